@@ -1,0 +1,168 @@
+r"""Bayer mosaics: the CFA, packing, and geometry that keeps the pattern.
+
+A mosaic keeps one colour a site, ``y[i, j] = x[c(i, j), i, j]``, where ``c`` repeats every two rows and columns
+(Bayer, US patent 3,971,065, 1976). *Packed* RAW holds the four sites of each 2 x 2 cell as four planes, always in the
+order R, Gr, Gb, B (Gr is the green of the red row), so that a network never needs to know the sensor's pattern.
+
+A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` does the bare movement and
+:meth:`CFA.turned` says what the pattern becomes; :func:`turn_keeping_cfa` crops a line where that brings it back.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+N_VIEWS = 8
+"""Number of flips and quarter turns of a picture (the dihedral group of the square)."""
+
+
+class CFA(str, Enum):
+    """The 2 x 2 colour filter array, read row by row from the top left: ``CFA("RGGB")`` is R G / G B."""
+
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+    def __str__(self) -> str:
+        return self.value
+
+    @classmethod
+    def _missing_(cls, value: object) -> CFA:
+        names = ", ".join(member.value for member in cls)
+        raise ValueError(f"CFA {value!r} is not a Bayer pattern; use one of {names}")
+
+    @property
+    def sites(self) -> tuple[tuple[int, int], ...]:
+        """(row, column) within the cell of R, Gr, Gb and B, in this order."""
+        red = self.value.index("R")
+        row, column = divmod(red, 2)
+        return (row, column), (row, 1 - column), (1 - row, column), (1 - row, 1 - column)
+
+    @property
+    def channels(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """The cell as indices into RGB: ``((0, 1), (1, 2))`` for RGGB."""
+        a, b, c, d = ("RGB".index(colour) for colour in self.value)
+        return (a, b), (c, d)
+
+    def shifted(self, rows: int, columns: int) -> CFA:
+        """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
+        cell = [self.value[:2], self.value[2:]]
+        return CFA("".join(cell[(i + rows) % 2][(j + columns) % 2] for i in (0, 1) for j in (0, 1)))
+
+    def turned(self, view: int) -> CFA:
+        """The pattern after :func:`turn` of a mosaic with even sides."""
+        cell = torch.arange(4).reshape(1, 1, 2, 2)
+        return CFA("".join(self.value[k] for k in turn(cell, view).flatten().tolist()))
+
+    def shift_to(self, other: CFA) -> tuple[int, int]:
+        """(rows, columns) in {0, 1} with ``self.shifted(rows, columns) == other``."""
+        return next((i, j) for i in (0, 1) for j in (0, 1) if self.shifted(i, j) == other)
+
+
+def _require_even(height: int, width: int) -> None:
+    if height % 2 or width % 2:
+        raise ValueError(f"a Bayer mosaic has even sides, got {height} x {width}; crop the last row or column")
+
+
+def _require_channels(image: Tensor, channels: int, what: str) -> None:
+    if image.ndim < 3 or image.shape[-3] != channels:
+        raise ValueError(f"{what} has shape (..., {channels}, H, W), got {tuple(image.shape)}")
+
+
+def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
+    """Mosaic ``(..., 1, H, W)`` to packed planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``.
+
+    Raises:
+        ValueError: if a side is odd, or the shape is not that of a mosaic.
+    """
+    _require_channels(mosaic, 1, "a mosaic")
+    _require_even(*mosaic.shape[-2:])
+    plane = mosaic[..., 0, :, :]
+    return torch.stack([plane[..., i::2, j::2] for i, j in CFA(cfa).sites], dim=-3)
+
+
+def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
+    """Packed planes ``(..., 4, H/2, W/2)`` to the mosaic ``(..., 1, H, W)``; the inverse of :func:`pack`."""
+    _require_channels(packed, 4, "packed RAW")
+    *lead, _, height, width = packed.shape
+    mosaic = packed.new_empty(*lead, 1, 2 * height, 2 * width)
+    for k, (i, j) in enumerate(CFA(cfa).sites):
+        mosaic[..., 0, i::2, j::2] = packed[..., k, :, :]
+    return mosaic
+
+
+def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
+    """Full-colour linear ``(..., 3, H, W)`` to packed ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
+    _require_channels(rgb, 3, "an RGB image")
+    _require_even(*rgb.shape[-2:])
+    sites = zip((0, 1, 1, 2), CFA(cfa).sites, strict=True)
+    return torch.stack([rgb[..., c, i::2, j::2] for c, (i, j) in sites], dim=-3)
+
+
+def mosaic(rgb: Tensor, cfa: CFA | str) -> Tensor:
+    """Full-colour linear ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``: stage f6, reversed."""
+    return unpack(pack_rgb(rgb, cfa), cfa)
+
+
+def demosaic(raw: Tensor, cfa: CFA | str) -> Tensor:
+    """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)`` by bilinear interpolation: stage f6."""
+    # kornia names the cell by its second row and column, as OpenCV does: BG is RGGB. Imported late: it is slow to load.
+    from kornia.color import CFA as KorniaCFA
+    from kornia.color import raw_to_rgb
+
+    _require_channels(raw, 1, "a mosaic")
+    _require_even(*raw.shape[-2:])
+    names = {CFA.RGGB: KorniaCFA.BG, CFA.BGGR: KorniaCFA.RG, CFA.GRBG: KorniaCFA.GB, CFA.GBRG: KorniaCFA.GR}
+    return raw_to_rgb(raw, names[CFA(cfa)])
+
+
+def turn(image: Tensor, view: int) -> Tensor:
+    """One of the eight flips and quarter turns of ``(..., H, W)``; a mosaic's pattern moves along.
+
+    ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity.
+    """
+    if not 0 <= view < N_VIEWS:
+        raise ValueError(f"view is in [0, {N_VIEWS}), got {view}")
+    if view & 4:
+        image = image.transpose(-2, -1)
+    axes = [axis for bit, axis in ((2, -2), (1, -1)) if view & bit]
+    return image.flip(axes) if axes else image
+
+
+def turn_back(image: Tensor, view: int) -> Tensor:
+    """The inverse of :func:`turn` with the same ``view``."""
+    flips = turn(image, view & 3)
+    return flips.transpose(-2, -1) if view & 4 else flips
+
+
+def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
+    """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped.
+
+    Example:
+        >>> raw = torch.rand(1, 1, 8, 8)
+        >>> turn_keeping_cfa(raw, "RGGB", 1).shape  # mirrored, two columns fewer, RGGB still
+        torch.Size([1, 1, 8, 6])
+    """
+    _require_even(*raw.shape[-2:])
+    cfa = CFA(cfa)
+    rows, columns = cfa.turned(view).shift_to(cfa)
+    turned = turn(raw, view)
+    height, width = turned.shape[-2:]
+    return turned[..., rows : height - rows, columns : width - columns]
+
+
+def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+    """Crop ``(..., H, W)`` without moving the pattern.
+
+    Raises:
+        ValueError: if the offset or the size is odd (the pattern would move), or the crop leaves the mosaic.
+    """
+    if top % 2 or left % 2 or height % 2 or width % 2:
+        raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
+    if min(top, left) < 0 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
+        raise ValueError(f"crop {height} x {width} at ({top}, {left}) leaves the mosaic {tuple(raw.shape[-2:])}")
+    return raw[..., top : top + height, left : left + width]

@@ -1,0 +1,61 @@
+"""A RAW frame and the sRGB picture of the same shot: what an ISP is fitted on and measured against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One shot, RAW and sRGB.
+
+    Attributes:
+        name: of the shot, for reports.
+        srgb: uint8 ``(3, H, W)``, in the sensor's orientation.
+        raw: the clean mosaic, float32 ``(1, H, W)``, black 0, white 1, sides even.
+        cfa: the pattern of ``raw`` and ``noisy``.
+        white_balance: as-shot multipliers of R, G, B, green being 1.
+        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
+        noisy: a noisy mosaic of the same scene, like ``raw``, where one was captured.
+        shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
+        camera: make and model.
+        registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
+            compare it at a much lower resolution only.
+
+    Raises:
+        ValueError: if shapes or dtypes disagree, a side is odd, or levels come without the other or without ``noisy``.
+    """
+
+    name: str
+    srgb: Tensor
+    raw: Tensor
+    cfa: CFA
+    white_balance: tuple[float, float, float]
+    color_matrix: Tensor
+    noisy: Tensor | None = None
+    shot_var: float | None = None
+    read_var: float | None = None
+    camera: str = "unknown"
+    registered: bool = True
+
+    def __post_init__(self) -> None:
+        self._require_shape("srgb", self.srgb, 3, torch.uint8)
+        self._require_shape("raw", self.raw, 1, torch.float32)
+        if self.noisy is not None:
+            self._require_shape("noisy", self.noisy, 1, torch.float32)
+        if any(side % 2 or side == 0 for side in self.raw.shape[-2:]):
+            raise ValueError(f"pair {self.name}: a mosaic has even sides, got {tuple(self.raw.shape)}")
+        if self.color_matrix.shape != (3, 3):
+            raise ValueError(f"pair {self.name}: color_matrix is (3, 3), got {tuple(self.color_matrix.shape)}")
+        if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
+            raise ValueError(f"pair {self.name}: shot_var and read_var come together, and with a noisy mosaic")
+
+    def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
+        expected = (channels, *self.raw.shape[-2:])
+        if tuple(image.shape) != expected or image.dtype != dtype:
+            raise ValueError(f"pair {self.name}: {field} is {dtype} {expected}, got {image.dtype} {tuple(image.shape)}")

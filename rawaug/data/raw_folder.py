@@ -1,0 +1,106 @@
+"""RAW files as pairs: the mosaic, and LibRaw's rendering or the camera's own JPEG of the same shot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import overload
+
+from torch import Tensor
+
+from rawaug.bayer import turn_back
+from rawaug.data.pairs import Pair
+from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
+
+EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+)
+_JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
+
+
+class RawFolder(Sequence[Pair]):
+    """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
+
+    A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size (it is turned
+    into the sensor's orientation, and the pair is not ``registered``), else LibRaw's rendering (see
+    :func:`rawaug.io.read_raw_and_develop`, also on forked workers). Files are read when asked for; the last one stays.
+
+    Args:
+        path: where the RAW files are.
+        camera_jpeg: False takes LibRaw's rendering always.
+        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
+
+    Raises:
+        FileNotFoundError: if a file or the folder does not exist.
+        ValueError: if the folder holds no RAW file.
+
+    Example:
+        >>> pair = RawFolder("shots")[0]  # doctest: +SKIP
+        >>> pair.raw.shape, pair.srgb.shape  # doctest: +SKIP
+        (torch.Size([1, 3000, 4000]), torch.Size([3, 3000, 4000]))
+    """
+
+    def __init__(
+        self, path: str | Path | Iterable[str | Path], *, camera_jpeg: bool = True, adjust_maximum_thr: float = 0.0
+    ) -> None:
+        self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
+        missing = [file for file in self.files if not file.is_file()]
+        if missing:
+            raise FileNotFoundError(f"{missing[0]}: no such RAW file")
+        if not self.files:
+            raise ValueError(f"{path}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
+        self.camera_jpeg = camera_jpeg
+        self.adjust_maximum_thr = adjust_maximum_thr
+        self._last: tuple[int, Pair] | None = None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    @overload
+    def __getitem__(self, index: int) -> Pair: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Pair]: ...
+
+    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        if self._last is None or self._last[0] != index:
+            self._last = index, self._read(self.files[index])
+        return self._last[1]
+
+    def _read(self, file: Path) -> Pair:
+        jpeg = _jpeg_beside(file) if self.camera_jpeg else None
+        if jpeg is not None:
+            frame = read_raw(file)
+            srgb = turn_back(read_picture(jpeg), frame.upright_view)
+            height, width = frame.mosaic.shape[-2:]
+            if (srgb.shape[-2] // 2 * 2, srgb.shape[-1] // 2 * 2) == (height, width):
+                return _pair(frame, srgb[:, :height, :width].contiguous(), registered=False)
+        return _pair(*read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
+
+
+def _pair(frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
+    return Pair(
+        name=frame.name,
+        srgb=srgb,
+        raw=frame.mosaic,
+        cfa=frame.cfa,
+        white_balance=frame.white_balance,
+        color_matrix=frame.color_matrix,
+        camera=frame.camera,
+        registered=registered,
+    )
+
+
+def _raw_files(path: str | Path) -> list[Path]:
+    path = Path(path)
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.suffix.lower() in EXTENSIONS)
+    return [path]
+
+
+def _jpeg_beside(file: Path) -> Path | None:
+    return next((jpeg for suffix in _JPEG_SUFFIXES if (jpeg := file.with_suffix(suffix)).is_file()), None)

@@ -1,0 +1,157 @@
+"""The training loop: one denoiser, one stream of samples, one page.
+
+``theta <- Adam(grad loss(net(noisy, variance; theta), clean))`` with a warm-up, a cosine and a running average of the
+weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or several processes (``torchrun``).
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+from tqdm.auto import tqdm
+
+import denoisers
+from denoisers.network import Denoiser
+from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
+from rawaug.experiment.stream import Sample, StepSampler, TrainingStream
+from rawaug.metrics import psnr
+from rawaug.seeding import derived_seed
+
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l1": nn.functional.l1_loss,
+    "l2": nn.functional.mse_loss,
+    "charbonnier": lambda a, b: ((a - b) ** 2 + 1e-6).sqrt().mean(),
+}
+
+
+def train(
+    stream: TrainingStream,
+    validation: Sequence[Sample],
+    network: DenoiserConfig,
+    config: TrainConfig,
+    folder: Path,
+    seed: int = 0,
+    device: str = "auto",
+    devices: int = 1,
+    label: str = "train",
+) -> Denoiser:
+    """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
+
+    Args:
+        stream: keyed samples.
+        validation: frozen noisy-clean crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
+        network, config: what is trained, and how.
+        folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
+        seed: of the network's start.
+        device, devices: Fabric's accelerator and number of devices.
+        label: heads the progress bar.
+
+    Returns:
+        The network with the averaged weights, in eval mode, on the CPU.
+    """
+    from lightning_fabric import Fabric
+    from torch.utils.tensorboard.writer import SummaryWriter
+
+    fabric = Fabric(accelerator=device, devices=devices, precision=config.precision)
+    fabric.launch()
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = {"seed": derived_seed(seed, "network") % 2**31, **network.settings}
+    net = denoisers.build(network.name, **settings)
+    average = torch.optim.swa_utils.AveragedModel(
+        net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
+    )
+    optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
+    start = resume(folder / "last.pt", net, average, optimiser, schedule)
+
+    memory_format = torch.channels_last if config.channels_last else torch.contiguous_format
+    model, optimiser = fabric.setup(net.to(memory_format=memory_format), optimiser)  # type: ignore[call-overload]
+    step_model = torch.compile(model) if config.compile else model
+    average.to(fabric.device)
+    sampler = StepSampler(start, config.steps, stream.batch, fabric.global_rank, fabric.world_size)
+    loader = DataLoader(
+        stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=fabric.device.type == "cuda"
+    )
+    loss_function = LOSSES[config.loss]
+    writer = SummaryWriter(str(folder)) if fabric.is_global_zero else None
+    began, score = time.perf_counter(), float("nan")
+
+    bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=not fabric.is_global_zero)
+    for step, batch in enumerate(bar, start=start + 1):
+        noisy, clean, variance = (x.to(fabric.device, memory_format=memory_format) for x in batch)
+        loss = loss_function(step_model(noisy, variance), clean)
+        optimiser.zero_grad(set_to_none=True)
+        fabric.backward(loss)
+        if config.clip_norm:
+            fabric.clip_gradients(model, optimiser, max_norm=config.clip_norm)
+        optimiser.step()
+        schedule.step()
+        average.update_parameters(net) if config.ema else average.module.load_state_dict(net.state_dict())
+
+        if step % config.validate_every == 0 or step == config.steps:
+            score = validate(average.module, validation, fabric.device)
+            if writer is not None:
+                rate = (step - start) * stream.batch / (time.perf_counter() - began)
+                log(folder / "log.csv", writer, step, loss=loss.item(), psnr=score, samples_per_second=rate)
+        if fabric.is_global_zero and (step % config.checkpoint_every == 0 or step == config.steps):
+            state = {"net": net.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
+            write_atomically({**state, "schedule": schedule.state_dict(), "step": step}, folder / "last.pt")
+        bar.set_postfix_str(f"loss {loss.item():.4f}, validation {score:.2f} dB", refresh=False)
+    if writer is not None:
+        writer.close()
+    trained = average.module.cpu().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    return trained.eval()
+
+
+def learning_rate_factor(step: int, config: TrainConfig) -> float:
+    """Linear warm-up, then a cosine to 1% of the highest rate."""
+    if step < config.warmup:
+        return (step + 1) / config.warmup
+    progress = (step - config.warmup) / max(1, config.steps - config.warmup)
+    return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
+
+
+@torch.no_grad()
+def validate(net: nn.Module, samples: Sequence[Sample], device: torch.device) -> float:
+    """Mean PSNR in dB over frozen samples."""
+    net.eval()
+    scores = [psnr(net(*(x.to(device) for x in (s.noisy, s.variance))), s.clean.to(device)) for s in samples]
+    net.train()
+    return torch.cat(scores).mean().item()
+
+
+def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> int:
+    """Load the checkpoint at ``path`` if there is one; the number of steps already done."""
+    if not path.is_file():
+        return 0
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    for key, target in {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}.items():
+        target.load_state_dict(state[key])
+    return int(state["step"])
+
+
+def write_atomically(state: dict[str, Any], path: Path) -> None:
+    """A checkpoint is there whole or not at all: a kill leaves the one before."""
+    partial = path.with_name(path.name + ".partial")
+    torch.save(state, partial)
+    partial.replace(path)
+
+
+def log(path: Path, writer: Any, step: int, **values: float) -> None:
+    """One row in the CSV file and one point in each TensorBoard curve."""
+    new = not path.is_file()
+    with path.open("a", newline="") as file:
+        rows = csv.writer(file)
+        if new:
+            rows.writerow(["step", *values])
+        rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
+    for name, value in values.items():
+        writer.add_scalar(name, value, step)

@@ -1,0 +1,15 @@
+"""Files at the edges: pictures through OpenImageIO, RAW through LibRaw. Neither is loaded before a file is opened."""
+
+from rawaug.io.pictures import decode_srgb, encode_srgb, read_picture, write_picture
+from rawaug.io.raw import RawFrame, develop, read_raw, read_raw_and_develop
+
+__all__ = [
+    "RawFrame",
+    "decode_srgb",
+    "develop",
+    "encode_srgb",
+    "read_picture",
+    "read_raw",
+    "read_raw_and_develop",
+    "write_picture",
+]

@@ -1,0 +1,241 @@
+r"""RAW files, through LibRaw: the mosaic as the sensor gave it, and LibRaw's own rendering of it.
+
+    y = min((d - black) / (white - black), 1)
+
+for a digital number d and the black level of its site: black is 0, white is 1, and nothing is clipped at black, since
+that would bias the noise in the shadows. Colour follows dcraw's convention: ``color_matrix`` M takes white-balanced
+camera colour to linear sRGB and keeps grey (each row sums to 1), so that ``rgb = M diag(white_balance) camera``. With a
+matrix X from XYZ to the camera (LibRaw's table, a DNG's ColorMatrix) M is the inverse of X S with its rows scaled to
+sum 1, where S takes linear sRGB to XYZ (IEC 61966-2-1).
+
+The mosaic and the rendering are both in the sensor's orientation, and agree pixel for pixel.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.io.tiff_tags import TiffTags, read_tiff_tags
+
+_XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+_TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
+_EXIF_MAKE, _EXIF_MODEL = 271, 272
+
+_developed_in: int | None = None
+"""The process that last used LibRaw's OpenMP threads: they do not survive a fork."""
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One RAW file.
+
+    Attributes:
+        mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
+        cfa: the pattern of ``mosaic``.
+        black: levels of the sites R, Gr, Gb, B, in digital numbers.
+        white: the saturated level, in digital numbers.
+        white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
+        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1: the one that
+            LibRaw renders with, or a typical camera's where the file and LibRaw tell nothing.
+        camera: make and model, ``"unknown"`` where the file does not tell.
+        iso: None where the file does not tell.
+        noise_profile: (shot_var, read_var) of a DNG's NoiseProfile tag, the mean over planes; None without one.
+        orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
+        name: the file's name without extension.
+        color_known: false where ``color_matrix`` is the typical one.
+    """
+
+    mosaic: Tensor
+    cfa: CFA
+    black: tuple[float, float, float, float]
+    white: float
+    white_balance: tuple[float, float, float]
+    color_matrix: Tensor
+    camera: str
+    iso: float | None
+    noise_profile: tuple[float, float] | None
+    orientation: int
+    name: str
+    color_known: bool = True
+
+    @property
+    def upright_view(self) -> int:
+        """The view of :func:`rawaug.bayer.turn` that shows the frame upright."""
+        if not self.orientation & 4:
+            return self.orientation
+        # `turn` transposes first: the two flips change places
+        return 4 | (self.orientation & 1) << 1 | (self.orientation & 2) >> 1
+
+
+def read_raw(path: str | Path) -> RawFrame:
+    """Read a RAW file with a Bayer mosaic.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if LibRaw cannot read it, or it is cut short.
+        ValueError: if it holds no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
+
+    Example:
+        >>> frame = read_raw("shot.dng")  # doctest: +SKIP
+        >>> frame.mosaic.shape, frame.cfa  # doctest: +SKIP
+        (torch.Size([1, 3000, 4000]), <CFA.RGGB: 'RGGB'>)
+    """
+    with _opened(Path(path)) as (raw, tags):
+        return _frame(Path(path), raw, tags)
+
+
+def develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> Tensor:
+    """LibRaw's rendering, uint8 ``(3, H, W)``: see :func:`read_raw_and_develop`."""
+    return read_raw_and_develop(path, adjust_maximum_thr)[1]
+
+
+def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> tuple[RawFrame, Tensor]:
+    """Read a RAW file and render it, uint8 ``(3, H, W)`` of the mosaic's size, not turned upright.
+
+    The rendering has the camera's white balance, no automatic brightness, and LibRaw's default tone curve (that of
+    BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum where that exceeds this part of
+    white (its default is 0.75): a digital gain that the file does not tell.
+
+    LibRaw renders with OpenMP, whose threads do not survive a fork: render in the main process, or start DataLoader
+    workers with ``multiprocessing_context="forkserver"``.
+
+    Raises:
+        RuntimeError: in a process forked after its parent rendered a file, where LibRaw would hang.
+        FileNotFoundError, OSError, ValueError: as :func:`read_raw`.
+    """
+    global _developed_in
+    if _developed_in not in (None, os.getpid()):
+        raise RuntimeError(
+            f"{path}: LibRaw hangs when it renders in a process forked from one that rendered; "
+            'use multiprocessing_context="forkserver", or no workers'
+        )
+    with _opened(Path(path)) as (raw, tags):
+        frame = _frame(Path(path), raw, tags)  # before rendering, which may change LibRaw's white level
+        _developed_in = os.getpid()
+        pixels = raw.postprocess(
+            use_camera_wb=True, no_auto_bright=True, adjust_maximum_thr=adjust_maximum_thr, output_bps=8, user_flip=0
+        )
+    height, width = frame.mosaic.shape[-2:]
+    if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
+        raise ValueError(f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}; no pair")
+    return frame, torch.from_numpy(pixels[:height, :width]).permute(2, 0, 1).contiguous()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
+    """The unpacked file, and its TIFF tags; LibRaw's errors become one line that names the file."""
+    import rawpy
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such RAW file")
+    try:
+        with rawpy.imread(str(path)) as raw:
+            tags = read_tiff_tags(path)
+            size = path.stat().st_size
+            if tags.mosaic_end is not None and tags.mosaic_end > size:  # LibRaw would not say what is wrong
+                raise OSError(
+                    f"{path}: cannot be read as RAW: it is cut short, {size} bytes of {tags.mosaic_end}; copy it again"
+                )
+            raw.unpack()
+            yield raw, tags
+    except rawpy.LibRawError as error:
+        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+        raise OSError(
+            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and of a known camera"
+        ) from error
+
+
+def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
+    cell = _bayer_cell(path, raw)
+    cfa = CFA("".join(raw.color_desc.decode()[k] for k in cell.flatten()))
+    levels, white = raw.black_level_per_channel, float(raw.white_level)
+    black = np.array([[levels[k] for k in row] for row in cell], np.float32)
+    if white <= black.max():
+        raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
+    matrix, color_known = _color_matrix(raw)
+    iso = getattr(getattr(raw, "other", None), "iso_speed", 0)  # rawpy tells since 0.27
+    return RawFrame(
+        mosaic=_normalised(raw.raw_image_visible, black, white),
+        cfa=cfa,
+        black=tuple(float(black[site]) for site in cfa.sites),  # type: ignore[arg-type]
+        white=white,
+        white_balance=_white_balance(raw),
+        color_matrix=torch.from_numpy(matrix).float(),
+        camera=_camera(raw, tags),
+        iso=float(iso) or None,
+        noise_profile=tags.noise_profile,
+        orientation=int(raw.sizes.flip),
+        name=path.stem,
+        color_known=color_known,
+    )
+
+
+def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
+    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(2, 2)``."""
+    height, width = (side // 2 * 2 for side in numbers.shape)
+    cells = numbers[:height, :width].astype(np.float32).reshape(height // 2, 2, width // 2, 2)
+    cells -= black[None, :, None, :]
+    cells /= (white - black)[None, :, None, :]
+    np.minimum(cells, 1, out=cells)
+    return torch.from_numpy(cells.reshape(1, height, width))
+
+
+def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
+    """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(2, 2)``: 0 to 3 are R, G, B, G."""
+    pattern = raw.raw_pattern
+    if pattern is None or pattern.shape != (2, 2) or raw.color_desc != b"RGBG" or set(pattern.flat) != {0, 1, 2, 3}:
+        raise ValueError(
+            f"{path}: holds no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW?); only Bayer RAW can be used"
+        )
+    return np.asarray(raw.raw_colors_visible[:2, :2])
+
+
+def _white_balance(raw: Any) -> tuple[float, float, float]:
+    """As LibRaw chooses: as shot, else for daylight."""
+    gains = raw.camera_whitebalance if min(raw.camera_whitebalance[:3]) > 0 else raw.daylight_whitebalance
+    return float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])
+
+
+def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
+    """As LibRaw chooses: the file's own, else its table's for the model; a typical one, and False, without either."""
+    own = np.asarray(raw.color_matrix, np.float64)[:, :3]
+    if own.any():
+        return own / own.sum(axis=1, keepdims=True), True
+    camera = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3] @ _XYZ_FROM_SRGB
+    if not camera.any():
+        return _TYPICAL_COLOR_MATRIX, False
+    return np.linalg.inv(camera / camera.sum(axis=1, keepdims=True)), True
+
+
+def _camera(raw: Any, tags: TiffTags) -> str:
+    """Make and model, from the file's tags or from its thumbnail's EXIF."""
+    make, model = tags.make, tags.model
+    if not model:
+        make, model = _thumbnail_camera(raw)
+    make, model = (str(name or "").strip() for name in (make, model))
+    return (model if model.startswith(make) else f"{make} {model}") or "unknown"
+
+
+def _thumbnail_camera(raw: Any) -> tuple[str | None, str | None]:
+    import rawpy
+    from PIL import Image
+
+    try:
+        thumbnail = raw.extract_thumb()
+    except rawpy.LibRawError:
+        return None, None
+    if thumbnail.format != rawpy.ThumbFormat.JPEG:
+        return None, None
+    exif = Image.open(BytesIO(thumbnail.data)).getexif()
+    return exif.get(_EXIF_MAKE), exif.get(_EXIF_MODEL)

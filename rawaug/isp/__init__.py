@@ -1,0 +1,1 @@
+"""The camera: stages, dictionaries, the model and its fit."""

@@ -1,0 +1,306 @@
+r"""The dictionary ISP: sRGB to RAW and back, six stages whose parameters come from two dictionaries.
+
+``y = f6^-1 . f5^-1 . f4^-1 . f3^-1 . f2^-1 . f1^-1 (x)`` and ``x = f1 . f2 . f3 . f4 . f5 . f6 (y)``
+
+Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022. The stages are in
+:mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.isp import stages
+from rawaug.isp.dictionary import ColourDictionary, Encoder, GainDictionary
+from rawaug.isp.params import POINTWISE_STAGES, ISPConfig, ISPParams, Pass
+
+THUMBNAIL = 64
+"""Longest side of what an encoder looks at."""
+
+WEIGHTS_DIR = Path(__file__).parents[1] / "weights"
+
+
+class DirectionNetworks(nn.Module):
+    """What each direction has of its own: tone network, gamma, attention mask and the two encoders."""
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__()
+        self.tone = stages.ToneNetwork()
+        self.gamma = nn.Parameter(torch.tensor(2.2))
+        self.attention = stages.AttentionMask()
+        self.colour_encoder = Encoder(config.colour_atoms, config.encoder_widths)
+        self.gain_encoder = Encoder(config.gain_atoms, config.encoder_widths)
+
+
+class DictionaryISP(nn.Module):
+    """A learned, interpretable camera.
+
+    Example:
+        >>> isp = DictionaryISP()
+        >>> srgb = torch.rand(2, 3, 64, 96)
+        >>> isp.reverse(srgb).raw.shape
+        torch.Size([2, 1, 64, 96])
+    """
+
+    def __init__(self, config: ISPConfig | None = None, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.config = config or ISPConfig()
+        self.info: dict[str, Any] = {}
+        self.colour = ColourDictionary(self.config.colour_atoms)
+        self.gain = GainDictionary(self.config.gain_atoms, generator)
+        self.shading = stages.GaussianMask()
+        self.reverse_networks = DirectionNetworks(self.config)
+        self.forward_networks = DirectionNetworks(self.config)
+        self.use_encoders(self.config.encoders)
+        self.neutral_gains: Tensor
+        self.register_buffer("neutral_gains", torch.ones(3))
+        """Channel gains of a shot whose as-shot white balance is (1, 1, 1): the digital gain, channel by channel."""
+
+    @property
+    def cfa(self) -> CFA:
+        """The pattern of the RAW that this ISP makes."""
+        return CFA(self.config.cfa)
+
+    def use_encoders(self, enabled: bool) -> None:
+        """Let the encoders look at the picture, or use their learned constants."""
+        for networks in (self.reverse_networks, self.forward_networks):
+            networks.colour_encoder.enabled = networks.gain_encoder.enabled = enabled
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    def params_from_weights(self, colour_weights: Tensor, gain_weights: Tensor) -> ISPParams:
+        """Parameters from given weights ``(B, N)`` and ``(B, M)``."""
+        matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
+        return ISPParams(colour_weights, gain_weights, matrix, gains)
+
+    def choose(self, srgb: Tensor) -> ISPParams:
+        """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
+        networks = self.reverse_networks
+        x2 = self._linear(thumbnail(as_float(srgb)))
+        candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
+        colour_weights = networks.colour_encoder(candidates)
+        x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
+        gains = self.gain.channel_gains()
+        balanced = [stages.inverse_gains(x3, g.expand(len(x3), 3), self.config.knee) for g in gains]
+        return self.params_from_weights(colour_weights, networks.gain_encoder(torch.stack(balanced, dim=1)))
+
+    def choose_forward(self, x4: Tensor) -> ISPParams:
+        """The parameters that the forward encoders choose for a linear image before white balance ``(B, 3, H, W)``."""
+        networks = self.forward_networks
+        small = thumbnail(x4)
+        balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
+        gain_weights = networks.gain_encoder(balanced)
+        x3 = stages.apply_gains(small, self.gain.combine(gain_weights))
+        candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
+        return self.params_from_weights(networks.colour_encoder(candidates), gain_weights)
+
+    def condition(
+        self, params: ISPParams, white_balance: Tensor | tuple[float, ...] | None, digital_gain: Tensor | float | None
+    ) -> ISPParams:
+        """Put the camera's own gains in place of the chosen ones.
+
+        Args:
+            params: chosen parameters.
+            white_balance: as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``, as the file tells them.
+            digital_gain: a further factor on all channels, scalar or ``(B,)``; the fit's own by default.
+        """
+        gains = params.gains
+        if white_balance is not None:
+            balance = torch.as_tensor(white_balance, dtype=gains.dtype, device=gains.device)
+            gains = (balance * self.neutral_gains).expand_as(gains)
+        if digital_gain is not None:
+            digital = torch.as_tensor(digital_gain, dtype=gains.dtype, device=gains.device).reshape(-1, 1)
+            gains = gains / gains[:, 1:2] * digital
+        return params._replace(gains=gains)
+
+    # -- passes -----------------------------------------------------------------------------------------------------
+
+    def reverse(
+        self,
+        srgb: Tensor,
+        params: ISPParams | None = None,
+        *,
+        white_balance: Tensor | tuple[float, ...] | None = None,
+        digital_gain: Tensor | float | None = None,
+        raw_samples: Tensor | None = None,
+        place: Tensor | None = None,
+        intermediates: bool = False,
+    ) -> Pass:
+        """sRGB to RAW.
+
+        Args:
+            srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
+            params: camera setting; chosen by the encoders (or their constants) if not given.
+            white_balance, digital_gain: the camera's own gains, see :meth:`condition`.
+            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings.
+            place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
+                (:func:`rawaug.isp.stages.place_in_frame`); the picture is taken for a full frame by default.
+            intermediates: also return x1 ... x5.
+
+        Returns:
+            A :class:`Pass` whose ``raw`` is the mosaic ``(B, 1, H, W)`` with the ISP's CFA, white at 1.
+
+        Raises:
+            ValueError: if the shape is not ``(B, 3, H, W)`` or a side is odd.
+        """
+        if srgb.ndim != 4 or srgb.shape[1] != 3:
+            raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
+        x = as_float(srgb)
+        params = self.condition(params or self.choose(x), white_balance, digital_gain)
+        if raw_samples is not None:
+            params = self.solve_gains(x, params, raw_samples, place)
+        seen: dict[str, Tensor] = {}
+        x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
+        return Pass(bayer.mosaic(x5, self.cfa), params, seen)
+
+    def reverse_pixels(
+        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
+        networks = self.reverse_networks
+        for name in self.config.stages:
+            if name == "tone":
+                x = networks.tone(x)
+            elif name == "gamma":
+                x = stages.gamma_expand(x, networks.gamma)
+            elif name == "colour":
+                x = stages.correct_colour(x, params.matrix)
+            elif name == "gains":
+                x = stages.inverse_gains(x, params.gains, self.config.knee)
+            else:
+                x = x * self.shading(self._place(x, place))
+                x = x * networks.attention(x) if self.config.attention else x
+            if seen is not None:
+                seen[f"x{POINTWISE_STAGES.index(name) + 1}"] = x
+        return x
+
+    def forward(
+        self,
+        raw: Tensor,
+        params: ISPParams | None = None,
+        *,
+        white_balance: Tensor | tuple[float, ...] | None = None,
+        place: Tensor | None = None,
+        intermediates: bool = False,
+    ) -> Pass:
+        """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
+        x5 = bayer.demosaic(raw, self.cfa)
+        if params is None:
+            x4 = self._correct_shading(x5, place) if "shading" in self.config.stages else x5
+            params = self.choose_forward(x4)
+        params = self.condition(params, white_balance, None)
+        seen: dict[str, Tensor] = {"x5": x5}
+        srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
+        return Pass(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
+
+    def forward_pixels(
+        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
+        networks = self.forward_networks
+        for name in reversed(self.config.stages):
+            if name == "shading":
+                x = self._correct_shading(x, place)
+            elif name == "gains":
+                x = stages.apply_gains(x, params.gains)
+            elif name == "colour":
+                x = stages.correct_colour(x, torch.linalg.pinv(params.matrix))
+            elif name == "gamma":
+                x = stages.gamma_compress(x, networks.gamma)
+            else:
+                x = networks.tone(x)
+            number = POINTWISE_STAGES.index(name)
+            if seen is not None and number:
+                seen[f"x{number}"] = x
+        return x
+
+    def solve_gains(self, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor | None = None) -> ISPParams:
+        """Least-squares gains from a few RAW readings ``(B, K, 3)`` of (row, column, value), channel by channel.
+
+        Readings at or above 0.98 (clipped) are left out; a channel without any reading keeps its chosen gain.
+        """
+        rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
+        value = raw_samples[..., 2]
+        batch = torch.arange(len(x), device=x.device)[:, None]
+        unit = params._replace(gains=torch.ones_like(params.gains))
+        where = self._place(x, place).expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+        x5 = self.reverse_pixels(x[batch, :, rows, columns].transpose(1, 2)[:, :, None], unit, where)[:, :, 0]
+        channel = torch.tensor(self.cfa.channels, device=x.device)[rows % 2, columns % 2]
+        own = F.one_hot(channel, 3).transpose(1, 2) * (value < 0.98)[:, None]
+        numerator, denominator = (own * x5 * x5).sum(2), (own * x5 * value[:, None]).sum(2)
+        solved = numerator / denominator.clamp_min(stages.EPS)
+        return params._replace(gains=torch.where(denominator > stages.EPS, solved, params.gains))
+
+    def _linear(self, x: Tensor) -> Tensor:
+        if "tone" in self.config.stages:
+            x = self.reverse_networks.tone(x)
+        return stages.gamma_expand(x, self.reverse_networks.gamma) if "gamma" in self.config.stages else x
+
+    def _correct_shading(self, x5: Tensor, place: Tensor | None) -> Tensor:
+        x = x5 / self.shading(self._place(x5, place))
+        return x * self.forward_networks.attention(x) if self.config.attention else x
+
+    def _place(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return (stages.place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
+
+    # -- files ------------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write weights, configuration and ``info`` to one safetensors file, atomically."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        header = {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(self.config))}
+        header["info"] = json.dumps(self.info)
+        partial = path.with_name(path.name + ".partial")
+        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, str(partial), header)
+        partial.replace(path)
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path) -> DictionaryISP:
+        """Load an ISP: the name of one shipped with the package, or a path.
+
+        Raises:
+            FileNotFoundError: if there is no such file or name.
+            ValueError: if the file is not that of an ISP.
+        """
+        path = Path(name) if Path(name).suffix else WEIGHTS_DIR / f"{name}.safetensors"
+        if not path.is_file():
+            shipped = ", ".join(sorted(p.stem for p in WEIGHTS_DIR.glob("*.safetensors"))) or "none"
+            raise FileNotFoundError(f"{name}: no such ISP; give a .safetensors file or a shipped name ({shipped})")
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                header = file.metadata() or {}
+                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
+        except SafetensorError as error:
+            raise ValueError(f"{path}: not a readable safetensors file ({error}); fit or copy it again") from error
+        if header.get("kind") != "isp":
+            raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
+        settings: dict[str, Any] = json.loads(header["config"])
+        settings = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
+        isp = cls(ISPConfig(**settings))
+        isp.load_state_dict(state)
+        isp.info = json.loads(header.get("info", "{}"))
+        return isp.eval()
+
+
+def as_float(srgb: Tensor) -> Tensor:
+    """uint8 to float32 in [0, 1]; floats pass."""
+    return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
+
+
+def thumbnail(image: Tensor) -> Tensor:
+    """``(B, 3, H, W)`` averaged down to at most :data:`THUMBNAIL` a side."""
+    height, width = image.shape[-2:]
+    scale = THUMBNAIL / max(height, width, THUMBNAIL)
+    return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))

@@ -1,0 +1,84 @@
+"""What describes an ISP: its configuration, one picture's camera setting, and the result of a pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.isp.stages import HIGHLIGHT_KNEE
+
+POINTWISE_STAGES = ("tone", "gamma", "colour", "gains", "shading")
+"""The stages between sRGB and the mosaic, in reverse order; stage k makes x_k."""
+
+
+@dataclass(frozen=True)
+class ISPConfig:
+    """What a :class:`DictionaryISP` is made of; stands in the header of its file.
+
+    Args:
+        colour_atoms: N, colour correction matrices in the dictionary.
+        gain_atoms: M, triplets of gains in the dictionary.
+        encoder_widths: features of the encoders' three convolutions.
+        cfa: pattern of the RAW it makes.
+        stages: the stages in reverse order, a subset of ``tone gamma colour gains shading``.
+        encoders: whether the encoders look at the picture; if not, learned constant weights are used.
+        attention: whether the shading stage has its attention mask.
+        knee: where Brooks' inverse gains start to spare highlights.
+    """
+
+    colour_atoms: int = 16
+    gain_atoms: int = 16
+    encoder_widths: tuple[int, int, int] = (32, 64, 160)
+    cfa: str = "RGGB"
+    stages: tuple[str, ...] = POINTWISE_STAGES
+    encoders: bool = False
+    attention: bool = True
+    knee: float = HIGHLIGHT_KNEE
+
+    def __post_init__(self) -> None:
+        CFA(self.cfa)
+        unknown = set(self.stages) - set(POINTWISE_STAGES)
+        if unknown:
+            raise ValueError(f"stages: unknown {sorted(unknown)}; choose from {' '.join(POINTWISE_STAGES)}")
+
+
+SMALL = {"colour_atoms": 8, "gain_atoms": 8, "encoder_widths": (16, 32, 64)}
+"""Settings of the size with at most 0.2 M parameters."""
+
+
+class ISPParams(NamedTuple):
+    """One camera setting per picture; replays a pass. Leading dimension B everywhere.
+
+    Args:
+        colour_weights: ``(B, N)`` weights of the colour atoms.
+        gain_weights: ``(B, M)`` weights of the gain atoms.
+        matrix: ``(B, 3, 3)`` sRGB to camera.
+        gains: ``(B, 3)`` white balance times digital gain, forward direction.
+    """
+
+    colour_weights: Tensor
+    gain_weights: Tensor
+    matrix: Tensor
+    gains: Tensor
+
+
+@dataclass
+class Pass:
+    """Result of a pass: ``raw`` ``(B, 1, H, W)`` or ``srgb`` ``(B, 3, H, W)``, the parameters; x1..x5 on request."""
+
+    image: Tensor
+    params: ISPParams
+    intermediates: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def raw(self) -> Tensor:
+        """The mosaic of a reverse pass."""
+        return self.image
+
+    @property
+    def srgb(self) -> Tensor:
+        """The picture of a forward pass."""
+        return self.image

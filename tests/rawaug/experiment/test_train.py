@@ -1,0 +1,78 @@
+"""The loop: it learns, and a run that was cut off ends as one that was not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from rawaug.bayer import CFA
+from rawaug.data import demo_pairs
+from rawaug.experiment import train as loop
+from rawaug.experiment.evaluate import frozen_sample
+from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
+from rawaug.experiment.stream import RealCrops, Sample, TrainingStream
+from rawaug.noise import noise_model
+
+NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
+CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
+
+
+@pytest.fixture(scope="module")
+def stream() -> TrainingStream:
+    pairs = demo_pairs("train", count=2)
+    return TrainingStream(RealCrops(pairs, noise_model("cycleisp_sidd"), 32, pairs[0].cfa), None, 2, 0.0, seed=0)
+
+
+@pytest.fixture(scope="module")
+def validation() -> list[Sample]:
+    pair = demo_pairs("validation", count=1)[0]
+    return [frozen_sample(pair, noise_model("cycleisp_sidd"), CFA.GRBG, seed=0)]
+
+
+def test_it_learns_to_denoise(tmp_path: Path) -> None:
+    noise = noise_model((0.02, 1e-3))
+    pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    stream = TrainingStream(RealCrops([pair], noise, 32, pair.cfa), None, 4, 0.0, seed=0)
+    validation = [frozen_sample(pair, noise, pair.cfa, seed=0)]
+    config = replace(CONFIG, steps=100, batch=4, ema=0.9)
+    net = loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
+    noisy = loop.psnr(validation[0].noisy, validation[0].clean).item()
+    assert loop.validate(net, validation, torch.device("cpu")) > noisy + 3.0
+    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,samples_per_second"
+
+
+def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
+    stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "whole", device="cpu")
+
+    class Killed(Exception):
+        pass
+
+    steps = 0
+    plain = loop.LOSSES["l1"]
+
+    def dies(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        nonlocal steps
+        steps += 1
+        if steps == 8:  # after the checkpoint of step 5
+            raise Killed
+        return plain(a, b)
+
+    monkeypatch.setitem(loop.LOSSES, "l1", dies)
+    with pytest.raises(Killed):
+        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
+    monkeypatch.setitem(loop.LOSSES, "l1", plain)
+    resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
+    for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_the_rate_warms_up_and_falls() -> None:
+    factors = [loop.learning_rate_factor(step, CONFIG) for step in range(CONFIG.steps + 1)]
+    assert factors[0] == 0.5 and factors[2] == 1.0
+    assert factors[-1] == pytest.approx(0.01)
+    assert all(a >= b for a, b in zip(factors[2:], factors[3:], strict=False))

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image, ImageOps
+
+from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
+SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)
+
+
+def write_with_oiio(path: Path, pixels: np.ndarray, kind: str) -> None:
+    output = oiio.ImageOutput.create(str(path))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    assert output is not None
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+
+
+@pytest.mark.parametrize("extension", ["png", "tif", "bmp", "ppm"])
+def test_lossless_formats_give_back_every_bit(tmp_path: Path, extension: str) -> None:
+    path = tmp_path / f"picture.{extension}"
+    write_picture(path, SRGB)
+    picture = read_picture(path)
+    assert picture.dtype == torch.uint8 and torch.equal(picture, SRGB)
+
+
+@pytest.mark.parametrize("extension", ["jpg", "webp", "jxl"])
+def test_lossy_formats_are_close(tmp_path: Path, extension: str) -> None:
+    smooth = torch.linspace(0, 255, 64).expand(3, 48, 64).round().to(torch.uint8)
+    write_picture(tmp_path / f"picture.{extension}", smooth)
+    assert (read_picture(tmp_path / f"picture.{extension}").int() - smooth.int()).abs().max() <= 4
+
+
+def test_floats_are_rounded_to_the_nearest_level(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", SRGB.double() / 255 + 0.4 / 255 * (SRGB < 255))
+    assert torch.equal(read_picture(tmp_path / "a.png"), SRGB)
+
+
+def test_16_bits_become_8_by_rounding(tmp_path: Path) -> None:
+    numbers = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1).repeat(3, -1)
+    write_with_oiio(tmp_path / "a.png", numbers, "uint16")
+    expected = np.rint(numbers[..., 0] / 257).astype(int)
+    assert np.array_equal(read_picture(tmp_path / "a.png")[1].numpy(), expected)
+
+
+def test_display_referred_floats_are_taken_as_they_are(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "a.tif", (PIXELS / 255).astype(np.float32), "float")
+    assert torch.equal(read_picture(tmp_path / "a.tif"), SRGB)
+
+
+def test_linear_exr_goes_through_the_srgb_transfer(tmp_path: Path) -> None:
+    linear = decode_srgb(SRGB.double() / 255).permute(1, 2, 0).float().contiguous().numpy()
+    write_with_oiio(tmp_path / "a.exr", linear, "float")
+    assert torch.equal(read_picture(tmp_path / "a.exr"), SRGB)
+
+
+def test_values_outside_the_unit_range_are_refused(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "bright.exr", np.full((4, 4, 3), 1.7, np.float32), "float")
+    with pytest.raises(ValueError, match=r"bright\.exr: values run from 1\.7 to 1\.7, not in \[0, 1\]"):
+        read_picture(tmp_path / "bright.exr")
+    with pytest.raises(ValueError, match="not in"):
+        write_picture(tmp_path / "nan.png", torch.full((3, 4, 4), float("nan")))
+
+
+def test_grey_becomes_three_channels_and_alpha_shows_black(tmp_path: Path) -> None:
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "grey.png")
+    assert torch.equal(read_picture(tmp_path / "grey.png"), SRGB[:1].expand(3, -1, -1))
+    Image.fromarray(PIXELS[..., 0]).convert("LA").save(tmp_path / "grey_alpha.png")
+    assert torch.equal(read_picture(tmp_path / "grey_alpha.png"), SRGB[:1].expand(3, -1, -1))
+    alpha = np.full((*PIXELS.shape[:2], 1), 51, np.uint8)  # 0.2
+    Image.fromarray(np.dstack([PIXELS, alpha])).save(tmp_path / "rgba.png")
+    assert (read_picture(tmp_path / "rgba.png").float() - 0.2 * SRGB).abs().max() <= 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_respected(tmp_path: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(PIXELS).save(tmp_path / "turned.png", exif=exif)
+    with Image.open(tmp_path / "turned.png") as stored:
+        upright = np.asarray(ImageOps.exif_transpose(stored))
+    assert np.array_equal(read_picture(tmp_path / "turned.png").permute(1, 2, 0).numpy(), upright)
+
+
+@pytest.mark.parametrize("extension", ["jpg", "tif"])
+def test_cmyk_is_refused(tmp_path: Path, extension: str) -> None:
+    path = tmp_path / f"print.{extension}"
+    Image.fromarray(PIXELS).convert("CMYK").save(path)
+    with pytest.raises(ValueError, match=rf"print\.{extension}: holds CMYK colours; convert it to sRGB first"):
+        read_picture(path)
+
+
+def test_five_channels_are_refused(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "layers.tif", np.zeros((4, 4, 5), np.uint8), "uint8")
+    with pytest.raises(ValueError, match=r"layers\.tif: holds channels R, G, B, A,"):
+        read_picture(tmp_path / "layers.tif")
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+@pytest.mark.parametrize("share", [0, 0.5])
+def test_cut_short_is_one_line_that_names_the_file(tmp_path: Path, extension: str, share: float) -> None:
+    path = tmp_path / f"cut.{extension}"
+    write_picture(path, SRGB)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(OSError, match=rf"cut\.{extension}: cannot be read as a picture") as caught:
+        read_picture(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_unwritable_ones_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.png: no such picture file"):
+        read_picture(tmp_path / "none.png")
+    with pytest.raises(OSError, match=r"nowhere/a\.png: cannot be written"):
+        write_picture(tmp_path / "nowhere" / "a.png", SRGB)
+    with pytest.raises(ValueError, match=r"a\.xyz: no picture format has this extension"):
+        write_picture(tmp_path / "a.xyz", SRGB)
+    with pytest.raises(ValueError, match=r"shape \(3, H, W\), got \(1, 24, 37\)"):
+        write_picture(tmp_path / "a.png", SRGB[:1])
+
+
+@given(st.floats(0, 1))
+def test_the_srgb_transfer_is_inverted_and_continuous(value: float) -> None:
+    v = torch.tensor(value, dtype=torch.float64)
+    assert abs(decode_srgb(encode_srgb(v)) - v) < 1e-6
+    assert abs(encode_srgb(decode_srgb(v)) - v) < 1e-6
+
+
+def test_the_srgb_transfer_has_its_published_values() -> None:
+    assert encode_srgb(torch.tensor(0.18)).item() == pytest.approx(0.4613561, abs=1e-6)
+    assert decode_srgb(torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0, 0.2140411, 1], abs=1e-6)

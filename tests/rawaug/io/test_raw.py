@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rawpy
+import tifffile
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA, mosaic, turn
+from rawaug.io import develop, raw, read_raw, read_raw_and_develop
+
+Dng = Callable[..., Path]
+NUMBERS = np.random.default_rng(0).integers(0, 4096, (40, 62)).astype(np.uint16)
+
+
+def decode_bt709(display: Tensor) -> Tensor:
+    return torch.where(display < 0.081, display / 4.5, ((display.clamp(min=0.081) + 0.099) / 1.099) ** (1 / 0.45))
+
+
+def psnr_of_raw_from_rendering(frame: raw.RawFrame, srgb: Tensor) -> float:
+    """RAW predicted at its sites from the rendering and the metadata alone, where the rendering is not clipped."""
+    display = srgb.double() / 255
+    gains = torch.tensor(frame.white_balance, dtype=torch.float64).reshape(3, 1, 1)
+    inverse = torch.linalg.inv(frame.color_matrix.double())
+    camera = torch.einsum("ij,jhw->ihw", inverse, decode_bt709(display)) / gains
+    predicted = mosaic(camera, frame.cfa)[0]
+    unclipped = ((display > 0.01) & (display < 0.98)).all(0)
+    assert unclipped.float().mean() > 0.5
+    error = (predicted - frame.mosaic[0])[unclipped]
+    return -10 * torch.log10(error.square().mean()).item()
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+@pytest.mark.parametrize("black", [(511,), (497, 501, 506, 515)])
+def test_the_mosaic_is_normalised_site_by_site(
+    tmp_path: Path, bayer_dng: Dng, cfa: CFA, black: tuple[int, ...]
+) -> None:
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", NUMBERS, cfa.value, black=black, white=4001))
+    levels = np.array(black * (4 // len(black)), np.float64).reshape(2, 2)
+    per_site = np.tile(levels, (20, 31))
+    expected = np.minimum((NUMBERS - per_site) / (4001 - per_site), 1)
+    assert frame.cfa == cfa
+    assert frame.mosaic.dtype == torch.float32 and frame.mosaic.shape == (1, 40, 62)
+    assert np.allclose(frame.mosaic[0].numpy(), expected, atol=1e-6)
+    assert frame.black == tuple(levels[site] for site in cfa.sites) and frame.white == 4001
+    assert frame.mosaic.min() < -0.1, "clipped at black"
+    assert (frame.mosaic == 1).any() and frame.mosaic.max() == 1
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_the_rendering_agrees_with_the_mosaic(tmp_path: Path, bayer_dng: Dng, cfa: CFA) -> None:
+    y, x = torch.meshgrid(torch.linspace(0, 1, 64), torch.linspace(0, 1, 96), indexing="ij")
+    camera = torch.stack([0.10 + 0.15 * x, 0.2 + 0.2 * y, 0.1 + 0.2 * (1 - x) * y])
+    numbers = (mosaic(camera, cfa)[0] * (16383 - 513) + 513).round().numpy().astype(np.uint16)
+    path = bayer_dng(tmp_path / "a.dng", numbers, cfa.value, black=(513,), white=16383)
+    frame, srgb = read_raw_and_develop(path)
+    assert srgb.dtype == torch.uint8 and srgb.shape == (3, 64, 96)
+    assert torch.equal(srgb, develop(path))
+    assert psnr_of_raw_from_rendering(frame, srgb) > 55
+
+
+def test_metadata_is_read(tmp_path: Path, bayer_dng: Dng) -> None:
+    profile = (1e-3, 1e-6, 2e-3, 3e-6, 3e-3, 5e-6)
+    frame = read_raw(bayer_dng(tmp_path / "shot.dng", NUMBERS, noise_profile=profile))
+    assert (frame.name, frame.camera, frame.iso) == ("shot", "Maker Model 1", None)
+    assert frame.noise_profile == pytest.approx((2e-3, 3e-6))
+    assert frame.white_balance == pytest.approx((2.0, 1.0, 1.6), abs=1e-4)
+    assert frame.color_matrix.sum(1).tolist() == pytest.approx([1, 1, 1], abs=1e-5)
+    assert frame.color_known
+
+
+def test_a_file_without_colour_or_noise_says_so(tmp_path: Path, bayer_dng: Dng) -> None:
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", NUMBERS, color_matrix=None))
+    assert frame.noise_profile is None
+    assert not frame.color_known
+    assert frame.color_matrix.sum(1).tolist() == pytest.approx([1, 1, 1])
+
+
+def test_the_last_line_of_an_odd_side_is_left_out(tmp_path: Path, bayer_dng: Dng) -> None:
+    frame, srgb = read_raw_and_develop(bayer_dng(tmp_path / "a.dng", NUMBERS[:39, :61].copy()))
+    assert frame.mosaic.shape == (1, 38, 60) and srgb.shape == (3, 38, 60)
+    assert np.allclose(frame.mosaic[0].numpy(), NUMBERS[:38, :60] / 4095, atol=1e-6)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_upright_view_is_how_libraw_shows_it(tmp_path: Path, bayer_dng: Dng, orientation: int) -> None:
+    path = bayer_dng(tmp_path / "a.dng", NUMBERS, orientation=orientation)
+    frame, srgb = read_raw_and_develop(path)
+    with rawpy.imread(str(path)) as file:
+        shown = file.postprocess(use_camera_wb=True, no_auto_bright=True, adjust_maximum_thr=0)
+    assert srgb.shape[-2:] == frame.mosaic.shape[-2:]
+    assert np.array_equal(turn(srgb, frame.upright_view).permute(1, 2, 0).numpy(), shown)
+
+
+def test_scaling_by_the_frames_maximum_is_an_option(tmp_path: Path, bayer_dng: Dng) -> None:
+    path = bayer_dng(tmp_path / "a.dng", (NUMBERS * 0.85).astype(np.uint16))
+    assert develop(path, adjust_maximum_thr=0.75).float().mean() > develop(path).float().mean() + 2
+
+
+def not_bayer(name: str) -> dict[str, object]:
+    if name == "X-Trans":
+        cell = np.array([*b"\1\2\1\1\0\1\0\1\0\2\1\2\1\2\1\1\0\1\1\0\1\1\2\1\2\1\2\0\1\0\1\0\1\1\2\1"], np.uint8)
+        return {"cfa": None, "extra": [(33421, 3, 2, (6, 6), True), (33422, 1, 36, cell.tobytes(), True)]}
+    if name == "monochrome":
+        return {"cfa": "GGGG"}
+    return {"numbers": np.stack([NUMBERS] * 3, -1), "cfa": None}
+
+
+@pytest.mark.parametrize("name", ["X-Trans", "monochrome", "linear"])
+def test_what_is_not_bayer_is_refused_in_one_line(tmp_path: Path, bayer_dng: Dng, name: str) -> None:
+    path = bayer_dng(tmp_path / "other.dng", **{"numbers": NUMBERS, **not_bayer(name)})
+    with pytest.raises(ValueError, match=r"other\.dng: holds no Bayer mosaic") as caught:
+        read_raw(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_broken_files_are_named(tmp_path: Path, bayer_dng: Dng, capfd: pytest.CaptureFixture[str]) -> None:
+    path = bayer_dng(tmp_path / "cut.dng", NUMBERS)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(OSError, match=r"cut\.dng: cannot be read as RAW: it is cut short"):
+        read_raw(path)
+    path.write_bytes(b"no RAW at all")
+    with pytest.raises(OSError, match=r"cut\.dng: cannot be read as RAW \(LibRaw: .*\)"):
+        read_raw(path)
+    with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
+        read_raw(tmp_path / "none.dng")
+    assert capfd.readouterr().err == ""
+
+
+def test_white_below_black_is_refused(tmp_path: Path, bayer_dng: Dng) -> None:
+    with pytest.raises(ValueError, match=r"a\.dng: white level 500 is not above black level 511"):
+        read_raw(bayer_dng(tmp_path / "a.dng", NUMBERS, black=(511,), white=500))
+
+
+def test_rendering_in_a_fork_of_a_renderer_is_refused(
+    tmp_path: Path, bayer_dng: Dng, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bayer_dng(tmp_path / "a.dng", NUMBERS)
+    develop(path)
+    monkeypatch.setattr(os, "getpid", lambda: -1)  # what a child of this process would see
+    with pytest.raises(RuntimeError, match=r"a\.dng: LibRaw hangs .*forkserver"):
+        develop(path)
+    assert read_raw(path).mosaic.shape == (1, 40, 62)
+
+
+def test_canon_and_gopro_frames(camera_files: Path) -> None:
+    frame, srgb = read_raw_and_develop(camera_files / "raw/canon/s40_0101.crw")
+    assert (frame.camera, frame.iso, frame.cfa) == ("Canon PowerShot S40", 50, CFA.RGGB)
+    assert frame.mosaic.shape == (1, 1720, 2312) and frame.black == (32,) * 4 and frame.white == 1023
+    assert psnr_of_raw_from_rendering(frame, srgb) > 60
+    one_cell_off = dataclasses.replace(frame, mosaic=frame.mosaic.roll(2, -1))
+    assert psnr_of_raw_from_rendering(one_cell_off, srgb) < 45
+
+    path = camera_files / "raw/gopro/hero6_0024.dng"
+    frame = read_raw(path)
+    assert frame.camera == "GoPro HERO6 Black" and frame.orientation == 1
+    assert frame.noise_profile == pytest.approx((1.562e-4, 4.88e-8), rel=1e-3)
+    with tifffile.TiffFile(path) as tiff:
+        tag = np.array(tiff.pages[0].tags["ColorMatrix2"].value, np.float64)  # for D50; the other is for tungsten
+    camera = (tag[0::2] / tag[1::2]).reshape(3, 3) @ raw._XYZ_FROM_SRGB
+    expected = np.linalg.inv(camera / camera.sum(1, keepdims=True))
+    assert np.allclose(frame.color_matrix.numpy(), expected, atol=1e-3)

@@ -1,0 +1,125 @@
+"""The dictionary ISP: shapes, sizes, conditioning, inverses and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.params import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.stages import place_in_frame
+from rawaug.metrics import psnr
+
+
+@pytest.fixture
+def srgb() -> torch.Tensor:
+    return torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(0))
+
+
+def count(isp: DictionaryISP) -> int:
+    return sum(p.numel() for p in isp.parameters())
+
+
+def test_sizes_stay_within_the_published_ones() -> None:
+    assert 0.45e6 < count(DictionaryISP()) <= 0.59e6
+    assert count(DictionaryISP(ISPConfig(**SMALL))) <= 0.2e6
+
+
+def test_reverse_gives_a_mosaic_and_the_intermediates(srgb: torch.Tensor) -> None:
+    result = DictionaryISP().reverse(srgb, intermediates=True)
+    assert result.raw.shape == (2, 1, 32, 48)
+    assert list(result.intermediates) == ["x1", "x2", "x3", "x4", "x5"]
+    assert torch.equal(result.raw[:, 0, 0::2, 0::2], result.intermediates["x5"][:, 0, 0::2, 0::2])
+
+
+def test_uint8_and_float_agree(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    bytes_ = (srgb * 255).round().to(torch.uint8)
+    torch.testing.assert_close(isp.reverse(bytes_).raw, isp.reverse(bytes_ / 255.0).raw)
+
+
+def test_the_same_parameters_give_the_same_bits(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    first = isp.reverse(srgb)
+    assert torch.equal(first.raw, isp.reverse(srgb, first.params).raw)
+
+
+def test_forward_after_reverse_above_60_db() -> None:
+    isp = DictionaryISP()
+    smooth = torch.linspace(0.1, 0.85, 64)[None, None, :, None].expand(1, 3, 64, 64).contiguous()
+    result = isp.reverse(smooth)
+    back = isp.forward(result.raw, result.params).srgb
+    inner = (slice(None), slice(None), slice(4, -4), slice(4, -4))
+    assert psnr(back[inner], smooth[inner]).item() > 60.0
+
+
+def test_white_balance_is_taken_as_given(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    params = isp.reverse(srgb, white_balance=(2.0, 1.0, 1.5)).params
+    torch.testing.assert_close(params.gains, torch.tensor([[2.0, 1.0, 1.5]] * 2))
+    params = isp.reverse(srgb, white_balance=(2.0, 1.0, 1.5), digital_gain=0.5).params
+    torch.testing.assert_close(params.gains, torch.tensor([[1.0, 0.5, 0.75]] * 2))
+
+
+def test_a_few_raw_samples_give_the_gains(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    dark = 0.8 * srgb
+    truth = isp.reverse(dark, white_balance=(1.7, 0.9, 1.4))
+    generator = torch.Generator().manual_seed(1)
+    rows, columns = (torch.randint(side, (2, 64), generator=generator) for side in (32, 48))
+    values = truth.raw[torch.arange(2)[:, None], 0, rows, columns]
+    solved = isp.reverse(dark, raw_samples=torch.stack([rows.float(), columns.float(), values], dim=2))
+    torch.testing.assert_close(solved.params.gains, truth.params.gains, rtol=1e-4, atol=0)
+
+
+def test_shading_depends_on_the_place_in_the_frame(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    isp.shading.set(torch.zeros(2), torch.eye(2))
+    centre = isp.reverse(srgb, place=place_in_frame(32, 48, (1000, 1500), (2032, 3048))).raw
+    corner = isp.reverse(srgb, place=place_in_frame(32, 48, (0, 0), (2032, 3048))).raw
+    assert 0.55 < (corner.mean() / centre.mean()).item() < 0.65  # exp(-1/2) at the corner
+
+
+def test_stages_can_be_left_out(srgb: torch.Tensor) -> None:
+    kept = tuple(stage for stage in POINTWISE_STAGES if stage != "gains")
+    result = DictionaryISP(ISPConfig(stages=kept)).reverse(srgb, intermediates=True)
+    assert list(result.intermediates) == ["x1", "x2", "x3", "x5"]
+    with pytest.raises(ValueError, match="bogus"):
+        ISPConfig(stages=("tone", "bogus"))
+
+
+def test_encoders_look_at_the_picture_only_when_enabled(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    with torch.no_grad():
+        for parameter in isp.reverse_networks.gain_encoder.layers[-1].parameters():
+            parameter.normal_(generator=torch.Generator().manual_seed(0))
+    assert torch.equal(*isp.choose(srgb).gain_weights)
+    isp.use_encoders(True)
+    assert not torch.equal(*isp.choose(srgb).gain_weights)
+
+
+@pytest.mark.parametrize("shape", [(3, 32, 32), (1, 4, 32, 32)])
+def test_wrong_shapes_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"\(B, 3, H, W\)"):
+        DictionaryISP().reverse(torch.zeros(shape))
+    with pytest.raises(ValueError, match="even sides"):
+        DictionaryISP().reverse(torch.zeros(1, 3, 31, 32))
+
+
+def test_a_file_holds_the_whole_isp(tmp_path: Path, srgb: torch.Tensor) -> None:
+    isp = DictionaryISP(ISPConfig(cfa="BGGR", colour_atoms=3, gain_atoms=5), torch.Generator().manual_seed(3))
+    isp.info = {"frames": ["a"]}
+    isp.save(tmp_path / "camera.safetensors")
+    loaded = DictionaryISP.from_pretrained(tmp_path / "camera.safetensors")
+    assert loaded.config == isp.config and loaded.info == isp.info
+    assert torch.equal(loaded.reverse(srgb).raw, isp.reverse(srgb).raw)
+
+
+def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such ISP"):
+        DictionaryISP.from_pretrained("nobody")
+    (tmp_path / "cut.safetensors").write_bytes(b"\x00" * 20)
+    with pytest.raises(ValueError, match=r"cut\.safetensors"):
+        DictionaryISP.from_pretrained(tmp_path / "cut.safetensors")

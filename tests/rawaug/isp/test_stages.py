@@ -1,0 +1,74 @@
+"""Each stage and its inverse, and what keeps it physical."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rawaug.isp import stages
+
+
+@pytest.fixture
+def x() -> torch.Tensor:
+    return torch.rand(2, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+
+
+def test_untrained_networks_are_the_identity(x: torch.Tensor) -> None:
+    assert torch.equal(stages.ToneNetwork()(x), x)
+    assert torch.equal(stages.AttentionMask()(x), torch.ones(2, 1, 6, 8))
+    assert torch.equal(stages.GaussianMask()(stages.place_in_frame(6, 8)), torch.ones(1, 1, 6, 8))
+
+
+def test_gamma_inverts(x: torch.Tensor) -> None:
+    grey = 0.05 + 0.95 * x
+    torch.testing.assert_close(stages.gamma_compress(stages.gamma_expand(grey, 2.2), 2.2), grey)
+    assert stages.gamma_expand(torch.zeros(1), 2.2) >= 0
+
+
+def test_colour_inverts(x: torch.Tensor) -> None:
+    matrix = torch.tensor([[[0.6, 0.3, 0.1], [0.1, 0.7, 0.2], [0.0, 0.2, 0.8]]]).expand(2, 3, 3)
+    back = stages.correct_colour(stages.correct_colour(x, matrix), torch.linalg.pinv(matrix))
+    torch.testing.assert_close(back, x)
+
+
+def test_gains_invert_below_the_knee(x: torch.Tensor) -> None:
+    gains = torch.tensor([[2.0, 1.0, 1.5], [1.2, 0.9, 1.9]])
+    dark = 0.85 * x
+    torch.testing.assert_close(stages.apply_gains(stages.inverse_gains(dark, gains), gains), dark)
+
+
+def test_highlights_come_back_saturated() -> None:
+    gains = torch.tensor([[2.0, 1.0, 1.5]])
+    white = torch.ones(1, 3, 1, 1)
+    assert torch.equal(stages.inverse_gains(white, gains), white)
+    torch.testing.assert_close(stages.inverse_gains(white, gains, knee=None).flatten(), 1 / gains[0])
+
+
+def test_inverse_gains_never_fall_below_the_plain_division(x: torch.Tensor) -> None:
+    gains = torch.tensor([[2.0, 0.8, 1.5]]).expand(2, 3)
+    assert (stages.inverse_gains(x, gains) >= stages.inverse_gains(x, gains, knee=None) - 1e-7).all()
+
+
+def test_a_crop_keeps_its_place_in_the_frame() -> None:
+    whole = stages.place_in_frame(20, 30)
+    crop = stages.place_in_frame(8, 10, offset=(4, 6), frame=(20, 30))
+    torch.testing.assert_close(crop, whole[..., 4:12, 6:16])
+    corner = stages.place_in_frame(2000, 3000)[0, :, -1, -1]
+    assert corner.norm().item() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_gaussian_mask_takes_mean_and_precision() -> None:
+    mask = stages.GaussianMask()
+    mean, precision = torch.tensor([0.1, -0.2]), torch.tensor([[0.8, 0.1], [0.1, 0.5]])
+    mask.set(mean, precision)
+    torch.testing.assert_close(mask.precision, precision)
+    place = stages.place_in_frame(40, 60)
+    p = place[0] - mean[:, None, None]
+    expected = torch.exp(-0.5 * (0.8 * p[0] ** 2 + 0.2 * p[0] * p[1] + 0.5 * p[1] ** 2))
+    torch.testing.assert_close(mask(place)[0, 0], expected)
+
+
+def test_gaussian_mask_never_brightens() -> None:
+    mask = stages.GaussianMask()
+    mask.set(torch.zeros(2), torch.tensor([[0.5, 0.0], [0.0, -0.5]]))
+    assert mask(stages.place_in_frame(10, 10)).max() <= 1.0

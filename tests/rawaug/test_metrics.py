@@ -1,0 +1,59 @@
+"""Metrics against scikit-image."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from rawaug.metrics import patch_psnr, psnr, ssim, worst_and_best_quarter
+
+
+@pytest.fixture
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.rand(2, 1, 40, 52, generator=generator, dtype=torch.float64)
+    return a, (a + 0.1 * torch.randn(a.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+
+
+def test_psnr_equals_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    a, b = images
+    for k in range(2):
+        expected = peak_signal_noise_ratio(a[k].numpy(), b[k].numpy(), data_range=1)
+        assert psnr(a, b)[k].item() == pytest.approx(expected, abs=1e-9)
+
+
+def test_ssim_equals_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+    a, b = images
+    for k in range(2):
+        _, full = structural_similarity(
+            a[k, 0].numpy(), b[k, 0].numpy(), data_range=1, gaussian_weights=True, sigma=1.5,
+            use_sample_covariance=False, full=True,
+        )  # fmt: skip
+        assert ssim(a, b)[k].item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
+
+
+def test_ssim_refuses_pictures_smaller_than_its_window() -> None:
+    with pytest.raises(ValueError, match="at least 11"):
+        ssim(torch.zeros(1, 1, 10, 20), torch.zeros(1, 1, 10, 20))
+
+
+def test_patch_psnr_averages_decibels_not_errors() -> None:
+    a = torch.zeros(1, 1, 256, 512)
+    b = a.clone()
+    b[..., :256] += 0.1  # 20 dB
+    b[..., 256:] += 0.001  # 60 dB
+    assert patch_psnr(a, b).item() == pytest.approx(40.0, abs=1e-3)
+    assert psnr(a, b).item() == pytest.approx(-10 * math.log10(0.5 * (1e-2 + 1e-6)), abs=1e-3)
+
+
+def test_quarters() -> None:
+    assert worst_and_best_quarter([4.0, 1.0, 3.0, 2.0, 5.0, 6.0, 7.0, 8.0]) == (1.5, 7.5)
+    assert worst_and_best_quarter([4.0]) == (4.0, 4.0)
+
+
+def test_shapes_must_agree() -> None:
+    with pytest.raises(ValueError, match="differ in shape"):
+        psnr(torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 6))
