@@ -21,8 +21,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from rawaug import bayer
 from rawaug.conform import even_sided, to_rgb_tensor
+from rawaug.isp.baked import BakedISP
 from rawaug.isp.dictionary import convex_weights, perturb
-from rawaug.isp.model import DictionaryISP, as_float
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPParams
 from rawaug.isp.stages import place_in_frame
 from rawaug.noise import NoiseModel, noise_model
@@ -93,6 +94,7 @@ class RawAugment(nn.Module):
         if sampling not in ("convex", "perturb", "chosen"):
             raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
         self.isp = isp.eval().requires_grad_(False)
+        self.baked = BakedISP(self.isp)
         self.noise = noise_model(noise)
         self.sampling = sampling
         self.strength = strength
@@ -145,9 +147,7 @@ class RawAugment(nn.Module):
         """
         if params is None:
             return super().apply(srgb)
-        clean = bayer.pack_rgb(
-            self.isp.reverse_pixels(as_float(srgb), params.isp, self._coordinates(srgb, params)), self.isp.cfa
-        )
+        clean = self.baked(srgb, params.isp, self._coordinates(srgb, params))
         noisy = self.noise.apply(clean, params.noise)
         return RawPair(noisy, clean, self.noise.variance(noisy, params.noise), params)
 

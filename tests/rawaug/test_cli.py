@@ -14,7 +14,7 @@ from rawaug.cli import main
 QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
     "--train.steps", "4", "--train.validate_every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
-    "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}', "--data.test", "demo:validation",
+    "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
 ]  # fmt: skip
 
 

@@ -7,7 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rawaug.isp.dictionary import (
-    ColourDictionary, Encoder, GainDictionary, convex_weights, perturb, project_to_simplex,
+    ColourDictionary,
+    Encoder,
+    GainDictionary,
+    convex_weights,
+    perturb,
+    project_to_simplex,
 )  # fmt: skip
 
 
