@@ -51,7 +51,7 @@ class RawPair(NamedTuple):
 
     Args:
         noisy: ``(B, 4, H/2, W/2)``, at most 1, below 0 where the noise goes there.
-        clean: ``(B, 4, H/2, W/2)``.
+        clean: ``(B, 4, H/2, W/2)``, at most 1: the sensor saturates there.
         variance: ``(B, 4, H/2, W/2)`` noise variance as the noisy signal tells it: what a network is given.
         params: replays the pair.
     """
@@ -147,7 +147,7 @@ class RawAugment(nn.Module):
         """
         if params is None:
             return super().apply(srgb)
-        clean = self.baked(srgb, params.isp, self._coordinates(srgb, params))
+        clean = self.baked(srgb, params.isp, self._coordinates(srgb, params)).clamp_(max=1.0)
         noisy = self.noise.apply(clean, params.noise)
         return RawPair(noisy, clean, self.noise.variance(noisy, params.noise), params)
 

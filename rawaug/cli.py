@@ -1,4 +1,4 @@
-"""The command line: ``rawaug run | fit | evaluate | info``, by jsonargparse on the dataclasses of recipes.
+"""The command line: ``rawaug run | fit | evaluate | preview | info``, by jsonargparse on the dataclasses of recipes.
 
 Bad input ends in one line on stderr that names the file or key and what to do, with exit status 2.
 """
@@ -42,7 +42,7 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     parsed = parser.parse_args(argv)
     command: str = parsed.command
-    commands = {"run": _run, "fit": _fit, "evaluate": _evaluate, "info": _info}
+    commands = {"run": _run, "fit": _fit, "evaluate": _evaluate, "preview": _preview, "info": _info}
     commands[command](parser.instantiate(parsed)[command])
     return 0
 
@@ -73,12 +73,20 @@ def _parser() -> Any:
     evaluate.add_argument("--seed", type=int, default=0, help="of that noise")
     evaluate.add_argument("--json", type=str | None, default=None, help="also write the result to this file")
 
+    preview = new("Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.")
+    preview.add_argument("picture", type=str, help="an sRGB picture")
+    preview.add_argument("--out", type=str, required=True, help="the PNG to write; the atoms go to NAME-atoms.png")
+    preview.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
+    preview.add_argument("--count", type=int, default=4, help="augmented RAWs to draw")
+    preview.add_argument("--seed", type=int, default=0, help="of these")
+
     info = new("What is in a file of weights.")
     info.add_argument("weights", type=str, help="a .safetensors file, or the name of a shipped ISP")
 
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
     subcommands = parser.add_subcommands(dest="command")
-    for name, subparser in {"run": run, "fit": fit, "evaluate": evaluate, "info": info}.items():
+    parsers = {"run": run, "fit": fit, "evaluate": evaluate, "preview": preview, "info": info}
+    for name, subparser in parsers.items():
         subcommands.add_subcommand(name, subparser, help=subparser.description)
     return parser
 
@@ -112,6 +120,14 @@ def _evaluate(arguments: Any) -> None:
     print_scores(result)
     if arguments.json:
         write_json(result, arguments.json)
+
+
+def _preview(arguments: Any) -> None:
+    from rawaug.experiment.preview import preview
+
+    a = arguments
+    for path in preview(a.picture, a.isp, a.out, a.count, a.seed):
+        print(path)
 
 
 def _info(arguments: Any) -> None:

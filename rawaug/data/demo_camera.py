@@ -1,12 +1,12 @@
 r"""The demo camera: makes RAW and sRGB of the same shot from any picture, so that everything can be tried without data.
 
-    clean = Q(y),  noisy = Q(shot_var Poisson(y / shot_var) + N(0, read_var)),   y = mosaic(e s diag(g)^-1 M^-1 L(x))
+    clean = Q(y),  noisy = Q(shot_var Poisson(y / shot_var) + N(0, read_var)),   y = mosaic(e s diag(g)^-1 M^-1 B L(x))
     srgb  = tone(M diag(g) demosaic(clean / s))
 
-The picture x is the scene, linearised by L (IEC 61966-2-1). A shot has an illuminant (gains g), an exposure e and an
-ISO (noise levels); the camera has a colour matrix M, lens shading s that falls off like cos^4 around a point off
-centre, a GRBG sensor of 12 bits with a black level (Q), and a film-like tone curve. It shares no code with the ISPs
-that are fitted to it: other noise (Poisson counts), other demosaicing (Malvar, He and Cutler), another tone curve.
+The picture x is the scene, linearised by L (IEC 61966-2-1); B is the blur of lens and optical low-pass filter. A shot
+has an illuminant (gains g), an exposure e and an ISO (noise levels); the camera has a colour matrix M, lens shading s
+that falls off like cos^4 around a point off centre, a GRBG sensor of 12 bits with a black level (Q), and a film-like
+tone curve. It shares no code with the ISPs that are fitted to it: other noise (Poisson counts), other demosaicing (Malvar, He and Cutler), another tone curve.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ _COLOR_MATRIX = ((1.66, -0.53, -0.13), (-0.21, 1.55, -0.34), (0.02, -0.47, 1.45)
 _ILLUMINANTS = ((2.25, 1.32), (2.10, 1.41), (1.98, 1.52), (1.85, 1.66), (1.72, 1.84), (1.55, 2.15))
 """Gains of red and blue from open shade over daylight to tungsten."""
 _EXPOSURE = (0.75, 1.0)
+_BLUR = 0.7
+"""Standard deviation in pixels of the point spread: no lens is as sharp as a picture that was scaled down."""
 _SHADING_CENTRE = (0.06, -0.04)
 _SHADING_FOCAL_LENGTH = 1.85
 _SHOULDER, _CONTRAST = 1.2, 0.4
@@ -117,7 +119,9 @@ class DemoCamera:
 
     def _expose(self, picture: Tensor, shot: Shot) -> Tensor:
         """The light on the sensor before noise, ``(1, H, W)``, white = 1."""
-        scene = decode_srgb(picture.float() / 255)
+        from kornia.filters import gaussian_blur2d
+
+        scene = gaussian_blur2d(decode_srgb(picture[None].float() / 255), 5, (_BLUR, _BLUR))[0]
         to_camera = torch.linalg.inv(torch.tensor(_COLOR_MATRIX))
         camera = torch.einsum("ij,jhw->ihw", to_camera, scene) / _column(shot.white_balance)
         return mosaic(shot.exposure * _shading(*picture.shape[-2:]) * camera, self.cfa).clamp(min=0)

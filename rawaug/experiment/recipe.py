@@ -53,9 +53,9 @@ class TrainConfig:
         learning_rate: of Adam at its highest.
         warmup: steps of linear warm-up before the cosine.
         loss: l1, l2 or charbonnier.
-        ema: decay of the weights' running average, which is what is validated and saved; 0 switches it off.
+        ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
-        validate_every: steps between two looks at the validation pairs.
+        validate_every: steps between two looks at the validation pairs; the best weights are kept.
         checkpoint_every: steps between two checkpoints (a killed run goes on from the last).
         workers: processes that prepare samples; 0 prepares them in the training process.
         precision: Fabric's, such as 32-true or bf16-mixed.

@@ -6,6 +6,7 @@ weights. Lightning Fabric places model and data: the same code on a CPU, one GPU
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 import time
@@ -55,7 +56,7 @@ def train(
         label: heads the progress bar.
 
     Returns:
-        The network with the averaged weights, in eval mode, on the CPU.
+        The network with the averaged weights of the best validation, in eval mode, on the CPU.
     """
     from lightning_fabric import Fabric
     from torch.utils.tensorboard.writer import SummaryWriter
@@ -70,7 +71,7 @@ def train(
     )
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
-    start = resume(folder / "last.pt", net, average, optimiser, schedule)
+    start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
 
     memory_format = torch.channels_last if config.channels_last else torch.contiguous_format
     model, optimiser = fabric.setup(net.to(memory_format=memory_format), optimiser)  # type: ignore[call-overload]
@@ -82,7 +83,7 @@ def train(
     )
     loss_function = LOSSES[config.loss]
     writer = SummaryWriter(str(folder)) if fabric.is_global_zero else None
-    began, score = time.perf_counter(), float("nan")
+    began = time.perf_counter()
 
     bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=not fabric.is_global_zero)
     for step, batch in enumerate(bar, start=start + 1):
@@ -98,15 +99,20 @@ def train(
 
         if step % config.validate_every == 0 or step == config.steps:
             score = validate(average.module, validation, fabric.device)
+            if score > best["psnr"]:
+                best = {"psnr": score, "step": step, "net": copy.deepcopy(average.module.state_dict())}
             if writer is not None:
                 rate = (step - start) * stream.batch / (time.perf_counter() - began)
                 log(folder / "log.csv", writer, step, loss=loss.item(), psnr=score, samples_per_second=rate)
         if fabric.is_global_zero and (step % config.checkpoint_every == 0 or step == config.steps):
             state = {"net": net.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
-            write_atomically({**state, "schedule": schedule.state_dict(), "step": step}, folder / "last.pt")
-        bar.set_postfix_str(f"loss {loss.item():.4f}, validation {score:.2f} dB", refresh=False)
+            write_atomically(
+                {**state, "schedule": schedule.state_dict(), "step": step, "best": best}, folder / "last.pt"
+            )
+        bar.set_postfix_str(f"loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}", refresh=False)
     if writer is not None:
         writer.close()
+    average.module.load_state_dict(best["net"])
     trained = average.module.cpu().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     return trained.eval()
 
@@ -128,14 +134,14 @@ def validate(net: nn.Module, samples: Sequence[Sample], device: torch.device) ->
     return torch.cat(scores).mean().item()
 
 
-def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> int:
-    """Load the checkpoint at ``path`` if there is one; the number of steps already done."""
+def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> tuple[int, dict[str, Any]]:
+    """Load the checkpoint at ``path`` if there is one; the number of steps already done, and the best until then."""
     if not path.is_file():
-        return 0
+        return 0, {"psnr": float("-inf"), "step": 0}
     state = torch.load(path, map_location="cpu", weights_only=True)
     for key, target in {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}.items():
         target.load_state_dict(state[key])
-    return int(state["step"])
+    return int(state["step"]), state["best"]
 
 
 def write_atomically(state: dict[str, Any], path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from rawaug import bayer
@@ -263,7 +263,7 @@ class DictionaryISP(nn.Module):
         header = {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(self.config))}
         header["info"] = json.dumps(self.info)
         partial = path.with_name(path.name + ".partial")
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, str(partial), header)
+        partial.write_bytes(save({key: value.contiguous() for key, value in self.state_dict().items()}, header))
         partial.replace(path)
 
     @classmethod

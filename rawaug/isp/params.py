@@ -45,8 +45,8 @@ class ISPConfig:
             raise ValueError(f"stages: unknown {sorted(unknown)}; choose from {' '.join(POINTWISE_STAGES)}")
 
 
-SMALL = {"colour_atoms": 8, "gain_atoms": 8, "encoder_widths": (16, 32, 64)}
-"""Settings of the size with at most 0.2 M parameters."""
+SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))
+"""The size with at most 0.2 M parameters."""
 
 
 class ISPParams(NamedTuple):

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from rawaug.cli import main
+from rawaug.data import demo_pictures
+from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
@@ -35,6 +37,15 @@ def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["info", weights]) == 0
     text = capsys.readouterr().out
     assert "colour atoms" in text and "train_00_astronaut" in text
+
+
+def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "picture.png"
+    write_picture(picture, demo_pictures(3)[2])
+    assert main(["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2"]) == 0
+    for name in ("stages.png", "stages-atoms.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
 
 
 def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

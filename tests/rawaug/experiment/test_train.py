@@ -15,6 +15,7 @@ from rawaug.experiment import train as loop
 from rawaug.experiment.evaluate import frozen_sample
 from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
 from rawaug.experiment.stream import RealCrops, Sample, TrainingStream
+from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
@@ -41,7 +42,7 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2, "deviation": True})
     config = replace(CONFIG, steps=120, batch=4, ema=0.9)
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
-    noisy = loop.psnr(validation[0].noisy, validation[0].clean).item()
+    noisy = psnr(validation[0].noisy, validation[0].clean).item()
     assert loop.validate(net, validation, torch.device("cpu")) > noisy + 2.0
     assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,samples_per_second"
 

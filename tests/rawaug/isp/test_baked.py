@@ -18,8 +18,8 @@ def curved_isp(**settings: object) -> DictionaryISP:
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings), generator)  # type: ignore[arg-type]
     with torch.no_grad():
         isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-        for layers in (isp.reverse_networks.tone.layers, isp.reverse_networks.attention.layers):
-            layers[-1].weight.normal_(std=0.05, generator=generator)
+        for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):
+            list(network.parameters())[-2].normal_(std=0.05, generator=generator)
     isp.shading.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
     return isp
 

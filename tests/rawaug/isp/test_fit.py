@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
-QUICK = {"steps": 60, "pixels": 4096, "batch": 1024}
+QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
 
 
 def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
@@ -22,7 +23,7 @@ def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | 
 
 @pytest.fixture(scope="module")
 def fitted(exact_pairs: list[Pair]) -> DictionaryISP:
-    return fit_isp(exact_pairs, FitConfig(**QUICK), progress=False)
+    return fit_isp(exact_pairs, QUICK, progress=False)
 
 
 def test_it_recovers_matrix_and_gains(
@@ -50,8 +51,8 @@ def test_without_fall_off_the_shading_stage_is_left_out(fitted: DictionaryISP) -
 def test_fall_off_is_found_and_worth_its_decibels(exact_pair: Callable[..., Pair]) -> None:
     pairs = [exact_pair(f"s{k}", (1.6, 1.0, 1.5), k, fall_off=0.8) for k in range(2)]
     unseen = exact_pair("unseen", (1.6, 1.0, 1.5), seed=9, fall_off=0.8)
-    with_mask = fit_isp(pairs, FitConfig(**QUICK), progress=False)
-    without = fit_isp(pairs, FitConfig(**QUICK, shading="off"), progress=False)
+    with_mask = fit_isp(pairs, QUICK, progress=False)
+    without = fit_isp(pairs, replace(QUICK, shading="off"), progress=False)
     torch.testing.assert_close(with_mask.shading.precision.diagonal(), torch.full((2,), 0.8), atol=0.1, rtol=0)
     assert error_db(with_mask, unseen, unseen.white_balance) > error_db(without, unseen, unseen.white_balance) + 6.0
 
@@ -75,10 +76,10 @@ def test_more_frames_than_atoms_are_clustered(exact_pairs: list[Pair]) -> None:
 
 def test_no_frame_and_a_white_frame_are_refused(exact_pairs: list[Pair], camera_matrix: torch.Tensor) -> None:
     with pytest.raises(ValueError, match="no RAW-sRGB pair"):
-        fit_isp([], FitConfig(**QUICK), progress=False)
+        fit_isp([], QUICK, progress=False)
     first = exact_pairs[0]
     white = Pair(
         "white", torch.full_like(first.srgb, 255), torch.ones_like(first.raw), first.cfa, (1, 1, 1), camera_matrix
     )
     with pytest.raises(ValueError, match="unclipped"):
-        fit_isp([white], FitConfig(**QUICK), progress=False)
+        fit_isp([white], QUICK, progress=False)

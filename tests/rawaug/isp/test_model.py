@@ -24,7 +24,7 @@ def count(isp: DictionaryISP) -> int:
 
 def test_sizes_stay_within_the_published_ones() -> None:
     assert 0.45e6 < count(DictionaryISP()) <= 0.59e6
-    assert count(DictionaryISP(ISPConfig(**SMALL))) <= 0.2e6
+    assert count(DictionaryISP(SMALL)) <= 0.2e6
 
 
 def test_reverse_gives_a_mosaic_and_the_intermediates(srgb: torch.Tensor) -> None:

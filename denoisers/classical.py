@@ -1,0 +1,194 @@
+r"""Classical denoisers of packed RAW: non-local means, wavelet shrinkage, total variation and BM3D.
+
+Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and is given ``y / sigma`` here, with
+``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal, so wrap the denoiser in
+:class:`Stabilised` for shot noise; alone it works at the mean level.
+
+Domain: packed RAW, any scale, not clipped; the work is done on the CPU. Sources: Buades et al., CVPR 2005 (non-local
+means); Coifman and Donoho, 1995 (translation-invariant shrinkage); Chambolle, JMIV 2004 (total variation); Dabov et
+al., TIP 2007 (BM3D); Makitalo and Foi, TIP 2013 (stabilise, denoise, unstabilise).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from importlib import import_module
+from itertools import product
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Planes = np.ndarray[Any, np.dtype[np.float32]]
+
+_HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32)
+"""R, Gr, Gb, B to luminance and three differences; orthonormal (white noise stays white), its own inverse."""
+
+
+class Classical(ABC):
+    """Base: ``denoiser(noisy, variance) -> denoised``, ``(B, 4, h, w)``, picture by picture.
+
+    Args:
+        strength: multiplies the method's own default amount of smoothing.
+    """
+
+    smallest: ClassVar[int] = 2
+    """The shortest side, in packed pixels, that the method takes."""
+
+    def __init__(self, strength: float = 1.0) -> None:
+        if not strength > 0:
+            raise ValueError(f"strength must be positive, got {strength}")
+        self.strength = strength
+
+    @abstractmethod
+    def denoise(self, planes: Planes) -> Planes:
+        """``(h, w, 4)`` with white noise of deviation 1 to the estimate without it, same shape."""
+
+    def __call__(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Denoise ``(B, 4, h, w)``; a picture without noise is returned as it is.
+
+        Args:
+            noisy: packed RAW.
+            variance: the noise variance, shape of ``noisy`` or broadcast to it; its mean over each picture is used.
+
+        Raises:
+            ValueError: if ``variance`` is missing, or the shape is not that of packed RAW or too small for the method.
+        """
+        name, least = type(self).__name__, self.smallest
+        if noisy.ndim != 4 or noisy.shape[1] != 4 or min(noisy.shape[-2:]) < least:
+            raise ValueError(f"{name} takes packed RAW (B, 4, h >= {least}, w >= {least}), got {tuple(noisy.shape)}")
+        if variance is None:
+            raise ValueError(f"{name} needs the noise variance: pass it as the second argument")
+        sigmas = variance.expand_as(noisy).mean((1, 2, 3)).sqrt().tolist()
+        return torch.stack([self._one(image, sigma) for image, sigma in zip(noisy, sigmas, strict=True)])
+
+    def _one(self, image: Tensor, sigma: float) -> Tensor:
+        if sigma == 0:
+            return image
+        planes = image.detach().permute(1, 2, 0).to("cpu", torch.float32).numpy() / np.float32(sigma)
+        clean = np.ascontiguousarray(self.denoise(planes), np.float32) * np.float32(sigma)
+        return torch.from_numpy(clean).permute(2, 0, 1).to(image)
+
+
+class NonLocalMeans(Classical):
+    """Non-local means (scikit-image, fast mode): patches of 5 x 5 over all four planes, sought 6 pixels around."""
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        from skimage.restoration import denoise_nl_means
+
+        settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
+        return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
+
+
+class Wavelet(Classical):
+    """Translation-invariant Haar shrinkage (scikit-image, PyWavelets): hard threshold at 3 sigma, mean of 16 shifts."""
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        from skimage.restoration import denoise_wavelet
+
+        height, width, channels = planes.shape
+        # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
+        sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
+        settings = {
+            "sigma": [sigma] * channels,
+            "wavelet": "haar",
+            "method": "VisuShrink",
+            "mode": "hard",
+            "wavelet_levels": min(4, min(height, width).bit_length() - 1),
+            "rescale_sigma": False,
+            "channel_axis": -1,
+        }
+        mean = np.zeros_like(planes)
+        for shift in product(range(4), repeat=2):
+            shrunk = denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
+            mean += np.roll(shrunk, np.negative(shift), (0, 1)) / 16
+        return mean
+
+
+class TotalVariation(Classical):
+    """Total variation (scikit-image, Chambolle's projection), each plane by itself."""
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        from skimage.restoration import denoise_tv_chambolle
+
+        return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
+
+
+class BM3D(Classical):
+    """BM3D (the ``bm3d`` wheel of its authors), blocks matched on the mean of the four planes.
+
+    The wheel is for non-commercial use only and therefore no requirement of this package: ``pip install bm3d``.
+    """
+
+    smallest = 16
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`.
+
+        Raises:
+            ImportError: if the wheel is not installed.
+        """
+        try:
+            bm3d = import_module("bm3d")
+        except ImportError:
+            raise ImportError(
+                "BM3D needs the bm3d wheel, whose licence is for non-commercial use only: pip install bm3d"
+            ) from None
+        # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
+        return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
+
+
+class Transform(Protocol):
+    """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
+
+    def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        """``(B, 4, h, w)`` RAW with var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
+
+    def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        """The estimate in the transform's domain back to RAW."""
+
+
+class Stabilised:
+    """A denoiser of white noise on RAW with shot noise: ``inverse(denoiser(forward(noisy), 1))``.
+
+    Args:
+        denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
+        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.stabilise``: the generalised Anscombe
+            transform with its exact unbiased inverse.
+
+    Example:
+        >>> class Scale:
+        ...     def forward(self, y, shot_var, read_var):
+        ...         return y / read_var.sqrt().reshape(-1, 1, 1, 1)
+        ...     def inverse(self, z, shot_var, read_var):
+        ...         return z * read_var.sqrt().reshape(-1, 1, 1, 1)
+        >>> denoiser = Stabilised(TotalVariation(), Scale())
+        >>> denoiser(torch.rand(1, 4, 16, 16), shot_var=torch.zeros(1), read_var=torch.full((1,), 1e-4)).shape
+        torch.Size([1, 4, 16, 16])
+    """
+
+    def __init__(self, denoiser: Classical, transform: Transform) -> None:
+        self.denoiser = denoiser
+        self.transform = transform
+
+    def __call__(self, noisy: Tensor, variance: Tensor | None = None, *, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        """Denoise ``(B, 4, h, w)``.
+
+        Args:
+            noisy: packed RAW.
+            variance: not read; here so that all denoisers are called alike.
+            shot_var: ``(B,)``, the noise is var(y) = shot_var y + read_var.
+            read_var: ``(B,)``.
+
+        Raises:
+            ValueError: if ``shot_var`` or ``read_var`` is not one number a picture.
+        """
+        for name, value in (("shot_var", shot_var), ("read_var", read_var)):
+            if value.shape != noisy.shape[:1]:
+                raise ValueError(f"{name} must be of shape ({len(noisy)},), one a picture, got {tuple(value.shape)}")
+        stable = self.transform.forward(noisy, shot_var, read_var)
+        return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot_var, read_var)

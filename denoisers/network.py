@@ -1,0 +1,121 @@
+r"""What every network here does around its own layers: ``denoised = noisy + residual([noisy, noise map])``.
+
+Domain: packed RAW, float, white = 1, not clipped at black; any height and width from 2 on. A network that pools ``s``
+times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by reflection
+without repeating the edge (as often as needed, so a 2 x 2 picture passes too), and the result is cropped back.
+
+The noise map is the standard deviation by default. UPI's is the variance, whose values of 1e-5 to 1e-2 move the first
+layer little: after 400 steps at a learning rate of 1e-3 the U-Net of width 8 had taken 12 % off the l1 error with the
+deviation and 6 % with the variance. The residual's last convolution starts at zero, so that an untrained network is the
+identity.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+PACKED = 4
+"""Channels of packed RAW: R, Gr, Gb, B."""
+
+LEAK = 0.2
+"""Negative slope that the initialisation reckons with (the U-Net's own; the others' are near enough)."""
+
+
+def conv(inputs: int, outputs: int, size: int = 3, bias: bool = True) -> nn.Conv2d:
+    """A convolution that keeps the size, its weights not drawn yet: :meth:`Denoiser.initialise` does that."""
+    device = torch.get_default_device()
+    return nn.utils.skip_init(nn.Conv2d, inputs, outputs, size, padding=size // 2, bias=bias, device=device)
+
+
+def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
+    """Pad ``(B, C, h, w)`` below and on the right to multiples of ``stride``, by reflection without the edge."""
+    for axis in (-2, -1):
+        size = image.shape[axis]
+        padding = -size % stride
+        if padding:
+            period = 2 * (size - 1)
+            place = torch.arange(size + padding, device=image.device) % period
+            image = image.index_select(axis, torch.minimum(place, period - place))
+    return image
+
+
+def require_width(width: int, multiple: int = 1) -> None:
+    """Refuse a number of features that no layer can have."""
+    if width < 1 or width % multiple:
+        raise ValueError(f"width must be a positive multiple of {multiple}, got {width}")
+
+
+class Denoiser(nn.Module, ABC):
+    """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``.
+
+    Args:
+        channels: of the picture, 4 for packed RAW.
+        variance_map: feed the noise map as ``channels`` more inputs; calls must then pass ``variance``.
+        deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
+        stride: sides are padded to multiples of this inside.
+        config: the constructor's arguments, kept with the weights so that the same network can be built again.
+    """
+
+    def __init__(self, channels: int, variance_map: bool, deviation: bool, stride: int, config: dict[str, Any]) -> None:
+        super().__init__()
+        self.channels = channels
+        self.variance_map = variance_map
+        self.deviation = deviation
+        self.stride = stride
+        shared = {"channels": channels, "variance_map": variance_map, "deviation": deviation}
+        self.config: dict[str, Any] = {**config, **shared}
+
+    @property
+    def inputs(self) -> int:
+        """Channels that enter the first layer."""
+        return self.channels * (1 + self.variance_map)
+
+    @abstractmethod
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Denoise ``(B, channels, h, w)``; the result has the same shape and is not clipped.
+
+        Args:
+            noisy: packed RAW.
+            variance: the noise variance of each value, not negative, shape of ``noisy``; a network without a noise map
+                does not read it.
+
+        Raises:
+            ValueError: if a shape is wrong, or the network was made with a noise map and ``variance`` is missing.
+        """
+        name = type(self).__name__
+        if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
+            raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
+        features = noisy
+        if self.variance_map:
+            if variance is None:
+                raise ValueError(f"{name} was made with variance_map=True: pass the noise variance of each value")
+            if variance.shape != noisy.shape:
+                raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
+            features = torch.cat([noisy, variance.sqrt() if self.deviation else variance], dim=1)
+        correction = self.residual(pad_to_multiple(features, self.stride))
+        return noisy + correction[..., : noisy.shape[-2], : noisy.shape[-1]]
+
+    @torch.no_grad()
+    def initialise(self, seed: int, *zeros: nn.Conv2d) -> None:
+        """Draw all convolutions anew (He et al. 2015, fan in), biases zero; ``zeros`` become zero altogether.
+
+        The numbers come from a CPU generator of ``seed``: the same on every device, and the global state is untouched.
+        """
+        generator = torch.Generator("cpu").manual_seed(seed)
+        for module in self.modules():
+            if not isinstance(module, nn.Conv2d) or module.weight.is_meta:
+                continue
+            if module in zeros:
+                module.weight.zero_()
+            else:
+                draw = torch.empty(module.weight.shape, device="cpu")
+                module.weight.copy_(nn.init.kaiming_normal_(draw, a=LEAK, generator=generator))
+            if module.bias is not None:
+                module.bias.zero_()

@@ -1,0 +1,68 @@
+r"""Denoising in tiles: ``f(y)[core] = f(y[core + overlap on every side])[core]``.
+
+Domain: packed RAW of any size. The equality is exact (to rounding) where the overlap is at least the network's
+receptive radius and the tiles start at multiples of its stride, so that pooling grids fall on the same pixels as in
+the whole picture: from 17 pixels for a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with
+distance: with a trained U-Net no value differed by more than 4 % of the noise's deviation at an overlap of 32 and by
+1 % at 64. Only the middle of each tile is kept; nothing is blended: that would hide an overlap that is too small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def _starts(size: int, tile: int, overlap: int, stride: int) -> list[int]:
+    """Where the tiles begin along a side: steps of ``tile - 2 overlap``, and a last one that reaches the end."""
+    last = max(0, -(-(size - tile) // stride) * stride)
+    return [*range(0, last, tile - 2 * overlap), last]
+
+
+@torch.no_grad()
+def tiled(
+    model: Callable[[Tensor, Tensor | None], Tensor],
+    noisy: Tensor,
+    variance: Tensor | None = None,
+    tile: int = 256,
+    overlap: int = 32,
+) -> Tensor:
+    """Denoise a picture of any size piece by piece, without gradients.
+
+    Peak memory is the result plus what the model needs for one ``(B, 4, tile, tile)`` piece, whatever the picture's
+    size; about ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles.
+        noisy: ``(B, 4, h, w)``.
+        variance: the noise variance of each value, shape of ``noisy``.
+        tile: side of a piece in packed pixels, overlap included.
+        overlap: context on each inner side, dropped from the result.
+
+    Raises:
+        ValueError: if the overlap leaves nothing of a tile, tile or overlap are no multiples of the model's stride, or
+            the tile is less than two strides.
+
+    Example:
+        >>> from denoisers import DnCNN
+        >>> tiled(DnCNN(width=8, depth=4, variance_map=False), torch.rand(1, 4, 300, 90), tile=64, overlap=8).shape
+        torch.Size([1, 4, 300, 90])
+    """
+    stride: int = getattr(model, "stride", 1)
+    if not 0 <= 2 * overlap < tile:
+        raise ValueError(f"overlap must be at least 0 and less than half the tile {tile}, got {overlap}")
+    if tile % stride or overlap % stride:
+        raise ValueError(f"tile {tile} and overlap {overlap} must be multiples of the model's stride {stride}")
+    if tile < 2 * stride:
+        raise ValueError(f"tile must be at least {2 * stride}, twice the model's stride, got {tile}")
+    denoised = torch.empty_like(noisy)
+    # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
+    for top in _starts(noisy.shape[-2], tile, overlap, stride):
+        for left in _starts(noisy.shape[-1], tile, overlap, stride):
+            window = (..., slice(top, top + tile), slice(left, left + tile))
+            piece = model(noisy[window], None if variance is None else variance[window])
+            above, before = (overlap if start else 0 for start in (top, left))
+            denoised[..., top + above : top + tile, left + before : left + tile] = piece[..., above:, before:]
+    return denoised

@@ -1,0 +1,114 @@
+r"""Files of weights: safetensors, with what is needed to build the network again as string metadata.
+
+``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
+"info": <JSON: anything the writer wants to tell>}``. Nothing in such a file is code; only the classes in
+:data:`denoisers.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from denoisers.network import Denoiser
+from denoisers.registry import DENOISERS, build
+
+FORMAT, KIND = "rawaug", "denoiser"
+
+
+def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) -> None:
+    """Write a network to ``path``: whole or not at all, an older file of this name stays until then.
+
+    Args:
+        model: one of the registered networks, on any device and in any memory format.
+        path: the file, in a folder that exists; by habit ``*.safetensors``.
+        info: what to tell about it (data, steps, seed, ...), as JSON can hold it.
+
+    Raises:
+        ValueError: if the class is not registered, or ``info`` is nothing that JSON can hold.
+        FileNotFoundError: if the folder does not exist.
+    """
+    from safetensors.torch import save_file
+
+    path = Path(path)
+    name = type(model).__name__
+    if DENOISERS.get(name) is not type(model):
+        raise ValueError(f"{path}: cannot save a {name}; only {', '.join(DENOISERS)} can be loaded again")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: its folder does not exist; make it first")
+    try:
+        texts = {"config": json.dumps(model.config), "info": json.dumps(info)}
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: info must be what JSON can hold: {error}") from None
+    tensors = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        save_file(tensors, unfinished, metadata={"format": FORMAT, "kind": KIND, "model": name, **texts})
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
+    """Read what :func:`save` wrote: the network, on the CPU in eval mode, and the info.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not such a file, or its weights do not fit the network that it names.
+
+    Example:
+        >>> import tempfile
+        >>> from denoisers import DnCNN
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(DnCNN(width=8, depth=3), f"{folder}/small.safetensors", {"steps": 0})
+        ...     load(f"{folder}/small.safetensors")[1]
+        {'steps': 0}
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    metadata, tensors = _read(path)
+    if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
+        raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
+    config, info = (_parse(path, metadata, key) for key in ("config", "info"))
+    try:
+        # On the meta device the network takes no memory before the file's tensors are known to fit.
+        with torch.device("meta"):
+            model = build(metadata.get("model", ""), **config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    expected = model.state_dict()
+    for key in sorted(expected.keys() | tensors.keys()):
+        if key not in tensors or key not in expected:
+            raise ValueError(f"{path}: tensor {key} is {'unknown' if key in tensors else 'missing'}")
+        shape, dtype = tensors[key].shape, tensors[key].dtype
+        if (shape, dtype) != (expected[key].shape, expected[key].dtype):
+            wanted = f"{tuple(expected[key].shape)} {expected[key].dtype}"
+            raise ValueError(f"{path}: tensor {key} is {tuple(shape)} {dtype}, the network needs {wanted}")
+    model.load_state_dict(tensors, assign=True)
+    return model.eval(), info
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a safetensors file: {str(error).splitlines()[0]}") from None
+
+
+def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
+    try:
+        value = json.loads(metadata.get(key, ""))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: metadata {key!r} is no JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: metadata {key!r} must be a JSON object, got {type(value).__name__}")
+    return value

@@ -1,0 +1,114 @@
+"""Classical denoisers: less noise on a picture with edges, none is the identity, scale-free, shot noise stabilised."""
+
+import sys
+
+import pytest
+import torch
+from torch import Tensor
+
+from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
+from denoisers.classical import _HADAMARD, Classical
+
+SIGMA = 0.03
+OWN = [NonLocalMeans, Wavelet, TotalVariation]
+
+
+def scene() -> tuple[Tensor, Tensor]:
+    """(clean, noisy) of a slope with a disc on it, each plane with a gain of its own."""
+    i, j = torch.meshgrid(torch.arange(64.0), torch.arange(48.0), indexing="ij")
+    shape = 0.2 + i / 200 + 0.3 * ((i - 30) ** 2 + (j - 20) ** 2 < 200)
+    clean = (torch.tensor([0.5, 1.0, 1.0, 0.7]).reshape(4, 1, 1) * shape).expand(2, 4, 64, 48)
+    return clean, clean + SIGMA * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+
+
+def mse(a: Tensor, b: Tensor) -> float:
+    return (a - b).square().mean().item()
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_most_of_the_noise_goes(method: type[Classical]) -> None:
+    clean, noisy = scene()
+    denoised = method()(noisy, torch.full_like(noisy, SIGMA**2))
+    assert denoised.shape == noisy.shape and denoised.dtype == noisy.dtype
+    assert mse(denoised, clean) < 0.35 * mse(noisy, clean)
+    assert (denoised - clean).mean().abs() < 1e-3
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_only_the_ratio_of_signal_to_noise_counts(method: type[Classical]) -> None:
+    _, noisy = scene()
+    once = method()(noisy, torch.full_like(noisy, SIGMA**2))
+    torch.testing.assert_close(method()(8 * noisy, torch.full_like(noisy, (8 * SIGMA) ** 2)) / 8, once)
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_each_picture_has_its_own_noise_level(method: type[Classical]) -> None:
+    _, noisy = scene()
+    variance = torch.tensor([0.0, SIGMA**2]).reshape(2, 1, 1, 1)
+    both = method()(noisy, variance)
+    assert torch.equal(both[0], noisy[0])
+    assert torch.equal(both[1:], method()(noisy[1:], variance[1:]))
+
+
+@pytest.mark.parametrize("method", OWN)
+def test_strength_smooths_more(method: type[Classical]) -> None:
+    _, noisy = scene()
+    variance = torch.full_like(noisy, SIGMA**2)
+    weak, strong = (mse(method(strength)(noisy, variance), noisy) for strength in (0.3, 1.0))
+    assert weak < strong
+    with pytest.raises(ValueError, match="strength must be positive"):
+        method(0)
+
+
+@pytest.mark.parametrize("method", [*OWN, BM3D])
+def test_small_and_wrong_inputs(method: type[Classical]) -> None:
+    least = method.smallest
+    if method is not BM3D:
+        noisy = torch.rand(1, 4, least, least + 1, generator=torch.Generator().manual_seed(0))
+        assert method()(noisy, torch.full_like(noisy, 1e-3)).isfinite().all()
+    with pytest.raises(ValueError, match=r"takes packed RAW \(B, 4, h >="):
+        method()(torch.zeros(1, 4, least - 1, 32), torch.zeros(1))
+    with pytest.raises(ValueError, match="needs the noise variance"):
+        method()(torch.zeros(1, 4, 32, 32))
+
+
+def test_bm3d_says_how_to_get_it_and_under_which_licence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    with pytest.raises(ImportError, match="non-commercial use only: pip install bm3d"):
+        BM3D()(torch.zeros(1, 4, 16, 16), torch.ones(1))
+
+
+def test_bm3d_where_installed() -> None:
+    pytest.importorskip("bm3d", reason="the bm3d wheel (non-commercial) is not installed")
+    clean, noisy = scene()
+    denoised = BM3D()(noisy[:1], torch.full_like(noisy[:1], SIGMA**2))
+    assert mse(denoised, clean[:1]) < 0.2 * mse(noisy[:1], clean[:1])
+
+
+def test_the_luminance_rotation_is_its_own_inverse() -> None:
+    assert torch.equal(torch.from_numpy(_HADAMARD @ _HADAMARD), torch.eye(4))
+
+
+class Root:
+    """Anscombe's first approximation for var(y) = a y + b: z = 2/a sqrt(a y + 3/8 a^2 + b), inverted algebraically."""
+
+    def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        a, b = (value.reshape(-1, 1, 1, 1) for value in (shot_var, read_var))
+        return 2 / a * (a * y + 0.375 * a**2 + b).clamp_min(0).sqrt()
+
+    def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        a, b = (value.reshape(-1, 1, 1, 1) for value in (shot_var, read_var))
+        return ((a * z / 2) ** 2 - 0.375 * a**2 - b) / a
+
+
+def test_stabilised_beats_the_mean_level_under_shot_noise() -> None:
+    clean, _ = scene()
+    clean = clean**3 + 0.002
+    shot_var, read_var = torch.tensor([0.01, 0.02]), torch.tensor([1e-5, 1e-5])
+    variance = shot_var.reshape(2, 1, 1, 1) * clean + read_var.reshape(2, 1, 1, 1)
+    noisy = clean + variance.sqrt() * torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    levels = {"shot_var": shot_var, "read_var": read_var}
+    denoised = Stabilised(NonLocalMeans(), Root())(noisy, **levels)
+    assert mse(denoised, clean) < 0.9 * mse(NonLocalMeans()(noisy, variance), clean)
+    with pytest.raises(ValueError, match=r"shot_var must be of shape \(2,\)"):
+        Stabilised(NonLocalMeans(), Root())(noisy, shot_var=shot_var[:1], read_var=read_var)

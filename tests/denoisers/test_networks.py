@@ -1,0 +1,166 @@
+"""The contract that every network keeps: shapes, identity before training, errors, dtypes, export."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from denoisers import DHDN, Denoiser, DnCNN, UNet
+from denoisers.network import pad_to_multiple
+
+Make = Callable[..., Any]
+
+SMALL: dict[str, Make] = {
+    "UNet": lambda **settings: UNet(width=4, **settings),
+    "DHDN": lambda **settings: DHDN(width=4, **settings),
+    "DnCNN": lambda **settings: DnCNN(width=8, depth=4, **settings),
+}
+
+
+@pytest.fixture(params=SMALL)
+def make(request: pytest.FixtureRequest) -> Make:
+    return SMALL[request.param]
+
+
+def pair(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(shape, generator=generator) - 0.1, torch.rand(shape, generator=generator) * 1e-2
+
+
+def awake(model: Denoiser, seed: int = 5) -> Denoiser:
+    """The zero weights drawn as well, so that the residual is not zero."""
+    model.initialise(seed)
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.mul_(0.7)  # DHDN's residual blocks would double the signal fourteen times
+    return model.eval()
+
+
+@pytest.mark.parametrize("size", [(2, 2), (2, 33), (17, 5), (16, 32), (31, 48)])
+def test_any_size_is_kept_and_the_untrained_network_is_the_identity(make: Make, size: tuple[int, int]) -> None:
+    noisy, variance = pair(2, 4, *size)
+    assert torch.equal(make().eval()(noisy, variance), noisy)
+    denoised = awake(make())(noisy, variance)
+    assert denoised.shape == noisy.shape and denoised.isfinite().all() and not torch.allclose(denoised, noisy)
+
+
+def test_no_picture_depends_on_its_batch(make: Make) -> None:
+    noisy, variance = pair(3, 4, 20, 24)
+    model = awake(make())
+    together = model(noisy, variance)
+    torch.testing.assert_close(model(noisy[1:2], variance[1:2]), together[1:2], rtol=0, atol=1e-5)
+
+
+def test_the_noise_map_is_required_and_read(make: Make) -> None:
+    noisy, variance = pair(1, 4, 16, 16)
+    model = awake(make())
+    with pytest.raises(ValueError, match="variance_map=True: pass"):
+        model(noisy)
+    with pytest.raises(ValueError, match="must have the shape"):
+        model(noisy, variance[:, :1])
+    assert not torch.allclose(model(noisy, variance), model(noisy, 2 * variance))
+    squared = awake(make(deviation=False))
+    assert torch.equal(squared(noisy, variance.sqrt()), model(noisy, variance))
+
+
+def test_a_blind_network_takes_the_picture_alone(make: Make) -> None:
+    noisy, variance = pair(1, 4, 16, 16)
+    model = awake(make(variance_map=False))
+    assert torch.equal(model(noisy), model(noisy, variance))
+
+
+@pytest.mark.parametrize("shape", [(4, 16, 16), (1, 3, 16, 16), (1, 4, 1, 16)])
+def test_wrong_shapes_are_named_in_one_line(make: Make, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"takes \(B, 4, h >= 2, w >= 2\), got") as error:
+        make()(*pair(*shape))
+    assert "\n" not in str(error.value)
+
+
+def test_weights_come_from_the_seed_and_leave_the_global_generator_alone(make: Make) -> None:
+    before = torch.get_rng_state()
+    first, again, other = (make(seed=seed).state_dict() for seed in (1, 1, 2))
+    assert torch.equal(before, torch.get_rng_state())
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
+def test_every_weight_learns_within_three_steps(make: Make) -> None:
+    noisy, variance = pair(2, 4, 32, 32)
+    model = make().train()
+    before = {key: value.clone() for key, value in model.named_parameters()}
+    optimizer = torch.optim.Adam(model.parameters(), 1e-3)
+    for _ in range(3):  # what lies before a zero weight moves one step after it, and before two zeros two steps
+        optimizer.zero_grad()
+        (model(noisy, variance) - 0.3).abs().mean().backward()
+        optimizer.step()
+    assert [key for key, value in model.named_parameters() if torch.equal(value, before[key])] == []
+
+
+def test_channels_last_and_bf16_agree_with_the_plain_run(make: Make) -> None:
+    noisy, variance = pair(2, 4, 32, 48)
+    model = awake(make())
+    plain = model(noisy, variance)
+    last = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    inputs = [image.contiguous(memory_format=torch.channels_last) for image in (noisy, variance)]
+    torch.testing.assert_close(last(*inputs), plain, rtol=1e-4, atol=1e-4)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = last(*inputs)
+    assert half.dtype == torch.float32  # the sum with the noisy picture stays exact
+    correction = (plain - noisy).abs().mean()
+    assert (half - plain).abs().mean() < 0.05 * correction
+
+
+def test_export_gives_the_same_numbers(make: Make) -> None:
+    model, (noisy, variance) = awake(make()), pair(1, 4, 36, 40)
+    exported = torch.export.export(model, (noisy, variance)).module()
+    torch.testing.assert_close(exported(noisy, variance), model(noisy, variance))
+
+
+def test_export_with_sides_of_any_multiple_of_the_stride() -> None:
+    model, (noisy, variance) = awake(UNet(width=4, scales=3)), pair(1, 4, 32, 48)
+    height, width = (4 * torch.export.Dim(name, min=2, max=512) for name in ("h", "w"))
+    sizes = {2: height, 3: width}
+    exported = torch.export.export(model, (noisy, variance), dynamic_shapes=(sizes, sizes)).module()
+    larger = pair(1, 4, 64, 20)
+    torch.testing.assert_close(exported(*larger), model(*larger))
+
+
+def test_padding_reflects_without_the_edge_as_often_as_needed() -> None:
+    row = torch.tensor([[[[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]]])
+    padded = pad_to_multiple(row, 8)
+    assert padded[0, 0, 0].tolist() == [0, 1, 2, 1, 0, 1, 2, 1]
+    assert padded[0, 0, :, 0].tolist() == [0, 3, 0, 3, 0, 3, 0, 3]
+    assert pad_to_multiple(padded, 8) is padded
+
+
+def test_dhdn_has_the_published_size() -> None:
+    with torch.device("meta"):
+        model = DHDN(width=128, channels=3, variance_map=False)
+    assert sum(weight.numel() for weight in model.parameters()) == pytest.approx(168.2e6, abs=0.1e6)
+
+
+def test_unet_has_the_published_features() -> None:
+    with torch.device("meta"):
+        model = UNet()
+    assert model.last.in_channels == 32
+    shapes = [tuple(weight.shape[:2]) for key, weight in model.named_parameters() if key.endswith(".0.weight")]
+    assert shapes[:5] == [(32, 8), (64, 32), (128, 64), (256, 128), (512, 256)]
+    assert shapes[5:] == [(256, 768), (128, 384), (64, 192), (32, 96)]
+    assert sum(isinstance(layer, torch.nn.Conv2d) for layer in model.modules()) == 9 * 3 + 1
+    assert model.stride == 16
+
+
+@pytest.mark.parametrize(
+    ("make_bad", "message"),
+    [
+        (lambda: UNet(width=0), "positive multiple of 1"),
+        (lambda: DHDN(width=5), "positive multiple of 2"),
+        (lambda: UNet(scales=0), "scales must be at least 1"),
+        (lambda: DnCNN(depth=1), "depth must be at least 2"),
+    ],
+)
+def test_impossible_settings_are_refused(make_bad: Make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_bad()

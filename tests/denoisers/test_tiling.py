@@ -1,0 +1,89 @@
+"""Tiles give the untiled result, at any size, wherever the overlap covers the receptive radius."""
+
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from denoisers import DnCNN, SelfEnsemble, UNet, tiled
+from denoisers.tiling import _starts
+
+
+def pair(*shape: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator) * 1e-2
+
+
+def awake(model: DnCNN | UNet) -> DnCNN | UNet:
+    model.initialise(3)
+    return model.eval()
+
+
+@given(
+    size=st.integers(2, 400),
+    stride=st.sampled_from([1, 4, 16]),
+    tile=st.integers(3, 8),
+    overlap=st.integers(0, 3),
+)
+@settings(max_examples=200, deadline=None)
+def test_starts_are_aligned_and_leave_no_gap(size: int, stride: int, tile: int, overlap: int) -> None:
+    tile, overlap = tile * stride, min(overlap, (tile - 1) // 2) * stride
+    starts = _starts(size, tile, overlap, stride)
+    assert starts[0] == 0 and all(start % stride == 0 for start in starts)
+    assert starts[-1] + tile >= size and (starts == [0] or size - starts[-1] > tile - stride)
+    # The part of a tile that is kept begins where the one before still had its context.
+    assert all(b + overlap <= a + tile - overlap for a, b in pairwise(starts))
+    assert starts == sorted(set(starts))
+
+
+@pytest.mark.parametrize("size", [(70, 41), (33, 90), (16, 16), (7, 100), (2, 2)])
+def test_convolutions_are_seamless(size: tuple[int, int]) -> None:
+    model = awake(DnCNN(width=6, depth=5, batch_norm=False))
+    noisy, variance = pair(2, 4, *size)
+    whole = model(noisy, variance)
+    assert (tiled(model, noisy, variance, tile=24, overlap=5) - whole).abs().max() < 1e-5
+    assert min(size) < 24 or (tiled(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("size", [(100, 61), (64, 128), (35, 30)])
+def test_pooling_grids_fall_together(size: tuple[int, int]) -> None:
+    model = awake(UNet(width=4, scales=2))  # receptive radius below 24
+    noisy, variance = pair(1, 4, *size)
+    whole = model(noisy, variance)
+    assert (tiled(model, noisy, variance, tile=64, overlap=24) - whole).abs().max() < 1e-5
+
+
+def test_every_piece_is_at_most_a_tile_and_no_gradient_is_kept() -> None:
+    sizes = []
+
+    class Note(nn.Module):
+        def forward(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
+            assert variance is None and not torch.is_grad_enabled()
+            sizes.append(tuple(noisy.shape[-2:]))
+            return noisy
+
+    noisy, _ = pair(1, 4, 300, 130)
+    assert torch.equal(tiled(Note(), noisy.requires_grad_(), tile=64, overlap=8), noisy)
+    assert set(sizes) == {(64, 64)}
+
+
+def test_tiles_of_an_ensemble_align_with_its_network() -> None:
+    noisy, variance = pair(1, 4, 40, 56)
+    ensemble = SelfEnsemble(UNet(width=4, scales=3), "RGGB")
+    assert torch.equal(tiled(ensemble, noisy, variance, tile=32, overlap=8), noisy)
+    with pytest.raises(ValueError, match="multiples of the model's stride 4"):
+        tiled(ensemble, noisy, variance, tile=32, overlap=6)
+
+
+def test_a_tile_is_at_least_two_strides() -> None:
+    with pytest.raises(ValueError, match="tile must be at least 16"):
+        tiled(UNet(width=4, scales=4), torch.zeros(1, 4, 17, 17), tile=8, overlap=0)
+
+
+@pytest.mark.parametrize("overlap", [-1, 16, 20])
+def test_an_overlap_that_leaves_nothing_is_refused(overlap: int) -> None:
+    with pytest.raises(ValueError, match="less than half the tile"):
+        tiled(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)

@@ -1,0 +1,119 @@
+"""A file of weights gives the same network back, whole or not at all, and anything else is refused in one line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from denoisers import DENOISERS, build, load, save
+from denoisers.unet import UNet
+
+SMALL: list[tuple[str, dict[str, Any]]] = [
+    ("UNet", {"width": 4, "scales": 3, "variance_map": False}),
+    ("DHDN", {"width": 4, "deviation": False}),
+    ("DnCNN", {"width": 8, "depth": 3, "batch_norm": True, "channels": 3}),
+]
+
+
+@pytest.mark.parametrize(("name", "config"), SMALL)
+def test_round_trip(name: str, config: dict[str, Any], tmp_path: Path) -> None:
+    model = build(name, seed=4, **config)
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.add_(0.01)  # nothing is at its initial value
+    model = model.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+    path = tmp_path / "a.safetensors"
+    save(model, path, {"steps": 7, "data": ["a", "b"]})
+    loaded, info = load(path)
+    assert type(loaded) is DENOISERS[name] and info == {"steps": 7, "data": ["a", "b"]}
+    assert loaded.config == model.config and not loaded.training
+    assert all(loaded.config[key] == value for key, value in config.items())
+    noisy = torch.rand(1, loaded.channels, 10, 14, generator=torch.Generator().manual_seed(0))
+    variance = torch.full_like(noisy, 1e-3)
+    torch.testing.assert_close(loaded(noisy, variance), model(noisy, variance), rtol=1e-5, atol=1e-5)
+    assert all(torch.equal(a, b) for a, b in zip(loaded.parameters(), model.parameters(), strict=True))
+    loaded(noisy, variance).mean().backward()  # what was loaded can be trained on
+    assert all(weight.requires_grad for weight in loaded.parameters())
+    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_a_failed_save_leaves_the_older_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.safetensors"
+    save(UNet(width=4, scales=2), path, {"steps": 1})
+
+    def fail(tensors: object, filename: Path, metadata: object) -> None:
+        Path(filename).write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr("safetensors.torch.save_file", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save(UNet(width=4, scales=2), path, {"steps": 2})
+    assert load(path)[1] == {"steps": 1}
+    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_what_cannot_be_loaded_again_is_not_saved(tmp_path: Path) -> None:
+    class Mine(UNet):
+        pass
+
+    with pytest.raises(ValueError, match="cannot save a Mine"):
+        save(Mine(width=4), tmp_path / "a.safetensors", {})
+    with pytest.raises(ValueError, match="info must be what JSON can hold"):
+        save(UNet(width=4), tmp_path / "a.safetensors", {"tensor": torch.zeros(1)})
+    with pytest.raises(FileNotFoundError, match="its folder does not exist"):
+        save(UNet(width=4), tmp_path / "none" / "a.safetensors", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+GOOD = {"format": "rawaug", "kind": "denoiser", "model": "DnCNN", "config": '{"width": 4, "depth": 2}', "info": "{}"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "isp"}, "not a denoiser of rawaug"),
+        ({"model": "os.system"}, "denoiser 'os.system' is unknown"),
+        ({"config": "{"}, "metadata 'config' is no JSON"),
+        ({"config": "[1]"}, "must be a JSON object, got list"),
+        ({"config": '{"width": 4, "dept": 2}'}, "has no setting 'dept'"),
+        ({"config": '{"width": -4, "depth": 2}'}, "width must be a positive"),
+        ({"config": '{"width": "4", "depth": 2}'}, "width must be int, got '4'"),
+        ({"config": '{"width": 8, "depth": 2}'}, r"tensor layers\.0\.bias is \(4,\) torch.float32, the network needs"),
+        ({"config": '{"width": 100000, "depth": 90}'}, "tensor .* the network needs|is missing"),
+        ({"config": '{"width": 4, "depth": 3}'}, r"tensor layers\.\S+ is (missing|unknown)"),
+        ({"info": ""}, "metadata 'info' is no JSON"),
+    ],
+)
+def test_bad_files_are_named_in_one_line(change: dict[str, str], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.safetensors"
+    tensors = build("DnCNN", **json.loads(GOOD["config"])).state_dict()
+    save_file(tensors, path, metadata=GOOD)
+    load(path)
+    save_file(tensors, path, metadata={**GOOD, **change})
+    with pytest.raises(ValueError, match=message) as error:
+        load(path)
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a file of weights at all", b"\xff" * 64])
+def test_other_files_and_none_are_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "other.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"other\.safetensors: no such file"):
+        load(path)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"other\.safetensors: not a safetensors file") as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+def test_build_names_what_is_unknown() -> None:
+    assert build("UNet", width=4).config["width"] == 4
+    with pytest.raises(ValueError, match="'Unet' is unknown; use one of UNet, DHDN, DnCNN"):
+        build("Unet")
+    with pytest.raises(ValueError, match="UNet has no setting 'depth'; it has width, scales"):
+        build("UNet", depth=3)
+    with pytest.raises(ValueError, match="variance_map must be bool, got 1"):
+        build("UNet", variance_map=1)
