@@ -1,0 +1,43 @@
+r"""The methods that the dictionary ISP is compared with, written from their papers, on one interface.
+
+=========== ============================================ ============ ========= =================================
+name        source                                       parameters   fitted    forward pass
+=========== ============================================ ============ ========= =================================
+upi         Brooks et al., CVPR 2019                     0            no        exact inverse
+upi-tuned   the same, matrix and gains from pairs        12           at once   exact inverse
+unet        Ronneberger et al., MICCAI 2015              11.77 M      descent   none
+cycleisp    Zamir et al., CVPR 2020                      3.14 M       descent   with a reference picture
+invisp      Xing et al., CVPR 2021                       1.41 M       descent   exact inverse
+invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   a network of its own
+=========== ============================================ ============ ========= =================================
+
+Parameters are those of the reverse pass at the default, published size.
+"""
+
+from types import MappingProxyType
+
+from rawaug.isp.baselines.base import ReverseISP
+from rawaug.isp.baselines.cycleisp import CycleISP
+from rawaug.isp.baselines.fit import fit_baseline
+from rawaug.isp.baselines.invgrey import InvertibleGrey
+from rawaug.isp.baselines.invisp import InvISP
+from rawaug.isp.baselines.unet import UNetISP
+from rawaug.isp.baselines.upi import UPI
+from rawaug.isp.baselines.upi_tuned import TunedUPI
+
+BASELINES: MappingProxyType[str, type[ReverseISP]] = MappingProxyType(
+    {method.name: method for method in (UPI, TunedUPI, UNetISP, CycleISP, InvISP, InvertibleGrey)}
+)
+"""Name to class; each is made without arguments, or with ``cfa`` and its own settings."""
+
+__all__ = [
+    "BASELINES",
+    "UPI",
+    "CycleISP",
+    "InvISP",
+    "InvertibleGrey",
+    "ReverseISP",
+    "TunedUPI",
+    "UNetISP",
+    "fit_baseline",
+]

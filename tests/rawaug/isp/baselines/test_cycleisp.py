@@ -1,0 +1,133 @@
+"""CycleISP's blocks, its reference picture, and checkpoints in the published layout, which the tests write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug.isp.baselines.cycleisp import CycleISP, DualAttentionBlock
+
+SMALL: dict[str, Any] = {"features": 8, "groups": 2, "blocks": 1}
+
+
+def published_layout(inputs: int, features: int = 8, groups: int = 2, blocks: int = 1) -> dict[str, Tensor]:
+    """Keys and shapes of the published networks up to their tails."""
+    generator = torch.Generator().manual_seed(inputs)
+    state = {"head.0.weight": (features, inputs, 3, 3), "head.0.bias": (features,)}
+    for i in range(groups):
+        group = f"body.{i}.body"
+        for j in range(blocks):
+            block = f"{group}.{j}"
+            for k in (0, 2):
+                state |= {f"{block}.body.{k}.weight": (features, features, 3, 3), f"{block}.body.{k}.bias": (features,)}
+            state[f"{block}.SA.spatial.conv.weight"] = (1, 2, 3, 3)
+            state |= {f"{block}.CA.conv_du.0.weight": (1, features, 1, 1), f"{block}.CA.conv_du.0.bias": (1,)}
+            state |= {f"{block}.CA.conv_du.2.weight": (features, 1, 1, 1), f"{block}.CA.conv_du.2.bias": (features,)}
+            state |= {f"{block}.conv1x1.weight": (features, 2 * features, 1, 1), f"{block}.conv1x1.bias": (features,)}
+        state |= {f"{group}.{blocks}.weight": (features, features, 3, 3), f"{group}.{blocks}.bias": (features,)}
+    state |= {f"body.{groups}.weight": (features, features, 3, 3), f"body.{groups}.bias": (features,)}
+    tensors = {key: 0.1 * torch.randn(shape, generator=generator) for key, shape in state.items()}
+    slope = torch.rand(features, generator=generator)  # one PReLU, saved wherever it is used
+    slopes = [f"body.{i}.body.{j}.body.1.weight" for i in range(groups) for j in range(blocks)]
+    return tensors | dict.fromkeys([*slopes, f"body.{groups + 1}.weight"], slope)
+
+
+def rgb2raw_layout() -> dict[str, Tensor]:
+    return published_layout(3) | {"tail.0.weight": torch.rand(3, 8, 3, 3), "tail.0.bias": torch.rand(3)}
+
+
+def write(path: Path, state: dict[str, Tensor], prefix: str = "") -> Path:
+    torch.save({"epoch": 3, "state_dict": {prefix + key: value for key, value in state.items()}}, path)
+    return path
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_published_rgb2raw_weights_load(tmp_path: Path, prefix: str) -> None:
+    model, state = CycleISP(**SMALL), rgb2raw_layout()
+    model.load_published(write(tmp_path / "rgb2raw.pth", state, prefix))
+    for own, published in (
+        ("head.weight", "head.0.weight"),
+        ("body.1.body.0.spatial.weight", "body.1.body.0.SA.spatial.conv.weight"),
+        ("body.1.body.0.channel.2.bias", "body.1.body.0.CA.conv_du.2.bias"),
+        ("body.1.body.0.merge.weight", "body.1.body.0.conv1x1.weight"),
+        ("body.0.body.1.bias", "body.0.body.1.bias"),
+        ("tail.0.weight", "tail.0.weight"),
+    ):
+        assert torch.equal(model.rgb2raw.get_parameter(own), state[published]), own
+    assert torch.equal(model.rgb2raw.state_dict()["body.1.body.0.body.1.weight"], state["body.3.weight"])
+
+
+def test_the_two_other_networks_load_too(tmp_path: Path) -> None:
+    model = CycleISP(**SMALL)
+    raw2rgb = published_layout(4)
+    raw2rgb |= {"tail.0.weight": torch.rand(8, 8, 3, 3), "tail.0.bias": torch.rand(8)}
+    raw2rgb |= {"tail.1.weight": raw2rgb["body.3.weight"], "tail_rgb.0.weight": torch.rand(12, 8, 1, 1)}
+    raw2rgb |= {"tail_rgb.0.bias": torch.rand(12), "conv1x1.0.weight": torch.rand(8, 16, 1, 1)}
+    model.load_published(write(tmp_path / "a.pth", raw2rgb | {"conv1x1.0.bias": torch.rand(8)}), "raw2rgb")
+    assert torch.equal(model.raw2rgb.get_parameter("tail_rgb.0.bias"), raw2rgb["tail_rgb.0.bias"])
+    ccm = published_layout(3, groups=2, blocks=2) | {"tail.0.weight": torch.rand(8, 8, 3, 3)}
+    ccm |= {"tail.0.bias": torch.rand(8), "blur.weight": torch.rand(3, 1, 21, 21)}
+    model.load_published(write(tmp_path / "b.pth", ccm), "ccm")
+    assert torch.equal(model.ccm.get_parameter("tail.0.weight"), ccm["tail.0.weight"])
+
+
+class Payload:
+    """What a pickle could carry."""
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    model, state = CycleISP(**SMALL), rgb2raw_layout()
+    with pytest.raises(FileNotFoundError, match=r"no\.pth: no such file"):
+        model.load_published(tmp_path / "no.pth")
+    missing = {key: value for key, value in state.items() if key != "tail.0.bias"}
+    wrong = state | {"tail.0.bias": torch.rand(4)}
+    unknown = state | {"extra.weight": torch.rand(1)}
+    for name, content, message in (
+        ("missing", missing, r"layer tail\.0\.bias is missing"),
+        ("wrong", wrong, r"tail\.0\.bias is \(4,\), rgb2raw needs \(3,\)"),
+        ("unknown", unknown, r"extra\.weight is unknown"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model.load_published(write(tmp_path / f"{name}.pth", content))
+    torch.save({"weights": state}, tmp_path / "bare.pth")
+    with pytest.raises(ValueError, match="no 'state_dict'"):
+        model.load_published(tmp_path / "bare.pth")
+    torch.save({"state_dict": {"head": Payload()}}, tmp_path / "code.pth")
+    (tmp_path / "text.pth").write_text("no checkpoint")
+    for name in ("code", "text"):
+        with pytest.raises(ValueError, match="not a checkpoint of plain weights"):
+            model.load_published(tmp_path / f"{name}.pth")
+    with pytest.raises(ValueError, match="use one of rgb2raw, raw2rgb, ccm"):
+        model.load_published(tmp_path / "bare.pth", "denoiser")
+
+
+@torch.no_grad()
+def test_a_block_weighs_its_features_over_space_and_over_channels() -> None:
+    block = DualAttentionBlock(4, 2, torch.nn.PReLU(4))
+    for parameter in block.parameters():
+        parameter.zero_()
+    block.get_parameter("body.2.bias").copy_(torch.tensor([1.0, 2.0, 3.0, 4.0]))  # f is this everywhere
+    block.spatial.weight[0, 0, 1, 1] = 1.0  # sigmoid(max = 4)
+    block.get_parameter("channel.2.bias").copy_(torch.tensor([0.0, 9.0, 0.0, 0.0]))
+    block.merge.weight[0, 0] = block.merge.weight[1, 4 + 1] = 1.0
+    out = block(torch.full((1, 4, 5, 5), 0.5))[0, :, 2, 2]
+    expected = torch.tensor([0.5 + torch.tensor(4.0).sigmoid(), 0.5 + 2.0 * torch.tensor(9.0).sigmoid(), 0.5, 0.5])
+    torch.testing.assert_close(out, expected)
+
+
+@torch.no_grad()
+def test_the_reference_colours_the_rendering() -> None:
+    model = CycleISP(**SMALL)
+    raw, srgb = torch.rand(1, 1, 16, 16), torch.rand(1, 3, 16, 16)
+    first, second = (model.forward(raw, reference=picture) for picture in (srgb, 1.0 - srgb))
+    assert first.shape == (1, 3, 16, 16) and not torch.equal(first, second)
+    with pytest.raises(ValueError, match="pass reference=srgb"):
+        model(raw)
+    with pytest.raises(ValueError, match="must have the sides"):
+        model(raw, reference=srgb[..., :12])
+    with pytest.raises(ValueError, match="more than 10 pixels, got 8x16"):
+        model(raw[..., :8, :], reference=srgb[..., :8, :])

@@ -1,0 +1,73 @@
+"""The flow is invertible whatever its weights, and the white balance stands where it should."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rawaug.data.pairs import Pair
+from rawaug.isp.baselines.base import Crops
+from rawaug.isp.baselines.invisp import InvISP
+
+
+def shaken(blocks: int = 8, growth: int = 32) -> InvISP:
+    """A model whose weights are far from the start."""
+    model, generator = InvISP(blocks=blocks, growth=growth), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+@torch.no_grad()
+def test_it_is_exactly_invertible() -> None:
+    flow = shaken().flow
+    x = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1))
+    assert (flow(x) - x).abs().max() > 0.05
+    torch.testing.assert_close(flow(flow.inverse(x)), x, atol=1e-5, rtol=0)
+    torch.testing.assert_close(flow.inverse(flow(x)), x, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 3, 8])
+def test_untrained_it_is_a_plain_gamma_camera(blocks: int) -> None:
+    srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(2))
+    raw = InvISP("GRBG", blocks=blocks, growth=4).reverse(srgb, white_balance=(2.0, 1.0, 1.6))
+    linear = srgb**2.2
+    torch.testing.assert_close(raw[:, 0, 0::2, 1::2], linear[:, 0, 0::2, 1::2], atol=1e-6, rtol=1e-4)
+    assert raw.max() <= 1.0  # w is (1, 0.5, 0.8): green and blue are divided by it
+    green = (2.0 * linear[:, 1, 0::2, 0::2]).clamp(max=1.0)
+    torch.testing.assert_close(raw[:, 0, 0::2, 0::2], green, atol=1e-6, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_flat_pictures_survive_the_cycle_with_the_same_balance() -> None:
+    model = InvISP(blocks=2, growth=4)
+    srgb = torch.tensor([0.5, 0.4, 0.45])[None, :, None, None].expand(1, 3, 8, 8)
+    balance = torch.tensor([1.8, 1.0, 1.5])
+    torch.testing.assert_close(model(model.reverse(srgb, balance), balance), srgb, atol=1e-4, rtol=0)
+    assert not torch.allclose(model(model.reverse(srgb, balance), (1.0, 1.0, 2.0)), srgb, atol=0.05)
+
+
+def test_blind_it_uses_the_mean_balance_of_the_pairs(exact_pairs: list[Pair]) -> None:
+    model = InvISP(blocks=1, growth=4)
+    model.prepare(exact_pairs)
+    mean = torch.tensor([pair.white_balance for pair in exact_pairs]).log().mean(0).exp()
+    srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(model.reverse(srgb), model.reverse(srgb, mean))
+
+
+def test_with_jpeg_between_the_way_back_sees_the_compressed_rendering() -> None:
+    generator = torch.Generator().manual_seed(4)
+    srgb = torch.rand(2, 3, 32, 32, generator=generator)
+    crops = Crops(srgb, torch.rand(2, 1, 32, 32, generator=generator), torch.tensor([[2.0, 1.0, 1.5]] * 2))
+    losses = {}
+    for quality in (10, 90):
+        model = InvISP(blocks=2, growth=4, jpeg_quality=quality)
+        loss = model.loss(crops, both=True)
+        loss.backward()
+        gradients = [p.grad for p in model.parameters() if p.grad is not None]
+        assert all(g.isfinite().all() for g in gradients) and any(g.abs().max() > 0 for g in gradients)
+        losses[quality] = loss.item()
+    assert losses[10] > losses[90] + 0.01
+    with pytest.raises(ValueError, match="1 to 100"):
+        InvISP(blocks=1, growth=4, jpeg_quality=0)
