@@ -25,6 +25,9 @@ PHOTOGRAPHS = {
 }
 """Files in scikit-image's data folder; the two motorcycles are one scene from two places."""
 
+PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png")
+"""More photographs of the user's sRGB folder, of which the camera has no RAW."""
+
 PAIRS = {"train": 5, "validation": 4, "test": 9}
 """Number of pairs of a split unless told otherwise."""
 
@@ -69,14 +72,16 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
 
 
 def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
-    """The sRGB pictures of a user: the training photographs whole, then dead leaves of 256 x 384 textured from them.
+    """The sRGB pictures of a user: photographs whole, then dead leaves of 256 x 384 textured from them.
+
+    The photographs are those of the training pairs and five others.
 
     Raises:
         ValueError: if ``count`` is not positive.
     """
     if count < 1:
         raise ValueError(f"demo: count is at least 1, got {count}")
-    photographs = list(_photographs("train").values())
+    photographs = [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
     leaves = (
         dead_leaves(*FRAME, photographs, keyed_generator(seed, "demo pictures", k))
         for k in range(count - len(photographs))
@@ -108,12 +113,16 @@ def _random_crop(photograph: Tensor, generator: torch.Generator) -> Tensor:
     return crop.flip(-1) if torch.rand((), generator=generator) < 0.5 else crop
 
 
-@cache
 def _photographs(split: str) -> dict[str, Tensor]:
+    return _read(PHOTOGRAPHS[split])
+
+
+@cache
+def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
     import skimage
 
     folder = Path(skimage.__file__).parent / "data"
-    return {Path(file).stem: read_picture(folder / file) for file in PHOTOGRAPHS[split]}
+    return {Path(file).stem: read_picture(folder / file) for file in files}
 
 
 def _require_split(split: str) -> None:

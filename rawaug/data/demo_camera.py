@@ -6,7 +6,8 @@ r"""The demo camera: makes RAW and sRGB of the same shot from any picture, so th
 The picture x is the scene, linearised by L (IEC 61966-2-1); B is the blur of lens and optical low-pass filter. A shot
 has an illuminant (gains g), an exposure e and an ISO (noise levels); the camera has a colour matrix M, lens shading s
 that falls off like cos^4 around a point off centre, a GRBG sensor of 12 bits with a black level (Q), and a film-like
-tone curve. It shares no code with the ISPs that are fitted to it: other noise (Poisson counts), other demosaicing (Malvar, He and Cutler), another tone curve.
+tone curve. It shares no code with the ISPs that are fitted to it: other noise (Poisson counts), other demosaicing
+(Malvar, He and Cutler), another tone curve.
 """
 
 from __future__ import annotations

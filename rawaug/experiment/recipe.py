@@ -63,14 +63,14 @@ class TrainConfig:
         compile: torch.compile the network.
     """
 
-    steps: int = 600
+    steps: int = 1500
     batch: int = 8
-    crop: int = 128
-    learning_rate: float = 1e-3
+    crop: int = 64
+    learning_rate: float = 7e-4
     warmup: int = 50
     loss: Literal["l1", "l2", "charbonnier"] = "l1"
     ema: float = 0.99
-    clip_norm: float = 1.0
+    clip_norm: float = 0.1
     validate_every: int = 100
     checkpoint_every: int = 200
     workers: int = 0

@@ -1,0 +1,78 @@
+"""Noise by name: the published presets and the measured cameras.
+
+===================================================================  ===========================  ============
+names                                                                what                         ``iso=``
+===================================================================  ===========================  ============
+``upi`` ``cycleisp_dnd`` ``cycleisp_sidd`` ``rawir``                 published training presets   no
+``iPhone 7`` ``Google Pixel`` ``Samsung Galaxy S6 Edge``
+``Motorola Nexus 6`` ``LG G4``                                       SIDD's phones                as tabulated
+``pmrid``                                                            OPPO Reno 10x                100 to 6400
+``CanonEOS5D4`` ``CanonEOS700D`` ``CanonEOS70D`` ``NikonD850``
+``SonyA7S2``                                                         ELD's cameras                100 to 6400
+===================================================================  ===========================  ============
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rawaug.noise.iso import EldLevels, Iso, PmridLevels, SiddLevels
+from rawaug.noise.levels import FixedLevels, NoiseLevels, Preset, published
+from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
+
+
+def camera_names() -> list[str]:
+    """The measured cameras: names that take ``iso=``."""
+    data = published()
+    return [*data["sidd_noise_level_function"]["cameras"], "pmrid", *data["eld"]["cameras"]]
+
+
+def noise_names() -> list[str]:
+    """Every name that :func:`noise_model` knows."""
+    return [*published()["presets"], *camera_names()]
+
+
+def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels:
+    """The levels of a name, or the fixed levels (shot_var, read_var).
+
+    Raises:
+        ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
+    """
+    data = published()
+    if isinstance(spec, str) and spec in camera_names():
+        if spec == "pmrid":
+            return PmridLevels(iso)
+        return SiddLevels(spec, iso) if spec in data["sidd_noise_level_function"]["cameras"] else EldLevels(spec, iso)
+    if isinstance(spec, str) and spec not in data["presets"]:
+        raise ValueError(f"noise {spec!r} is unknown; use one of {', '.join(noise_names())}, or (shot_var, read_var)")
+    if iso is not None:
+        raise ValueError(
+            f"noise {spec!r} has no law by ISO; leave iso out, or name a camera: {', '.join(camera_names())}"
+        )
+    if isinstance(spec, str):
+        return Preset(spec)
+    if len(spec) != 2:
+        raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
+    return FixedLevels(*spec)
+
+
+def noise_model(spec: str | Sequence[float] | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
+    """The shot and read noise of a name or of (shot_var, read_var); a model is handed back as it is.
+
+    Args:
+        spec: one of :func:`noise_names`, a pair of variances on the scale white = 1, or a :class:`NoiseModel`.
+        iso: of a camera: one ISO, limits, or None for its whole measured range.
+        poisson: exact photon statistics instead of the Gaussian.
+
+    Raises:
+        ValueError: if the name is unknown, ``iso`` does not fit it, or options are given together with a model.
+
+    Example:
+        >>> noise_model("cycleisp_sidd"), noise_model("Google Pixel", iso=800), noise_model((1e-3, 1e-5))
+    """
+    if isinstance(spec, NoiseModel):
+        if iso is not None or poisson:
+            raise ValueError("iso and poisson are for noise given by name; this noise is a model already")
+        return spec
+    levels = noise_levels(spec, iso=iso)
+    return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)

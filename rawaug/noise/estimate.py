@@ -1,0 +1,250 @@
+r"""A camera's own noise, from its RAW files: photon transfer on flat blocks.
+
+.. math:: \operatorname{var} = \mathrm{shot\_var} \cdot \operatorname{mean} + \mathrm{read\_var}
+
+is fitted to local mean and local variance on same-colour sites (Janesick, "Photon transfer", 2007; on scenes that are
+not charts: Foi et al. 2008). Each packed plane is cut into 8 x 8 blocks and transformed by the orthonormal DCT, where
+white noise has the same variance in every coefficient and texture is strongest in the low ones. Low coefficients say
+whether a block is flat, high ones how noisy it is (Ponomarenko et al., "An automatic approach to lossy compression of
+AVIRIS images", 2007): as they are independent, the choice does not bias the measure. The first row and column are not
+used, so that banding does not count. Where the noise is not white, a codec has smoothed it or texture has entered, and
+the level is left out.
+
+Signals are black-subtracted, white = 1. The variance that rounding to the sensor's grid adds (a twelfth of a squared
+step) is part of ``read_var``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA, pack
+
+BLOCK = 8
+_order = torch.arange(BLOCK)[:, None] + torch.arange(BLOCK)
+_inner = (torch.arange(BLOCK)[:, None] > 0) & (torch.arange(BLOCK) > 0)
+_LOW = (_order > 0) & (_order < 5)
+_HIGH = _inner & (_order >= 5)
+_MIDDLE = _HIGH & (_order <= 7)
+_TOP = _inner & (_order >= 9)
+_DOF = int(_HIGH.sum())
+_MEDIAN = (1 - 2 / (9 * _DOF)) ** 3  # of chi-squared / dof, Wilson and Hilferty
+_RELATIVE_SD = math.sqrt(2 / _DOF)  # of one block's variance
+
+_FLAT = 1.2  # low over expected energy: passes 70 % of the blocks that hold noise alone
+_WHITE = 0.15  # how far the bands' energies may differ
+_CLIP_MARGIN = 4.0  # in standard deviations of a pixel
+_MIN_BLOCKS = 30  # a level's
+_MIN_POINTS = 6
+_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class NoisePoints:
+    """Measured levels: tensors ``(N,)``. ``channel`` is 0 to 3 for R, Gr, Gb, B; ``blocks`` counts the flat ones;
+    ``used`` is False where the level was left out of the line (too few blocks, not white, or far from the others)."""
+
+    signal: Tensor
+    variance: Tensor
+    channel: Tensor
+    blocks: Tensor
+    used: Tensor
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """What was fitted: the line, its standard errors, R^2 over the used points, and the points themselves.
+
+    ``read_var`` is 0 where the files cannot tell it from none: the best line would have been negative at black.
+    """
+
+    shot_var: float
+    read_var: float
+    shot_var_error: float
+    read_var_error: float
+    r2: float
+    points: NoisePoints
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """What is known of each block, tensors ``(N,)``: mean, mean energies of the DCT bands, and the room to clipping."""
+
+    channel: Tensor
+    signal: Tensor
+    low: Tensor
+    high: Tensor
+    middle: Tensor
+    top: Tensor
+    to_black: Tensor
+    to_white: Tensor
+
+
+def estimate_noise(
+    mosaics: Tensor | Sequence[Tensor], cfa: CFA | str, *, read_var: float | None = None
+) -> NoiseEstimate:
+    """(shot_var, read_var) of one camera at one ISO, from the flat regions of its RAW files.
+
+    Args:
+        mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
+            left out, and those near another level of clipping, where the file's lowest or highest value piles up.
+        cfa: the pattern, of all of them.
+        read_var: where dark frames tell it (:func:`from_dark_frames`); else it is fitted too.
+
+    Raises:
+        ValueError: if there are too few flat regions, or they do not span a range of signals.
+
+    Example:
+        >>> estimate = estimate_noise([mosaic], "RGGB")
+        >>> model = ShotReadNoise(FixedLevels(estimate.shot_var, estimate.read_var))
+    """
+    frames = [mosaics] if isinstance(mosaics, Tensor) else list(mosaics)
+    measured = [_measure(frame, cfa) for frame in frames]
+    blocks = _Blocks(*(torch.cat([getattr(m, f.name) for m in measured]) for f in fields(_Blocks)))
+    levels = _split_levels(blocks)
+    points = _start(levels)
+    for _ in range(_ROUNDS):
+        shot, read = _fit(points, read_var)[0]
+        points = _points(levels, shot, read)
+    (shot, read), errors, points = _fit(points, read_var)
+    return NoiseEstimate(shot, read, *errors, _r2(points, shot, read), points)
+
+
+def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
+    if frame.shape[:-3].numel() != 1 or frame.ndim < 3 or frame.shape[-3] != 1:
+        raise ValueError(f"a mosaic has shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
+    if min(frame.shape[-2:]) < 2 * BLOCK:
+        raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise on")
+    floor, ceiling = _clipping_levels(frame)
+    planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
+    tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
+    dct = _dct_matrix().to(tiles)
+    energy = (dct @ tiles @ dct.T).square_()
+    bands = [energy[..., band.to(tiles.device)].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
+    signal = tiles.mean((-2, -1)).flatten()
+    channel = torch.arange(4, device=tiles.device).repeat_interleave(tiles.shape[1])
+    inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
+    room = signal - floor, ceiling - signal
+    return _Blocks(*(t.flatten()[inside].double().cpu() for t in (channel, signal, *bands, *room)))
+
+
+def _clipping_levels(frame: Tensor) -> tuple[float, float]:
+    """(floor, ceiling): where values pile up at the end of the range; else no floor, and white."""
+    floor = float(frame.min()) if _piles_up(frame) else -math.inf
+    ceiling = float(frame.max()) if _piles_up(-frame) else 1.0
+    return floor, min(ceiling, 1.0)
+
+
+def _piles_up(frame: Tensor) -> bool:
+    """Whether the lowest value is frequent, and at least as frequent as the next."""
+    lowest = frame.min()
+    above = frame[frame > lowest]
+    if above.numel() == 0:
+        return False
+    count, next_count = frame.numel() - above.numel(), int((above == above.min()).sum())
+    return count >= max(10, frame.numel() // 100_000, next_count)
+
+
+def _dct_matrix() -> Tensor:
+    k = torch.arange(BLOCK, dtype=torch.float64)
+    matrix = torch.cos(math.pi / BLOCK * k[:, None] * (k + 0.5)) * math.sqrt(2 / BLOCK)
+    matrix[0] /= math.sqrt(2)
+    return matrix
+
+
+def _split_levels(blocks: _Blocks) -> list[_Blocks]:
+    """The blocks by colour and by signal, as many in each level of a colour."""
+    levels = []
+    for channel in range(4):
+        index = torch.nonzero(blocks.channel == channel).flatten()
+        index = index[blocks.signal[index].argsort()]
+        count = min(32, max(4, len(index) // 200))
+        levels += [_take(blocks, part) for part in index.tensor_split(count) if len(part) >= _MIN_BLOCKS]
+    if len(levels) < _MIN_POINTS:
+        raise ValueError("too few blocks without clipped pixels to estimate noise; give larger or more frames")
+    return levels
+
+
+def _take(blocks: _Blocks, index: Tensor) -> _Blocks:
+    return _Blocks(*(getattr(blocks, f.name)[index] for f in fields(_Blocks)))
+
+
+def _start(levels: list[_Blocks]) -> NoisePoints:
+    """The first guess: in each level the twentieth of the blocks that vary least in the low frequencies."""
+    flattest = [_take(b, b.low.argsort()[: max(_MIN_BLOCKS, len(b.low) // 20)]) for b in levels]
+    return _gather([(b, b.high.median() / _MEDIAN) for b in flattest])
+
+
+def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoints:
+    """Each level's signal and variance over the blocks that the line says are flat and clear of clipping."""
+    chosen = []
+    for b in levels:
+        expected = (shot_var * b.signal.clamp(min=0) + read_var).clamp(min=1e-12)
+        clear = torch.minimum(b.to_black, b.to_white) > _CLIP_MARGIN * expected.sqrt()
+        no_outlier = b.high < (1 + 6 * _RELATIVE_SD) * expected
+        keep = torch.nonzero(clear & no_outlier & (b.low < _FLAT * expected)).flatten()
+        if len(keep) == 0:
+            continue
+        flat, expected = _take(b, keep), expected[keep]
+        # the ratio to the line, so that a wide level is not skewed by its spread of signals
+        chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
+    if not chosen:
+        raise ValueError(
+            "no flat regions found to estimate noise on; give frames with even areas, such as sky or a chart"
+        )
+    return _gather(chosen)
+
+
+def _gather(levels: list[tuple[_Blocks, Tensor]]) -> NoisePoints:
+    counts = torch.tensor([len(b.signal) for b, _ in levels])
+    whiteness = torch.stack([b.top.mean() / b.middle.mean() for b, _ in levels])
+    return NoisePoints(
+        signal=torch.stack([b.signal.mean() for b, _ in levels]),
+        variance=torch.stack([variance for _, variance in levels]).clamp(min=1e-12),
+        channel=torch.stack([b.channel[0] for b, _ in levels]).long(),
+        blocks=counts,
+        used=(counts >= _MIN_BLOCKS) & ((whiteness - 1).abs() < _WHITE),
+    )
+
+
+def _fit(
+    points: NoisePoints, known_read_var: float | None
+) -> tuple[tuple[float, float], tuple[float, float], NoisePoints]:
+    """Robust weighted least squares: ((shot, read), their standard errors, the points with outliers unused)."""
+    used = points.used
+    x, y, n = points.signal, points.variance, points.blocks.double()
+    if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
+        raise ValueError("too few flat regions, or all of one brightness, to fit noise; give more frames, or charts")
+    variance, trust = y, used
+    for _ in range(_ROUNDS):
+        weight = trust * n / variance.square()
+        shot, read, shot_error, read_error = _line(x, y, weight, known_read_var)
+        variance = (shot * x.clamp(min=0) + read).clamp(min=1e-12)
+        residual = y / variance - 1
+        scale = max(1.4826 * float(residual[used].abs().median()), 0.02)
+        trust = used & (residual.abs() < 4 * scale)
+    points = replace(points, used=trust)
+    sd = scale * math.sqrt(float(n[points.used].mean()))
+    return (shot, read), (shot_error * sd, read_error * sd), points
+
+
+def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) -> tuple[float, float, float, float]:
+    """Weighted least squares: slope, intercept and their standard errors for weights 1 / variance."""
+    w, wx, wxx = (float((weight * t).sum()) for t in (torch.ones_like(x), x, x * x))
+    wy, wxy = float((weight * y).sum()), float((weight * x * y).sum())
+    determinant = w * wxx - wx * wx
+    read = (wxx * wy - wx * wxy) / determinant if known_read_var is None else known_read_var
+    if known_read_var is None and read >= 0:
+        return (w * wxy - wx * wy) / determinant, read, (w / determinant) ** 0.5, (wxx / determinant) ** 0.5
+    read = max(read, 0.0)
+    return (wxy - read * wx) / wxx, read, wxx**-0.5, 0.0
+
+
+def _r2(points: NoisePoints, shot_var: float, read_var: float) -> float:
+    x, y = points.signal[points.used], points.variance[points.used]
+    return float(1 - (y - shot_var * x - read_var).square().sum() / (y - y.mean()).square().sum())

@@ -1,0 +1,195 @@
+r"""Shot and read noise, the two that every sensor makes.
+
+.. math:: y_{noisy} = y + n, \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
+
+on linear, black-subtracted RAW with white = 1 (Foi et al., "Practical Poissonian-Gaussian noise modeling and fitting
+for single-image raw-data", 2008). Shot noise is the Poisson statistics of photons, ``shot_var`` being the share of
+white that one electron makes; read noise is that of the electronics. Noisy RAW is clipped at white, as a sensor does,
+and never at black: zero-mean noise stays zero-mean in the shadows.
+
+Every model splits in ``sample(batch, generator) -> params`` and a pure ``apply(clean, params)``. The parameters hold
+one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever else is in the
+batch. (The CPU and CUDA have different streams: a replay is exact on the same kind of device.)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from rawaug.noise.levels import NoiseLevels
+from rawaug.noise.poisson import poisson
+from rawaug.seeding import keyed_generator
+
+Params = dict[str, Tensor]
+
+_CACHED = 2**18
+"""Numbers that a CPU works on at a time, so that they stay in its cache."""
+
+_NO_SHOT = 1e-30
+"""Stands for a shot_var of 0, so that it can be divided by: too small for any effect on the picture."""
+
+
+class NoiseModel(ABC):
+    """What turns clean packed RAW into noisy.
+
+    ``stream`` names the model's random stream: models composed on one picture draw from its one seed without
+    correlation.
+    """
+
+    stream: ClassVar[str]
+
+    @abstractmethod
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """Draw the parameters of ``batch`` pictures: tensors with leading dimension ``batch``, on the generator's
+        device."""
+
+    @abstractmethod
+    def disturb(self, clean: Tensor, params: Params) -> Tensor:
+        """The noisy RAW before the clip at white, as a new tensor: what composed models hand on to one another."""
+
+    @abstractmethod
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        """The variance map ``(B, 4, h, w)`` of the noise on signal ``clean``, before the clip at white.
+
+        It evaluates the law at whatever signal it is handed. In training that may be the clean signal; at test time
+        only the noisy one is known, and it is what UPI's networks are given (Brooks et al. 2019).
+        """
+
+    @torch.no_grad()
+    def apply(self, clean: Tensor, params: Params) -> Tensor:
+        """Noisy RAW ``(B, 4, h, w)`` of clean packed RAW ``(B, 4, h, w)``: clipped at white, not at black. Pure.
+
+        The parameters may lie on another device than the picture. No gradient passes.
+
+        Raises:
+            ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch
+            size.
+        """
+        require_batch(clean, params)
+        return self.disturb(clean, params).clamp_(max=1.0)
+
+    def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
+        """One generator a picture on ``device``, from the picture's seed and the model's stream."""
+        for seed in params["seed"].tolist():
+            yield keyed_generator(seed, self.stream, device=device)
+
+
+def require_batch(clean: Tensor, params: Params) -> None:
+    """Raise ValueError unless ``clean`` is ``(B, 4, h, w)`` in float32 or float64 and every parameter has length B."""
+    if clean.ndim != 4 or clean.shape[1] != 4 or clean.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"noise is made on packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
+    for name, value in params.items():
+        if value.shape[:1] != clean.shape[:1]:
+            raise ValueError(
+                f"noise parameter {name!r} has shape {tuple(value.shape)}, the batch has {len(clean)} pictures"
+            )
+
+
+def new_seeds(batch: int, generator: torch.Generator) -> Tensor:
+    """One int64 seed a picture, ``(batch,)``."""
+    return torch.randint(2**63 - 1, (batch,), generator=generator, device=generator.device)
+
+
+def per_picture(value: Tensor, like: Tensor) -> Tensor:
+    """Parameters ``(B,)`` as ``(B, 1, 1, 1)`` on the device and in the type of ``like``."""
+    return value.to(like).reshape(-1, 1, 1, 1)
+
+
+class ShotReadModel(NoiseModel):
+    """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
+
+    Args:
+        levels: what samples (shot_var, read_var), such as ``Preset("cycleisp_sidd")`` or ``FixedLevels(1e-3, 1e-5)``.
+    """
+
+    stream = "shot_read"
+
+    def __init__(self, levels: NoiseLevels) -> None:
+        self.levels = levels
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        """``shot_var``, ``read_var`` and ``seed``, each ``(batch,)``."""
+        shot_var, read_var = self.levels.sample(batch, generator)
+        return {"shot_var": shot_var, "read_var": read_var, "seed": new_seeds(batch, generator)}
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        shot_var, read_var = (per_picture(params[name], clean) for name in ("shot_var", "read_var"))
+        return torch.addcmul(read_var, clean.clamp(min=0), shot_var)
+
+
+class ShotReadNoise(ShotReadModel):
+    """Gaussian noise of variance ``shot_var * y + read_var``: the default, and fast.
+
+    Example:
+        >>> model = ShotReadNoise(FixedLevels(1e-3, 1e-5))
+        >>> params = model.sample(2, torch.Generator().manual_seed(0))
+        >>> model.apply(torch.rand(2, 4, 8, 8), params).shape
+        torch.Size([2, 4, 8, 8])
+    """
+
+    @torch.no_grad()
+    def apply(self, clean: Tensor, params: Params) -> Tensor:
+        require_batch(clean, params)
+        return self._disturb(clean, params, white=1.0)
+
+    @torch.no_grad()
+    def disturb(self, clean: Tensor, params: Params) -> Tensor:
+        return self._disturb(clean, params, white=None)
+
+    def _disturb(self, clean: Tensor, params: Params, white: float | None) -> Tensor:
+        """y + sqrt(shot) n / rsqrt(max(y, 0) + read / shot), in few passes: the factor sqrt(shot) comes with the draw;
+        dividing by 1 / sd is faster than multiplying by sd, and exact where there is no noise: x / inf = 0."""
+        noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
+        y, out = clean.reshape(len(clean), -1), noisy.view(len(clean), -1)
+        shot_var = params["shot_var"].double().clamp(min=_NO_SHOT)
+        sds, at_black = shot_var.sqrt().tolist(), (params["read_var"] / shot_var).to(y)[:, None]
+        generators = list(self.generators(params, clean.device))
+        rows, columns = _piece(y)
+        scratch = y.new_empty(min(rows, len(y)), columns)
+        for i in range(0, len(y), rows):
+            group = slice(i, i + rows)
+            for j in range(0, y.shape[1], columns):
+                signal, noise = y[group, j : j + columns], out[group, j : j + columns]
+                for row, sd, generator in zip(noise, sds[group], generators[group], strict=True):
+                    row.normal_(std=sd, generator=generator)
+                inverse_sd = torch.clamp(signal, min=0, out=scratch[: len(noise), : noise.shape[1]])
+                inverse_sd.add_(at_black[group]).rsqrt_()
+                torch.addcdiv(signal, noise, inverse_sd, out=noise)
+                if white is not None:
+                    noise.clamp_(max=white)
+        return noisy
+
+
+def _piece(y: Tensor) -> tuple[int, int]:
+    """(pictures, numbers of each) to work on at a time: all on a GPU, what fits the cache on a CPU."""
+    pictures, size = y.shape
+    if y.device.type != "cpu":
+        return pictures, size
+    return max(1, _CACHED // max(size, 1)), max(1, min(size, _CACHED))
+
+
+class PoissonGaussianNoise(ShotReadModel):
+    """Exact photon statistics: ``shot_var * Poisson(y / shot_var) + N(0, read_var)``, skewed at low counts as light is.
+
+    Signal below black makes no photons and is kept as it is. :mod:`rawaug.noise.poisson` says how counts are drawn.
+    """
+
+    @torch.no_grad()
+    def disturb(self, clean: Tensor, params: Params) -> Tensor:
+        noisy = clean.clone(memory_format=torch.contiguous_format)
+        for i, generator in enumerate(self.generators(params, clean.device)):
+            shot_var = float(params["shot_var"][i])
+            if shot_var > _NO_SHOT:
+                light = clean[i].clamp(min=0)
+                noisy[i] += poisson(light / shot_var, generator).mul_(shot_var).sub_(light)
+            noisy[i] += self.read_noise(noisy[i], i, params, generator)
+        return noisy
+
+    def read_noise(self, like: Tensor, picture: int, params: Params, generator: torch.Generator) -> Tensor:
+        """Read noise of the shape ``(4, h, w)`` of ``like``, for one picture of the batch."""
+        return torch.empty_like(like).normal_(generator=generator).mul_(float(params["read_var"][picture]) ** 0.5)

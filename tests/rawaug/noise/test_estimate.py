@@ -1,0 +1,217 @@
+"""The estimate of a camera's noise: simulated frames of known levels, and real files where there are any."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rawpy
+import tifffile
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from rawaug.bayer import unpack
+from rawaug.noise import (
+    DefectPixels,
+    FixedLevels,
+    NoiseEstimate,
+    PoissonGaussianNoise,
+    Quantisation,
+    RowNoise,
+    SensorNoise,
+    ShotReadNoise,
+    estimate_noise,
+    from_dark_frames,
+    plot_noise,
+)
+
+BITS, BLACK = 12, 256
+ROUNDING = (1 / (2**BITS - 1 - BLACK)) ** 2 / 12
+
+
+def scene(seed: int, size: int = 1024, texture: float = 0.3) -> Tensor:
+    """Clean packed RAW ``(1, 4, size/2, size/2)``: patches from near black to beyond white, with 1/f texture on half of
+    them, fine gratings on some, a slow gradient over all; some 7 % is clipped."""
+    generator = torch.Generator().manual_seed(seed)
+    side = size // 2
+    patches = side // 32
+
+    def random_patches() -> Tensor:
+        return interpolate(torch.rand(1, 1, patches, patches, generator=generator), size=(side, side))
+
+    spectrum = torch.fft.rfft2(torch.randn(side, side, generator=generator))
+    frequency = (torch.fft.fftfreq(side)[:, None].square() + torch.fft.rfftfreq(side).square()).sqrt()
+    rough = torch.fft.irfft2(spectrum / frequency.clamp(min=1 / side), s=(side, side))
+    rough = rough / rough.std() * (random_patches() < 0.5)
+    grating = torch.sin(2.1 * torch.arange(side)) * (random_patches() < 0.15)
+    light = 10 ** (3 * random_patches() - 2.7) * (1 + texture * rough + 0.6 * texture * grating).clamp(min=0.02)
+    light = light * (1 + 0.2 * torch.arange(side) / side)
+    return (light * torch.tensor([0.6, 1.0, 1.0, 0.7])[:, None, None]).clamp(max=1)
+
+
+def shoot(clean: Tensor, shot: float, read: float, seed: int, **switches: float) -> Tensor:
+    """The mosaic of a camera with these levels."""
+    model = SensorNoise(FixedLevels(shot, read), poisson=True, bits=BITS, black_level=BLACK, **switches)
+    return unpack(model.apply(clean, model.sample(1, torch.Generator().manual_seed(seed))), "GRBG")
+
+
+@pytest.mark.parametrize(("shot", "read"), [(1e-3, 1e-5), (3e-4, 3e-6)])
+@pytest.mark.parametrize("seed", range(5))
+def test_textured_and_clipped_frames_give_both_levels_within_5_percent(shot: float, read: float, seed: int) -> None:
+    clean = scene(seed)
+    assert (clean == 1).float().mean() > 0.03
+    estimate = estimate_noise(shoot(clean, shot, read, seed), "GRBG")
+    assert estimate.shot_var == pytest.approx(shot, rel=0.05)
+    assert estimate.read_var == pytest.approx(read + ROUNDING, rel=0.05)
+    assert estimate.r2 > 0.98
+
+
+def test_errors_are_of_the_right_size() -> None:
+    """On frames without texture the standard errors are those of the estimates, within a factor of 2."""
+    frames = [shoot(scene(seed, 512, texture=0.0), 1e-3, 1e-5, seed) for seed in range(12)]
+    estimates = [estimate_noise(frame, "GRBG") for frame in frames]
+    shot_error = np.sqrt(np.mean([(e.shot_var - 1e-3) ** 2 for e in estimates]))
+    read_error = np.sqrt(np.mean([(e.read_var - 1e-5 - ROUNDING) ** 2 for e in estimates]))
+    assert 0.5 < shot_error / np.mean([e.shot_var_error for e in estimates]) < 2
+    assert 0.5 < read_error / np.mean([e.read_var_error for e in estimates]) < 2
+
+
+def test_several_frames_are_better_than_one() -> None:
+    frames = [shoot(scene(seed), 1e-3, 1e-5, seed) for seed in range(3)]
+    one, three = estimate_noise(frames[0], "GRBG"), estimate_noise(frames, "GRBG")
+    assert three.shot_var_error < one.shot_var_error
+    assert three.points.blocks.sum() > 2 * one.points.blocks.sum()
+
+
+def test_banding_and_defects_do_not_count() -> None:
+    estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0, row_var=5e-6, dead=5e-4, hot=5e-4), "GRBG")
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
+    assert estimate.read_var == pytest.approx(1e-5 + ROUNDING, rel=0.05)
+
+
+def test_frames_that_clip_elsewhere() -> None:
+    """A sensor that saturates at 0.8 of the nominal white, and a file that is clipped at black."""
+    frame = shoot(scene(1), 1e-3, 1e-5, 1).clamp(0, 0.8)
+    estimate = estimate_noise(frame, "GRBG")
+    used = estimate.points.signal[estimate.points.used]
+    assert used.max() < 0.8 and used.min() > 0.01
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
+    assert estimate.read_var == pytest.approx(1e-5, rel=0.3)  # no dark level is left to measure it on
+
+
+def test_levels_too_near_white_are_left_out() -> None:
+    """At two standard deviations from white a fifth of the blocks are unclipped: those of the least noise."""
+    levels = torch.tensor([0.01, 0.05, 0.2, 0.5, 0.93, 0.94, 0.95, 0.96])
+    clean = levels.repeat_interleave(64)[None, None, None, :].expand(1, 4, 512, 512).contiguous()
+    estimate = estimate_noise(shoot(clean, 1e-3, 1e-5, 0), "GRBG")
+    assert estimate.points.signal[estimate.points.used].max() < 0.9
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.02)
+
+
+def test_smoothed_levels_are_left_out() -> None:
+    """A codec that smooths the blue plane: the others tell the noise."""
+    packed = shoot(scene(2), 1e-3, 1e-5, 2)
+    planes = packed.clone()
+    blue = planes[..., 1::2, 0::2]  # of GRBG
+    blue[..., 1:-1] = (blue[..., :-2] + 2 * blue[..., 1:-1] + blue[..., 2:]) / 4
+    estimate = estimate_noise(planes, "GRBG")
+    assert not (estimate.points.used & (estimate.points.channel == 3)).any()
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
+
+
+def test_known_read_noise_is_kept() -> None:
+    dark = [shoot(torch.zeros(1, 4, 128, 128), 1e-3, 1e-5, seed) for seed in range(2)]
+    read_var = from_dark_frames(dark, "GRBG").read_var
+    assert read_var == pytest.approx(1e-5 + ROUNDING, rel=0.02)
+    estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0), "GRBG", read_var=read_var)
+    assert estimate.read_var == read_var and estimate.read_var_error == 0
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
+
+
+def test_dark_frames_tell_banding_black_level_and_ignore_hot_pixels() -> None:
+    def dark(seed: int) -> Tensor:
+        clean = torch.tensor([1e-3, 2e-3, -1e-3, 0.0])[None, :, None, None].expand(1, 4, 512, 256)
+        for model in (ShotReadNoise(FixedLevels(0, 1e-5)), RowNoise(2e-6), DefectPixels(0, 1e-3), Quantisation(14)):
+            clean = model.apply(clean, model.sample(1, torch.Generator().manual_seed(seed)))
+        return unpack(clean, "BGGR")
+
+    measured = from_dark_frames([dark(seed) for seed in range(4)], "BGGR")
+    assert measured.read_var == pytest.approx(1e-5, rel=0.02)
+    assert measured.row_var == pytest.approx(2e-6, rel=0.1)
+    assert measured.black_offset == pytest.approx((1e-3, 2e-3, -1e-3, 0.0), abs=1e-4)
+    plain = shoot(torch.zeros(1, 4, 512, 32), 1e-3, 1e-5, 0)
+    assert from_dark_frames([plain], "GRBG").row_var < 3e-8  # a row's mean varies by 1.6e-7 without any banding
+    with pytest.raises(ValueError, match="clipped at black"):
+        from_dark_frames([dark(0).clamp(min=0)], "BGGR")
+    with pytest.raises(ValueError, match="no dark frames"):
+        from_dark_frames([], "BGGR")
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (torch.rand(1, 3, 64, 64), "a mosaic has shape"),
+        (torch.rand(2, 1, 64, 64), "a mosaic has shape"),
+        (torch.rand(1, 8, 8), "too small"),
+        (torch.rand(1, 32, 32), "too few blocks"),
+        (torch.ones(1, 512, 512), "too few blocks"),
+        (torch.zeros(1, 512, 512), "too few"),
+        (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "all of one brightness"),
+    ],
+)
+def test_frames_without_the_answer_are_refused(frame: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        estimate_noise(frame, "RGGB")
+
+
+def test_figure_shows_points_and_lines(tmp_path: Path) -> None:
+    estimate = estimate_noise(shoot(scene(0, 512), 1e-3, 1e-5, 0), "GRBG")
+    figure = plot_noise(estimate, tmp_path / "noise.png", title="a camera", reference=(1e-3, 1e-5))
+    assert (tmp_path / "noise.png").stat().st_size > 10_000
+    drawn = sum(np.shape(collection.get_offsets())[0] for collection in figure.axes[0].collections)
+    assert drawn == len(estimate.points.signal) and len(figure.axes[0].lines) == 2
+
+
+def read_mosaic(path: Path) -> Tensor:
+    """The visible mosaic of an RGGB file, black-subtracted, white = 1."""
+    with rawpy.imread(str(path)) as raw:
+        assert raw.raw_colors_visible[:2, :2].tolist() == [[0, 1], [3, 2]]
+        black, white = float(raw.black_level_per_channel[0]), float(raw.white_level)
+        values = raw.raw_image_visible.astype(np.float32)
+    return torch.from_numpy((values - black) / (white - black))[None]
+
+
+def test_gopro_file_agrees_with_its_noise_profile(camera_files: Path) -> None:
+    """The codec smooths: most of B, and the highlights of all colours, are left out; G and R lie 12 % below the tag.
+
+    The tag's read variance is shot_var / 3200 in every GoPro file, not a measurement; the file's is 1.8 times that.
+    """
+    path = camera_files / "raw" / "gopro" / "hero6_0024.dng"
+    with tifffile.TiffFile(path) as file:
+        shot, read = file.pages[0].tags[51041].value[:2]
+    estimate = estimate_noise(read_mosaic(path), "RGGB")
+    assert 1 / 1.6 < estimate.shot_var / shot < 1.6
+    assert 1 / 2.5 < estimate.read_var / read < 2.5
+    signal = torch.tensor([0.002, 0.005, 0.01, 0.1, 0.5, 1.0])
+    ratio = (estimate.shot_var * signal + estimate.read_var) / (shot * signal + read)
+    assert ratio.max() < 1.6 and ratio.min() > 1 / 1.6
+    assert estimate.r2 > 0.9
+
+
+@pytest.mark.parametrize("name", ["g2_0304", "s40_0101", "s40_0112"])
+def test_canon_charts_give_a_line(camera_files: Path, name: str) -> None:
+    estimate: NoiseEstimate = estimate_noise(read_mosaic(camera_files / "raw" / "canon" / f"{name}.crw"), "RGGB")
+    assert estimate.r2 > 0.9
+    assert estimate.points.used.float().mean() > 0.8
+    assert 1e-4 < estimate.shot_var < 1.5e-4  # cameras of one generation at ISO 50
+
+
+def test_estimate_does_not_change_what_it_is_given() -> None:
+    frame = shoot(scene(0, 512), 1e-3, 1e-5, 0)
+    kept = frame.clone()
+    estimate_noise(frame, "GRBG")
+    assert torch.equal(frame, kept)
+    model = PoissonGaussianNoise(FixedLevels(1e-3, 1e-5))
+    assert model.sample(1, torch.Generator())["shot_var"].shape == (1,)

@@ -1,0 +1,85 @@
+"""What a sensor adds: tails, banding, offsets, defects."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy import stats
+
+from rawaug.bayer import CFA, unpack
+from rawaug.noise import BlackOffset, ColourBias, DefectPixels, FixedLevels, Quantisation, RowNoise, TukeyLambdaNoise
+from rawaug.noise.sensor import tukey_lambda_variance
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("shape", [0.3, 0.14, 0.05, 0.0, -0.03])
+def test_tukey_lambda_has_its_kurtosis_and_quantiles(shape: float) -> None:
+    model = TukeyLambdaNoise(FixedLevels(0, 1e-6), shape)
+    noise = model.apply(torch.zeros(1, 4, 512, 512), model.sample(1, generator())).flatten().double() / 1e-3
+    kurtosis = float((noise**4).mean() / noise.var() ** 2)
+    assert kurtosis == pytest.approx(3 + float(stats.tukeylambda.stats(shape, moments="k")), rel=0.03)
+    sd = stats.tukeylambda.std(shape)
+    assert stats.kstest(noise[:100_000].numpy(), lambda x: stats.tukeylambda.cdf(x * sd, shape)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("shape", [0.2, 0.14, 1e-3, 1e-5, 0.0, -0.1, -0.2429])
+def test_tukey_lambda_variance(shape: float) -> None:
+    assert tukey_lambda_variance(shape) == pytest.approx(stats.tukeylambda.var(shape), rel=1e-4)
+
+
+def test_tukey_lambda_shapes_are_drawn_and_checked() -> None:
+    shapes = TukeyLambdaNoise(FixedLevels(0, 1e-6), (-0.2, 0.1)).sample(1000, generator())["tukey_lambda"]
+    assert shapes.min() >= -0.2 and shapes.max() <= 0.1 and shapes.std() == pytest.approx(0.3 / 12**0.5, rel=0.1)
+    with pytest.raises(ValueError, match=r"above -0\.5"):
+        TukeyLambdaNoise(FixedLevels(0, 0), -0.5)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_banding_is_constant_along_rows_of_the_mosaic_and_independent_between_them(cfa: CFA) -> None:
+    model = RowNoise(1e-4)
+    noise = model.apply(torch.zeros(2, 4, 512, 16), model.sample(2, generator()))
+    mosaic = unpack(noise, cfa)[:, 0]
+    assert torch.equal(mosaic, mosaic[..., :1].expand_as(mosaic))
+    rows = mosaic[..., 0]
+    assert abs(float(torch.corrcoef(torch.stack([rows[0, :-1], rows[0, 1:]]))[0, 1])) < 0.1
+    assert abs(float(torch.corrcoef(rows)[0, 1])) < 0.1
+
+
+def test_ranges_are_drawn_per_picture() -> None:
+    row_var = RowNoise((1e-6, 1e-4)).sample(2000, generator())["row_var"]
+    assert row_var.min() >= 1e-6 and row_var.max() <= 1e-4
+    assert row_var.log10().mean() == pytest.approx(-5, abs=0.05)
+    for wrong in (-1e-6, (0.0, 1e-4), (1e-4, 1e-6)):
+        with pytest.raises(ValueError, match="row_var is not negative"):
+            RowNoise(wrong)
+
+
+def test_offsets_are_constant_over_a_picture() -> None:
+    clean = torch.full((500, 4, 2, 2), 0.2)
+    black = BlackOffset(1e-3)
+    offset = black.apply(clean, black.sample(500, generator())) - clean
+    assert offset.flatten(1).std(1).max() < 1e-6 and offset[:, 0, 0, 0].std() == pytest.approx(1e-3, rel=0.1)
+    colour = ColourBias(1e-3)
+    bias = colour.apply(clean, colour.sample(500, generator())) - clean
+    assert bias.flatten(2).std(2).max() < 1e-6 and bias[:, :, 0, 0].std() == pytest.approx(1e-3, rel=0.1)
+    assert abs(float(torch.corrcoef(bias[:, :2, 0, 0].T)[0, 1])) < 0.15
+
+
+def test_defects_are_as_many_as_asked_for() -> None:
+    model = DefectPixels(dead=1e-2, hot=2e-2)
+    noisy = model.apply(torch.full((2, 4, 256, 256), 0.3), model.sample(2, generator()))
+    assert (noisy == 0).float().mean() == pytest.approx(1e-2, rel=0.05)
+    hot = noisy[noisy > 0.3]
+    assert hot.numel() / noisy.numel() == pytest.approx(2e-2, rel=0.05)
+    assert (hot == 1).float().mean() == pytest.approx(0.3, abs=0.03)
+    with pytest.raises(ValueError, match="add up to at most 1"):
+        DefectPixels(0.6, 0.6)
+
+
+def test_impossible_depths_are_refused() -> None:
+    for bits, black in ((0, 0), (17, 0), (8, 255)):
+        with pytest.raises(ValueError, match="bits are 1 to 16"):
+            Quantisation(bits, black)
