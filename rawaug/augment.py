@@ -11,7 +11,7 @@ them after, and the parameters replay the pair bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -67,7 +67,8 @@ class RawAugment(nn.Module):
 
     Args:
         isp: the fitted camera.
-        noise: name of a preset, (shot_var, read_var), or a :class:`rawaug.noise.NoiseModel`.
+        noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
+            ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
             ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
@@ -85,7 +86,7 @@ class RawAugment(nn.Module):
     def __init__(
         self,
         isp: DictionaryISP,
-        noise: str | tuple[float, float] | NoiseModel = "cycleisp_sidd",
+        noise: str | Sequence[float] | NoiseModel = "cycleisp_sidd",
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
@@ -95,7 +96,7 @@ class RawAugment(nn.Module):
             raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
         self.isp = isp.eval().requires_grad_(False)
         self.baked = BakedISP(self.isp)
-        self.noise = noise_model(noise)
+        self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
         self.generator = keyed_generator(seed, "augment")
@@ -163,6 +164,19 @@ class RawAugment(nn.Module):
         rows = params.place[:1] if len(places) == 1 else params.place
         height, width = srgb.shape[-2:]
         return torch.cat([place_in_frame(height, width, (t, left), (h, w)) for t, left, h, w in rows.tolist()])
+
+
+def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | NoiseModel) -> NoiseModel:
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels that stand in its file.
+
+    Raises:
+        ValueError: if none were measured, or the name is unknown.
+    """
+    if noise != "camera":
+        return noise_model(noise)
+    if "noise" not in isp.info:
+        raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again, or name a preset')
+    return noise_model((isp.info["noise"]["shot_var"], isp.info["noise"]["read_var"]))
 
 
 class _Sequence(Protocol):

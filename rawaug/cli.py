@@ -63,6 +63,8 @@ def _parser() -> Any:
     fit = new("Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where there are any).")
     fit.add_argument("data", type=str, help="folder of RAW files, one file, or kind:path")
     fit.add_argument("--out", type=str, required=True, help="the .safetensors file to write")
+    fit.add_argument("--noise", type=bool, default=True, help="also measure the camera's noise, for noise: camera")
+    fit.add_argument("--dark", type=str | None, default=None, help="folder of dark frames: they tell the read variance")
     fit.add_class_arguments(FitConfig)
 
     evaluate = new("PSNR and SSIM of an ISP or a denoiser; the file says which.")
@@ -106,10 +108,17 @@ def _fit(arguments: Any) -> None:
     settings = vars(arguments)
     data, out = settings.pop("data"), settings.pop("out")
     _require_safetensors(out)
-    isp = fit(data, **settings)
+    figure = Path(out).with_name(f"{Path(out).stem}-noise.png") if settings["noise"] else None
+    if figure is not None:
+        figure.parent.mkdir(parents=True, exist_ok=True)
+    isp = fit(data, noise_figure=figure, **settings)
     isp.info["data"] = data
     isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
+    if figure is not None:
+        noise = isp.info["noise"]
+        levels = f"shot_var {noise['shot_var']:.3g}, read_var {noise['read_var']:.3g}"
+        print(f"noise: {levels}, R^2 {noise['r2']:.3f}: {figure}")
 
 
 def _evaluate(arguments: Any) -> None:

@@ -9,18 +9,28 @@ from typing import Any
 
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.pairs import Pair
+from rawaug.experiment.camera_noise import as_info, measure_camera_noise
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
+from rawaug.noise import plot_noise
 
 
 def fit(
-    source: str | Path | Sequence[str | Path] | Sequence[Pair], progress: bool = True, **settings: Any
+    source: str | Path | Sequence[str | Path] | Sequence[Pair],
+    progress: bool = True,
+    noise: bool = False,
+    dark: str | Path | None = None,
+    noise_figure: str | Path | None = None,
+    **settings: Any,
 ) -> DictionaryISP:
     """Fit a camera of one's own.
 
     Args:
         source: a RAW file, a folder of them, a list of files, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
+        noise: also measure the camera's noise levels, for ``RawAugment(isp, noise="camera")``.
+        dark: folder of dark frames, which then tell the read variance.
+        noise_figure: where to draw the measured points and the line.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Raises:
@@ -31,14 +41,21 @@ def fit(
         >>> isp.info["frames"][0]
         'train_00_astronaut'
     """
-    pairs: Sequence[Pair]
-    if isinstance(source, (str, Path)):
-        pairs = open_pairs(str(source), split="train")
-    elif len(source) and isinstance(source[0], Pair):
-        pairs = list(source)  # type: ignore[arg-type]
-    else:
-        pairs = RawFolder(source)  # type: ignore[arg-type]
+    pairs = _pairs(source)
     start = time.perf_counter()
     isp = fit_isp(pairs, FitConfig(**settings), progress)
+    if noise or dark is not None or noise_figure is not None:
+        estimate = measure_camera_noise(pairs, dark)
+        isp.info["noise"] = as_info(estimate)
+        if noise_figure is not None:
+            plot_noise(estimate, noise_figure, title=", ".join(sorted({pair.camera for pair in pairs})))
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
+
+
+def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair]) -> Sequence[Pair]:
+    if isinstance(source, (str, Path)):
+        return open_pairs(str(source), split="train")
+    if len(source) and isinstance(source[0], Pair):
+        return list(source)  # type: ignore[arg-type]
+    return RawFolder(source)  # type: ignore[arg-type]

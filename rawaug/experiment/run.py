@@ -15,18 +15,17 @@ from typing import Any
 
 import denoisers
 from denoisers.network import Denoiser
-from rawaug.augment import RawAugment, RawPairs
-from rawaug.bayer import CFA
+from rawaug.augment import RawAugment, RawPairs, noise_for
 from rawaug.data import RawFolder, open_pairs, open_pictures
 from rawaug.data.pairs import Pair
 from rawaug.experiment.evaluate import frozen_sample, score_denoiser, summary, write_json
 from rawaug.experiment.fitting import fit
-from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.report import Row, draw, print_table
-from rawaug.experiment.stream import RealCrops, Sample, TrainingStream
+from rawaug.experiment.stream import RealCrops, TrainingStream
 from rawaug.experiment.train import train
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import noise_model
+from rawaug.noise import NoiseModel
 from rawaug.seeding import derived_seed
 
 SHOWN = 3
@@ -35,35 +34,123 @@ SHOWN = 3
 
 def run(recipe: Recipe) -> dict[str, list[dict[str, Any]]]:
     """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``."""
-    folder = Path(recipe.out) / recipe.name
-    pairs = list(open_pairs(recipe.data.pairs, split="train")[: recipe.data.count])
-    test = open_pairs(recipe.data.test)
-    _require_unseen(recipe, test)
-    open_pictures(recipe.data.pictures)  # what is missing is told before anything is fitted
-    results: dict[str, list[dict[str, Any]]] = {arm: [] for arm in recipe.arms}
-    models: dict[str, Denoiser] = {}
-    cfa = pairs[0].cfa
-    for seed in range(recipe.seed, recipe.seed + recipe.seeds):
-        isp = _fitted_isp(recipe, pairs, seed, folder)
-        for name, arm in recipe.arms.items():
-            place = folder / f"seed{seed}" / name
-            models[name] = _trained(recipe, arm, name, isp, pairs, cfa, seed, place)
-            results[name].append(_evaluated(recipe, models[name], name, test, cfa, place))
-    write_json({"recipe": asdict(recipe), "results": results}, folder / "results.json")
-    picture = draw(_rows(recipe, models, test, cfa), cfa, folder / "picture.png")
-    counted = (
-        f"{len(pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s), tested on {recipe.data.test}"
-    )
-    print_table(results, f"{recipe.name}: {counted}")
-    print(f"table: {folder / 'results.json'}\npicture: {picture}")
-    return results
+    return _Run(recipe).all_stages()
 
 
-def _require_unseen(recipe: Recipe, test: Sequence[Pair]) -> None:
+class _Run:
+    """One recipe on its data; everything that could be missing is opened before anything is fitted."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe, self.data = recipe, recipe.data
+        self.folder = Path(recipe.out) / recipe.name
+        self.test = open_pairs(self.data.test)
+        self.validation = open_pairs(self.data.validation, split="validation")
+        source = open_pairs(self.data.pairs, split="train")
+        _require_unseen(self.test, {"pairs": source, "validation": self.validation})
+        self.pictures = open_pictures(self.data.pictures)
+        self.pairs = list(source[: self.data.count])
+        self.cfa = self.pairs[0].cfa
+
+    def all_stages(self) -> dict[str, list[dict[str, Any]]]:
+        recipe = self.recipe
+        results: dict[str, list[dict[str, Any]]] = {arm: [] for arm in recipe.arms}
+        models: dict[str, Denoiser] = {}
+        for seed in range(recipe.seed, recipe.seed + recipe.seeds):
+            isp = self.fitted_isp(seed)
+            noise = noise_for(isp, recipe.noise)
+            for arm in recipe.arms:
+                models[arm] = self.trained(arm, isp, noise, seed)
+                results[arm].append(self.evaluated(arm, models[arm], noise, seed))
+        table = self.folder / "results.json"
+        write_json({"recipe": asdict(recipe), "results": results}, table)
+        picture = draw(self.rows(models, noise), self.cfa, self.folder / "picture.png")
+        settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
+        print_table(results, f"{recipe.name}: {settings}, tested on {self.data.test}")
+        print(f"table: {table}\npicture: {picture}")
+        return results
+
+    def fitted_isp(self, seed: int) -> DictionaryISP:
+        """The ISP of the few pairs."""
+        path = self.folder / f"seed{seed}" / "isp.safetensors"
+        settings = {**asdict(self.recipe.isp), "seed": seed}
+        measure = self.recipe.noise == "camera"
+        key = _key("isp", settings, [pair.name for pair in self.pairs], measure)
+        if path.is_file():
+            isp = DictionaryISP.from_pretrained(path)
+            if isp.info.get("key") == key:
+                print(f"fitted already: {path}")
+                return isp
+        isp = fit(self.pairs, noise=measure, **settings)
+        isp.info["key"] = key
+        isp.save(path)
+        return isp
+
+    def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
+        """The denoiser of one arm."""
+        recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
+        path = place / "denoiser.safetensors"
+        config, network = recipe.train, recipe.denoiser
+        key = _key(
+            isp.info["key"], asdict(recipe.arms[arm]), asdict(config), asdict(network), recipe.noise, asdict(self.data)
+        )
+        if path.is_file():
+            model, info = denoisers.load(path)
+            if info.get("key") == key:
+                print(f"trained already: {path}")
+                return model
+        _discard_other_checkpoint(place, key)
+        validation = [frozen_sample(pair, noise, self.cfa, seed=0) for pair in self.validation]
+        stream, label = self.stream(arm, isp, noise, seed), f"seed {seed}, {arm}"
+        model = train(stream, validation, network, config, place, seed, recipe.device, recipe.devices, label)
+        levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
+        info = {"key": key, "cfa": str(self.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
+        denoisers.save(model, path, info)
+        (place / "last.pt").unlink(missing_ok=True)
+        return model
+
+    def stream(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> TrainingStream:
+        """The training samples of one arm."""
+        config, settings = self.recipe.train, self.recipe.arms[arm]
+        real = RealCrops(self.pairs, noise, config.crop, self.cfa)
+        augmented = None
+        if settings.augmented:
+            augment = RawAugment(isp, noise, settings.sampling, settings.strength)
+            augmented = RawPairs(self.pictures, augment, config.crop)
+        return TrainingStream(real, augmented, config.batch, settings.augmented, derived_seed(seed, "stream"))
+
+    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, seed: int) -> dict[str, Any]:
+        """Plain and self-ensemble scores on the test frames."""
+        result: dict[str, Any] = {}
+        for kind in ("plain", "self_ensemble"):
+            label, ensemble = f"evaluate {arm}, {kind}", kind == "self_ensemble"
+            scored = score_denoiser(model, self.test, noise, self.cfa, 0, ensemble, label)
+            result[kind] = summary([score for score, *_ in scored])
+        write_json(result, self.folder / f"seed{seed}" / arm / "evaluation.json")
+        return result
+
+    def rows(self, models: dict[str, Denoiser], noise: NoiseModel) -> list[Row]:
+        """Panels of the first test frames with the last seed's models."""
+        rows: list[Row] = []
+        for pair in list(self.test[:SHOWN]):
+            row = Row(pair, {}, {})
+            for arm, model in models.items():
+                scored = score_denoiser(model, [pair], noise, self.cfa, 0, False, f"picture, {arm}")
+                score, _, sample, denoised = next(scored)
+                row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
+                row.panels[arm] = denoised
+                row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", arm: f"{score.psnr:.2f} dB"}
+            row.panels["clean"] = sample.clean
+            row.captions["clean"] = pair.name
+            rows.append(row)
+        return rows
+
+
+def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:
     """Refuse test frames that are also among the frames of training or validation."""
     unseen = _identities(test)
-    for part in ("pairs", "validation"):
-        seen = unseen & _identities(open_pairs(getattr(recipe.data, part), split="train" if part == "pairs" else part))
+    for part, pairs in others.items():
+        seen = unseen & _identities(pairs)
         if seen:
             raise ValueError(f"data.test: {min(seen)} is also among data.{part}; test on frames that nothing has seen")
 
@@ -80,65 +167,6 @@ def _key(*settings: Any) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-def _fitted_isp(recipe: Recipe, pairs: Sequence[Pair], seed: int, folder: Path) -> DictionaryISP:
-    path = folder / f"seed{seed}" / "isp.safetensors"
-    settings = {**asdict(recipe.isp), "seed": seed}
-    key = _key("isp", settings, [pair.name for pair in pairs])
-    if path.is_file():
-        isp = DictionaryISP.from_pretrained(path)
-        if isp.info.get("key") == key:
-            print(f"fitted already: {path}")
-            return isp
-    isp = fit(pairs, **settings)
-    isp.info["key"] = key
-    isp.save(path)
-    return isp
-
-
-def _trained(
-    recipe: Recipe,
-    arm: ArmConfig,
-    name: str,
-    isp: DictionaryISP,
-    pairs: Sequence[Pair],
-    cfa: CFA,
-    seed: int,
-    place: Path,
-) -> Denoiser:
-    path = place / "denoiser.safetensors"
-    config = recipe.train
-    key = _key(
-        "train",
-        isp.info["key"],
-        asdict(arm),
-        asdict(config),
-        asdict(recipe.denoiser),
-        recipe.noise,
-        recipe.data.pictures,
-    )
-    if path.is_file():
-        model, info = denoisers.load(path)
-        if info.get("key") == key:
-            print(f"trained already: {path}")
-            return model
-    _discard_other_checkpoint(place, key)
-    noise = noise_model(recipe.noise)
-    real = RealCrops(pairs, noise, config.crop, cfa)
-    augmented = None
-    if arm.augmented:
-        augment = RawAugment(isp, noise, arm.sampling, arm.strength)
-        augmented = RawPairs(open_pictures(recipe.data.pictures), augment, config.crop)
-    stream = TrainingStream(real, augmented, config.batch, arm.augmented, derived_seed(seed, "stream"))
-    label = f"seed {seed}, {name}"
-    model = train(
-        stream, _validation(recipe, cfa), recipe.denoiser, config, place, seed, recipe.device, recipe.devices, label
-    )
-    info = {"key": key, "cfa": str(cfa), "noise": recipe.noise, "steps": config.steps, "seed": seed, "arm": name}
-    denoisers.save(model, path, {**info, "real_pairs": [pair.name for pair in pairs], "pictures": recipe.data.pictures})
-    (place / "last.pt").unlink(missing_ok=True)
-    return model
-
-
 def _discard_other_checkpoint(place: Path, key: str) -> None:
     """A checkpoint of other settings cannot be gone on from."""
     place.mkdir(parents=True, exist_ok=True)
@@ -147,39 +175,3 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
     stamp.write_text(key)
-
-
-def _validation(recipe: Recipe, cfa: CFA) -> list[Sample]:
-    noise = noise_model(recipe.noise)
-    return [frozen_sample(pair, noise, cfa, seed=0) for pair in open_pairs(recipe.data.validation, split="validation")]
-
-
-def _evaluated(
-    recipe: Recipe, model: Denoiser, name: str, test: Sequence[Pair], cfa: CFA, place: Path
-) -> dict[str, Any]:
-    """Plain and self-ensemble scores on the test frames."""
-    noise = noise_model(recipe.noise)
-    result: dict[str, Any] = {}
-    for kind in ("plain", "self_ensemble"):
-        scored = score_denoiser(model, test, noise, cfa, 0, kind == "self_ensemble", f"evaluate {name}, {kind}")
-        result[kind] = summary([score for score, *_ in scored])
-    write_json(result, place / "evaluation.json")
-    return result
-
-
-def _rows(recipe: Recipe, models: dict[str, Denoiser], test: Sequence[Pair], cfa: CFA) -> list[Row]:
-    """Panels of the first test frames with the last seed's models."""
-    noise = noise_model(recipe.noise)
-    rows: list[Row] = []
-    for pair in list(test[:SHOWN]):
-        row = Row(pair, {}, {})
-        for name, model in models.items():
-            score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, 0, False, f"picture, {name}"))
-            row.panels.setdefault("noisy", sample.noisy)
-            row.captions["noisy"] = f"{score.psnr_noisy:.2f} dB"
-            row.panels[name] = denoised
-            row.captions[name] = f"{score.psnr:.2f} dB"
-        row.panels["clean"] = sample.clean
-        row.captions["clean"] = pair.name
-        rows.append(row)
-    return rows

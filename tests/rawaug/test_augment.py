@@ -171,3 +171,13 @@ def test_wrapping_a_loader_is_one_line(augment: RawAugment, srgb: Tensor) -> Non
     assert len(wrapped) == len(batches) == 2 and wrapped.batch_size == 2
     pair, labels = batches[0]
     assert pair.noisy.shape == (2, 4, 8, 10) and labels.tolist() == [0, 1]
+
+
+def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:
+    with pytest.raises(ValueError, match="fitted without measuring noise"):
+        RawAugment(isp, noise="camera")
+    measured = DictionaryISP()
+    measured.info["noise"] = {"shot_var": 2e-3, "read_var": 3e-5, "r2": 0.99}
+    params = RawAugment(measured, noise="camera")(torch.rand(2, 3, 8, 8)).params
+    torch.testing.assert_close(params.noise["shot_var"], torch.full((2,), 2e-3))
+    torch.testing.assert_close(params.noise["read_var"], torch.full((2,), 3e-5))
