@@ -9,7 +9,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rawaug._version import __version__
 
@@ -63,7 +63,8 @@ def _parser() -> Any:
     fit = new("Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where there are any).")
     fit.add_argument("data", type=str, help="folder of RAW files, one file, or kind:path")
     fit.add_argument("--out", type=str, required=True, help="the .safetensors file to write")
-    fit.add_argument("--noise", type=bool, default=True, help="also measure the camera's noise, for noise: camera")
+    noise_help = "also measure the camera's noise, for noise: camera; auto goes on where the frames do not show it"
+    fit.add_argument("--noise", type=Literal["auto", "on", "off"], default="auto", help=noise_help)
     fit.add_argument("--dark", type=str | None, default=None, help="folder of dark frames: they tell the read variance")
     fit.add_class_arguments(FitConfig)
 
@@ -108,14 +109,15 @@ def _fit(arguments: Any) -> None:
     settings = vars(arguments)
     data, out = settings.pop("data"), settings.pop("out")
     _require_safetensors(out)
-    figure = Path(out).with_name(f"{Path(out).stem}-noise.png") if settings["noise"] else None
-    if figure is not None:
-        figure.parent.mkdir(parents=True, exist_ok=True)
+    figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
+    figure.parent.mkdir(parents=True, exist_ok=True)
     isp = fit(data, noise_figure=figure, **settings)
     isp.info["data"] = data
     isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
-    if figure is not None:
+    if "noise_not_measured" in isp.info:
+        print(f"noise not measured: {isp.info['noise_not_measured']}")
+    if "noise" in isp.info:
         noise = isp.info["noise"]
         levels = f"shot_var {noise['shot_var']:.3g}, read_var {noise['read_var']:.3g}"
         print(f"noise: {levels}, R^2 {noise['r2']:.3f}: {figure}")

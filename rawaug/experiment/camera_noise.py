@@ -8,30 +8,52 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from torch import Tensor
+
 from rawaug.bayer import CFA
 from rawaug.data import RawFolder
 from rawaug.data.pairs import Pair
 from rawaug.experiment.stream import aligned
+from rawaug.io import read_raw
 from rawaug.noise import NoiseEstimate, estimate_noise, from_dark_frames
+
+MOST_FRAMES = 16
+"""Frames that are measured at most: they are in memory together."""
 
 
 def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> NoiseEstimate:
     """(shot_var, read_var) of the camera at the ISO of its files, with the measured points.
 
     Args:
-        pairs: frames of one camera at one ISO; others blur the line, which its R^2 shows.
+        pairs: frames of one camera at one ISO (others blur the line, which its R^2 shows); of more than
+            :data:`MOST_FRAMES`, so many, evenly spaced.
         dark: folder of dark frames, which then tell the read variance.
 
     Raises:
         ValueError: if the frames have too few flat regions, or a dark frame is clipped at black.
     """
-    cfa = CFA(pairs[0].cfa)
+    mosaics, cfa = _mosaics(pairs)
     read_var = None
     if dark is not None:
-        frames = [aligned(frame.raw, frame.cfa, cfa) for frame in RawFolder(dark, camera_jpeg=False)]
-        read_var = from_dark_frames(frames, cfa).read_var
-    mosaics = [aligned(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, cfa) for pair in pairs]
+        frames, dark_cfa = _mosaics(RawFolder(dark))
+        read_var = from_dark_frames(frames, dark_cfa).read_var
     return estimate_noise(mosaics, cfa, read_var=read_var)
+
+
+def _mosaics(pairs: Sequence[Pair]) -> tuple[list[Tensor], CFA]:
+    """The mosaics of frames spread over ``pairs``, brought to the pattern of the first. RAW files are not developed."""
+    chosen = [round(k * (len(pairs) - 1) / max(1, MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
+    indices = range(len(pairs)) if len(pairs) <= MOST_FRAMES else chosen
+    found: list[tuple[Tensor, CFA]] = []
+    for index in indices:
+        if isinstance(pairs, RawFolder):
+            frame = read_raw(pairs.files[index])
+            found.append((frame.mosaic, frame.cfa))
+        else:
+            pair = pairs[index]
+            found.append((pair.raw if pair.noisy is None else pair.noisy, pair.cfa))
+    cfa = found[0][1]
+    return [aligned(mosaic, own, cfa) for mosaic, own in found], cfa
 
 
 def as_info(estimate: NoiseEstimate) -> dict[str, float]:

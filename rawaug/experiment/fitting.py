@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.pairs import Pair
@@ -18,7 +18,7 @@ from rawaug.noise import plot_noise
 def fit(
     source: str | Path | Sequence[str | Path] | Sequence[Pair],
     progress: bool = True,
-    noise: bool = False,
+    noise: Literal["auto", "on", "off"] = "auto",
     dark: str | Path | None = None,
     noise_figure: str | Path | None = None,
     **settings: Any,
@@ -28,7 +28,8 @@ def fit(
     Args:
         source: a RAW file, a folder of them, a list of files, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
-        noise: also measure the camera's noise levels, for ``RawAugment(isp, noise="camera")``.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" goes on
+            without where the frames do not show them, and says why in ``isp.info["noise_not_measured"]``.
         dark: folder of dark frames, which then tell the read variance.
         noise_figure: where to draw the measured points and the line.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
@@ -44,11 +45,17 @@ def fit(
     pairs = _pairs(source)
     start = time.perf_counter()
     isp = fit_isp(pairs, FitConfig(**settings), progress)
-    if noise or dark is not None or noise_figure is not None:
-        estimate = measure_camera_noise(pairs, dark)
-        isp.info["noise"] = as_info(estimate)
-        if noise_figure is not None:
-            plot_noise(estimate, noise_figure, title=", ".join(sorted({pair.camera for pair in pairs})))
+    if noise != "off":
+        try:
+            estimate = measure_camera_noise(pairs, dark)
+        except ValueError as error:
+            if noise == "on":
+                raise
+            isp.info["noise_not_measured"] = str(error)
+        else:
+            isp.info["noise"] = as_info(estimate)
+            if noise_figure is not None:
+                plot_noise(estimate, noise_figure, title=", ".join(isp.info["frames"][:4]))
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
 

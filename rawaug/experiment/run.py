@@ -80,7 +80,7 @@ class _Run:
             if isp.info.get("key") == key:
                 print(f"fitted already: {path}")
                 return isp
-        isp = fit(self.pairs, noise=measure, **settings)
+        isp = fit(self.pairs, noise="on" if measure else "off", **settings)
         isp.info["key"] = key
         isp.save(path)
         return isp

@@ -16,9 +16,9 @@ makes it hold up with a handful of frames (``docs/fit.md``).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -88,6 +88,21 @@ class FrameColour:
         return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale))
 
 
+class _Shot(NamedTuple):
+    """What is kept of a frame besides its pixels."""
+
+    name: str
+    cfa: CFA
+    white_balance: tuple[float, float, float]
+
+
+def _noting(pairs: Iterable[FramePair], shots: list[_Shot]) -> Iterator[FramePair]:
+    """``pairs``, each noted in ``shots`` as it passes: reading a RAW file twice would take as long as the fit."""
+    for pair in pairs:
+        shots.append(_Shot(pair.name, CFA(pair.cfa), pair.white_balance))
+        yield pair
+
+
 def fit_isp(pairs: Sequence[FramePair], config: FitConfig | None = None, progress: bool = True) -> DictionaryISP:
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
@@ -100,8 +115,10 @@ def fit_isp(pairs: Sequence[FramePair], config: FitConfig | None = None, progres
         ValueError: if there is no pair or a frame has too few unclipped pixels.
     """
     config = config or FitConfig()
-    samples = sample_pixels(pairs, config.pixels, config.seed, config.noisy)
-    patterns = {CFA(pair.cfa) for pair in pairs}
+    shots: list[_Shot] = []
+    reading = tqdm(pairs, desc="read", unit="frame", leave=False, disable=None if progress else True)
+    samples = sample_pixels(_noting(reading, shots), config.pixels, config.seed, config.noisy)
+    patterns = {shot.cfa for shot in shots}
     count = min(config.atoms, len(samples.srgb))
     settings = {
         "colour_atoms": count, "gain_atoms": count, "attention": config.attention,
@@ -115,10 +132,10 @@ def fit_isp(pairs: Sequence[FramePair], config: FitConfig | None = None, progres
     colour = FrameColour.from_product(_least_squares(isp, samples, colour))
     _set_atoms(isp, colour, config.seed)
     _set_priors(isp, samples, colour)
-    balance = torch.tensor([pair.white_balance for pair in pairs])
+    balance = torch.tensor([shot.white_balance for shot in shots])
     isp.neutral_gains.copy_(-(colour.log_scale + balance.log()).mean(0)).exp_()
     _refine_forward(isp, colour, samples, config, progress)
-    isp.info = {"frames": [pair.name for pair in pairs], "steps": config.steps, "seed": config.seed}
+    isp.info = {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
     return isp.eval()
 
 
