@@ -100,7 +100,7 @@ def _pair(split: str, k: int, seed: int) -> Pair:
         picture = _random_crop(photographs[scene], generator)
     levels = list(NOISE_LEVELS)
     # every scene meets every ISO in time, and a few pairs already span the range
-    iso = levels[(turn + len(levels) // len(scenes) * (k % len(scenes))) % len(levels)]
+    iso = levels[(1 + turn + len(levels) // len(scenes) * (k % len(scenes))) % len(levels)]
     return DemoCamera().capture(picture, generator, name=f"{split}_{k:02d}_{scene}", iso=iso)
 
 
