@@ -74,7 +74,7 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
 def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
     """The sRGB pictures of a user: photographs whole, then dead leaves of 256 x 384 textured from them.
 
-    The photographs are those of the training pairs and five others.
+    The photographs are those of the training pairs and five others, none of validation or test.
 
     Raises:
         ValueError: if ``count`` is not positive.
