@@ -31,7 +31,7 @@ PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg"
 PAIRS = {"train": 5, "validation": 4, "test": 9}
 """Number of pairs of a split unless told otherwise."""
 
-FRAME = (256, 384)
+FRAME = (288, 448)
 """Height and width of every frame."""
 
 
@@ -47,7 +47,7 @@ def demo_photographs(split: str) -> dict[str, Tensor]:
 
 
 def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair]:
-    """Shots by the demo camera, 256 x 384: crops of the split's photographs, and of dead leaves except in training.
+    """Shots by the demo camera, 288 x 448: crops of the split's photographs, and of dead leaves except in training.
 
     Pair k depends on (split, k, seed) alone; scenes and ISO values take turns.
 
@@ -72,7 +72,7 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
 
 
 def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
-    """The sRGB pictures of a user: photographs whole, then dead leaves of 256 x 384 textured from them.
+    """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
 
     The photographs are those of the training pairs and five others, none of validation or test.
 
