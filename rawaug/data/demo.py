@@ -62,7 +62,7 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
     Example:
         >>> pair = demo_pairs("train", count=1)[0]
         >>> pair.raw.shape, pair.cfa, pair.noisy is not None
-        (torch.Size([1, 256, 384]), <CFA.GRBG: 'GRBG'>, True)
+        (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
     _require_split(split)
     count = PAIRS[split] if count is None else count
