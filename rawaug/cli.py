@@ -23,6 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(argv)
+    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        return 0
     except (ValueError, OSError, ArgumentError) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT

@@ -27,7 +27,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Pair
 from rawaug.experiment.stream import Sample, aligned
-from rawaug.isp.model import DictionaryISP
+from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.isp.samples import block_averages
 from rawaug.metrics import patch_psnr, psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
@@ -55,9 +55,7 @@ def read_header(path: str | Path) -> dict[str, str]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a rawaug weights file.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such weights file")
+    path = find_weights(path)
     try:
         with safe_open(str(path), framework="pt") as file:
             header = dict(file.metadata() or {})
@@ -142,6 +140,7 @@ def evaluate(
         noise: preset for frames without a noisy capture; by default the one that the denoiser was trained with.
         seed: of that noise.
     """
+    weights = find_weights(weights)
     kind = read_header(weights)["kind"]
     result: dict[str, Any] = {"kind": kind, "data": data}
     pairs = open_pairs(data, split="test")
@@ -155,7 +154,7 @@ def evaluate(
         scored = score_denoiser(model, pairs, levels, cfa, seed, self_ensemble, "evaluate")
         scores = [score for score, *_ in scored]
         result |= {"self_ensemble": self_ensemble, "seed": seed}
-    digest = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
     return {**result, **summary(scores), "weights_sha256": digest, "version": __version__}
 
 

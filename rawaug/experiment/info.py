@@ -7,7 +7,7 @@ from pathlib import Path
 
 import denoisers
 from rawaug.experiment.evaluate import read_header
-from rawaug.isp.model import WEIGHTS_DIR, DictionaryISP
+from rawaug.isp.model import DictionaryISP, find_weights
 
 
 def describe(weights: str | Path) -> str:
@@ -16,7 +16,7 @@ def describe(weights: str | Path) -> str:
     Raises:
         FileNotFoundError, ValueError: if there is no such file, or it is not rawaug's.
     """
-    path = Path(weights) if Path(weights).suffix else WEIGHTS_DIR / f"{weights}.safetensors"
+    path = find_weights(weights)
     kind = read_header(path)["kind"]
     if kind == "isp":
         return _describe_isp(path)

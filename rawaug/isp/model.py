@@ -274,10 +274,7 @@ class DictionaryISP(nn.Module):
             FileNotFoundError: if there is no such file or name.
             ValueError: if the file is not that of an ISP.
         """
-        path = Path(name) if Path(name).suffix else WEIGHTS_DIR / f"{name}.safetensors"
-        if not path.is_file():
-            shipped = ", ".join(sorted(p.stem for p in WEIGHTS_DIR.glob("*.safetensors"))) or "none"
-            raise FileNotFoundError(f"{name}: no such ISP; give a .safetensors file or a shipped name ({shipped})")
+        path = find_weights(name)
         try:
             with safe_open(str(path), framework="pt") as file:
                 header = file.metadata() or {}
@@ -292,6 +289,19 @@ class DictionaryISP(nn.Module):
         isp.load_state_dict(state)
         isp.info = json.loads(header.get("info", "{}"))
         return isp.eval()
+
+
+def find_weights(name: str | Path) -> Path:
+    """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package.
+
+    Raises:
+        FileNotFoundError: naming the shipped ones.
+    """
+    path = Path(name) if Path(name).suffix else WEIGHTS_DIR / f"{name}.safetensors"
+    if not path.is_file():
+        shipped = ", ".join(sorted(p.stem for p in WEIGHTS_DIR.glob("*.safetensors")))
+        raise FileNotFoundError(f"{name}: no such weights; give a .safetensors file or a shipped ISP ({shipped})")
+    return path
 
 
 def as_float(srgb: Tensor) -> Tensor:
