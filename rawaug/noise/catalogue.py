@@ -68,7 +68,10 @@ def noise_model(spec: str | Sequence[float] | NoiseModel, *, iso: Iso = None, po
         ValueError: if the name is unknown, ``iso`` does not fit it, or options are given together with a model.
 
     Example:
-        >>> noise_model("cycleisp_sidd"), noise_model("Google Pixel", iso=800), noise_model((1e-3, 1e-5))
+        >>> import torch
+        >>> params = noise_model("Google Pixel", iso=800).sample(1, torch.Generator().manual_seed(0))
+        >>> round(params["shot_var"].item(), 6)
+        0.001764
     """
     if isinstance(spec, NoiseModel):
         if iso is not None or poisson:

@@ -74,6 +74,7 @@ class SensorNoise(Compose):
         bits, black_level: the grid of digital numbers.
 
     Example:
+        >>> from rawaug.noise import Preset
         >>> model = SensorNoise(Preset("cycleisp_sidd"), row_var=(1e-7, 1e-5), bits=10, black_level=64)
     """
 

@@ -100,8 +100,8 @@ def estimate_noise(
         ValueError: if there are too few flat regions, or they do not span a range of signals.
 
     Example:
-        >>> estimate = estimate_noise([mosaic], "RGGB")
-        >>> model = ShotReadNoise(FixedLevels(estimate.shot_var, estimate.read_var))
+        >>> estimate = estimate_noise([mosaic], "RGGB")  # doctest: +SKIP
+        >>> model = noise_model((estimate.shot_var, estimate.read_var))  # doctest: +SKIP
     """
     frames = [mosaics] if isinstance(mosaics, Tensor) else list(mosaics)
     measured = [_measure(frame, cfa) for frame in frames]

@@ -126,6 +126,7 @@ class ShotReadNoise(ShotReadModel):
     """Gaussian noise of variance ``shot_var * y + read_var``: the default, and fast.
 
     Example:
+        >>> from rawaug.noise import FixedLevels
         >>> model = ShotReadNoise(FixedLevels(1e-3, 1e-5))
         >>> params = model.sample(2, torch.Generator().manual_seed(0))
         >>> model.apply(torch.rand(2, 4, 8, 8), params).shape
