@@ -1,4 +1,8 @@
-"""What is read: pictures, RAW files and the built-in demo data, as datasets of sRGB pictures or of RAW-sRGB pairs."""
+"""What is read: pictures, RAW files, published datasets and the built-in demo data.
+
+They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
+clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for what is to be handed in.
+"""
 
 from __future__ import annotations
 
@@ -6,37 +10,71 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
+from rawaug.data.check import DataReport, check
 from rawaug.data.dead_leaves import dead_leaves
 from rawaug.data.demo import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.demo_camera import DemoCamera
+from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
+from rawaug.data.fivek import fivek_pairs
 from rawaug.data.pairs import Pair
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
+from rawaug.data.rawir import Rawir
+from rawaug.data.sidd import SiddFrames
+from rawaug.data.sidd_blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd_submission import check_submission, write_submission
+from rawaug.data.zurich import Zurich
 
 __all__ = [
+    "DataReport",
     "DemoCamera",
+    "Dnd",
+    "DndCrop",
     "Pair",
     "PictureFolder",
     "RawFolder",
+    "Rawir",
+    "SiddBenchmark",
+    "SiddBlocks",
+    "SiddFrames",
+    "SiddPlusBlocks",
+    "Zurich",
+    "check",
+    "check_dnd_submission",
+    "check_submission",
     "dead_leaves",
     "demo_pairs",
     "demo_photographs",
     "demo_pictures",
+    "fivek_pairs",
     "open_pairs",
     "open_pictures",
+    "write_dnd_submission",
+    "write_submission",
 ]
 
 _PAIR_KINDS: dict[str, Callable[[str, str], Sequence[Pair]]] = {
     "demo": lambda path, split: demo_pairs(path or split),
+    "dnd": lambda path, split: _no_clean_frames(path),
+    "fivek": lambda path, split: fivek_pairs(path, split),
+    "fivek_canon": lambda path, split: fivek_pairs(path, split, ["canon"]),
+    "fivek_nikon": lambda path, split: fivek_pairs(path, split, ["nikon"]),
+    "rawir": lambda path, split: Rawir(path, split),
+    "sidd": lambda path, split: _sidd(path, split),
+    "siddplus": lambda path, split: SiddPlusBlocks(path),
+    "zurich": lambda path, split: Zurich(path, split),
 }
+_SPLITS = ("train", "validation", "test")
 
 
 def open_pairs(spec: str, split: str = "test") -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
 
     Args:
-        spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"demo:"``, ``"demo:train"``.
-        split: of a dataset that has splits, unless ``spec`` names one. A folder has none.
+        spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"demo:"``, ``"demo:train"``,
+            ``"sidd:SIDD_Medium_Raw"``, ``"zurich:Zurich-RAW-to-DSLR:test"`` (with the split last).
+        split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
+            full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind, split, file or folder.
@@ -51,18 +89,25 @@ def open_pairs(spec: str, split: str = "test") -> Sequence[Pair]:
     if kind not in _PAIR_KINDS:
         known = ", ".join(f"{name}:" for name in _PAIR_KINDS)
         raise ValueError(f"{spec}: no such kind of data; there are {known} or the path of a RAW file or folder")
-    return _PAIR_KINDS[kind](path, split)
+    if kind != "demo" and not path:
+        raise ValueError(f"{spec}: say where the data are, {kind}:PATH")
+    path, named = _path_and_split(path)
+    return _PAIR_KINDS[kind](path, named or split)
 
 
-def open_pictures(spec: str) -> list[Tensor] | PictureFolder:
+def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
     """Open sRGB pictures, uint8 ``(3, H, W)``: a folder, or ``"demo:"``.
+
+    Args:
+        spec: ``"demo:"`` or the path of a folder.
+        min_side: smaller pictures of a folder are skipped and told; give the side of your crops.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
     """
     kind, path = _kind_and_path(spec)
     if kind is None:
-        return PictureFolder(path)
+        return PictureFolder(path, min_side)
     if kind != "demo" or path:
         raise ValueError(f"{spec}: no such kind of pictures; there are demo: or the path of a folder")
     return demo_pictures()
@@ -72,3 +117,26 @@ def _kind_and_path(spec: str) -> tuple[str | None, str]:
     """``"kind:path"`` taken apart; the kind of a bare path (``C:\\shots`` too) is None."""
     kind, colon, path = spec.partition(":")
     return (kind, path) if colon and len(kind) > 1 and kind.isidentifier() else (None, spec)
+
+
+def _path_and_split(path: str) -> tuple[str, str | None]:
+    """``"path:split"`` taken apart; demo's bare split is its path."""
+    folder, colon, split = path.rpartition(":")
+    return (folder, split) if colon and split in _SPLITS else (path, None)
+
+
+def _sidd(path: str, split: str) -> Sequence[Pair]:
+    if split == "train":
+        return SiddFrames(path)
+    if split == "test":
+        return SiddBlocks(path)
+    raise ValueError(
+        f"sidd:{path}: has no split {split}: train are the full frames, test the validation blocks; "
+        "validate on a folder of other frames, or on none"
+    )
+
+
+def _no_clean_frames(path: str) -> Sequence[Pair]:
+    raise ValueError(
+        f"dnd:{path}: the clean frames of DND are not public; read it as rawaug.data.Dnd and hand in results"
+    )

@@ -1,59 +1,174 @@
-"""A folder of sRGB pictures as a map-style dataset."""
+"""A folder of sRGB pictures as a map-style dataset, for folders as they are: large, and with some damaged files.
+
+Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
+cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
+whatever order, with any number of workers. What was found lies in memory that all workers share, so that the process
+which made the dataset can tell it, and so that nobody opens a bad file twice.
+"""
 
 from __future__ import annotations
 
-import warnings
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
+import numpy as np
+import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, get_worker_info
 
-from rawaug.io import read_picture
+from rawaug.io.pictures import MAX_PIXELS, read_picture
 
-EXTENSIONS = (".bmp", ".exr", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+_COUNTERS = 64
+_NAMED = 20
+_log = logging.getLogger(__name__)
 
 
 class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
-    A file that cannot be read is replaced by the next one that can, whoever asks and in whatever order; a warning
-    names it, and :attr:`skipped` holds the reason (of the files met so far, by this process).
+    After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
+    a warning; :attr:`skipped` and :meth:`report` tell them at any time.
 
     Args:
-        path: a folder; files with the extensions of :data:`EXTENSIONS` are taken.
+        path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
+        min_side: smaller pictures are skipped; give the side of your crops. A mosaic has sides of 2 at least.
+        max_pixels: larger pictures are skipped.
+        allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if it holds no picture, or none that can be read.
+        ValueError: if it holds no file with such an extension, or, on access, if too many of them had to be skipped.
 
     Example:
-        >>> pictures = PictureFolder("photographs")  # doctest: +SKIP
+        >>> pictures = PictureFolder("photographs", min_side=256)  # doctest: +SKIP
         >>> pictures[0].shape  # doctest: +SKIP
         torch.Size([3, 375, 500])
+        >>> print(pictures.report())  # doctest: +SKIP
+        photographs: all of its 25000 pictures that were read are fine
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
+    ) -> None:
         self.path = Path(path)
         if not self.path.is_dir():
             raise FileNotFoundError(f"{path}: no such folder of pictures")
-        self.files = sorted(file for file in self.path.rglob("*") if file.suffix.lower() in EXTENSIONS)
-        self.skipped: dict[Path, str] = {}
-        if not self.files:
+        self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
+        self.names = _Names(sorted(_listed(self.path)))
+        if not len(self.names):
             raise ValueError(f"{path}: holds no picture; known are {', '.join(EXTENSIONS)}")
-        self[0]  # a folder of unreadable files is told here, not in a worker
+        self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
+        self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
+        self._epochs_told = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._reasons: dict[int, str] = {}
 
     def __len__(self) -> int:
-        return len(self.files)
+        return len(self.names)
 
     def __getitem__(self, index: int) -> Tensor:
         first = range(len(self))[index]
-        for file in self.files[first:] + self.files[:first]:
-            if file in self.skipped:
+        for candidate in chain(range(first, len(self)), range(first)):
+            if self._bad[candidate]:
                 continue
-            try:
-                return read_picture(file)
-            except (OSError, ValueError) as error:
-                self.skipped[file] = str(error)
-                warnings.warn(f"{error}; skipped", stacklevel=2)
-        reason = self.skipped[self.files[first]]
-        raise ValueError(f"{self.path}: none of its {len(self)} pictures can be read; {reason}")
+            picture = self._judged(candidate)
+            if picture is not None:
+                self._count()
+                return picture
+        raise AssertionError("the share of skipped files is checked before the last one is")
+
+    def read(self, index: int) -> Tensor:
+        """The picture of one file, not replaced by another.
+
+        Raises:
+            FileNotFoundError, OSError, ValueError: if it cannot be used.
+        """
+        file = self.path / self.names[index]
+        picture = read_picture(file, self.max_pixels)
+        if min(picture.shape[1:]) < self.min_side:
+            size = f"{picture.shape[1]} x {picture.shape[2]}"
+            raise ValueError(f"{file}: is {size}, a side below {self.min_side}; leave it out")
+        return picture
+
+    @property
+    def skipped(self) -> dict[Path, str]:
+        """The files that could not be used, with the reason, as far as any worker has met them."""
+        bad = self._bad.nonzero()[:, 0].tolist()
+        for index in bad:
+            if index not in self._reasons:  # met by a worker: ask the file again
+                self._reasons[index] = self._fault(index) or f"{self.path / self.names[index]}: can be read by now"
+        return {self.path / self.names[index]: self._reasons[index] for index in bad}
+
+    def report(self) -> str:
+        """What was skipped so far, one line a file."""
+        skipped = self.skipped
+        if not skipped:
+            return f"{self.path}: all of its {len(self)} pictures that were read are fine"
+        return "\n".join([f"{self.path}: {len(skipped)} of {len(self)} pictures skipped", *skipped.values()])
+
+    def _judged(self, index: int) -> Tensor | None:
+        """The picture, or None and a mark where it is damaged."""
+        try:
+            return self.read(index)
+        except (OSError, ValueError) as error:
+            self._reasons[index] = str(error)
+        self._bad[index] = 1
+        count = int(self._bad.sum())
+        if count > self.allowed_share * len(self):
+            names = [f"{self.path / self.names[i]}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
+            more = f" and {count - _NAMED} more" if count > _NAMED else ""
+            raise ValueError(
+                f"{self.path}: {count} of {len(self)} pictures cannot be used, above the allowed share of "
+                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; the last because {self._reasons[index]}"
+            )
+        return None
+
+    def _fault(self, index: int) -> str | None:
+        try:
+            self.read(index)
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None
+
+    def _count(self) -> None:
+        """Count a reading; whoever completes an epoch tells what was skipped (two may, if they do so at once)."""
+        worker = get_worker_info()
+        self._read[(0 if worker is None else 1 + worker.id) % _COUNTERS] += 1
+        epoch = int(self._read.sum()) // len(self)
+        if epoch > self._epochs_told[0]:
+            self._epochs_told[0] = epoch
+            if self._bad.any():
+                _log.warning("%s", self.report())
+
+
+class _Names(Sequence[str]):
+    """Many strings in two arrays: a list's reference counts would be copied into every forked worker, page by page."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        encoded = [os.fsencode(name) for name in names]
+        self._ends = np.cumsum([len(name) for name in encoded], dtype=np.int64)
+        self._bytes = np.frombuffer(b"".join(encoded), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, index: int) -> str:  # type: ignore[override]
+        index = range(len(self))[index]
+        start = self._ends[index - 1] if index else 0
+        return os.fsdecode(self._bytes[start : self._ends[index]].tobytes())
+
+
+def _listed(folder: Path) -> Iterator[str]:
+    """Paths below ``folder`` that have a picture's extension, as they come; a folder of such a name is a folder."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for parent, _, files in os.walk(folder, onerror=refuse):
+        inside = Path(parent).relative_to(folder)
+        for file in files:
+            if file.lower().endswith(EXTENSIONS):
+                yield str(inside / file)

@@ -1,9 +1,15 @@
-"""Files at the edges: pictures through OpenImageIO, RAW through LibRaw. Neither is loaded before a file is opened."""
+"""Files at the edges: pictures through OpenImageIO, RAW in through LibRaw, DNG out through tifffile.
 
+None of them is loaded before a file is opened.
+"""
+
+from rawaug.io.dng import write_dng
+from rawaug.io.gain_map import GainMap
 from rawaug.io.pictures import decode_srgb, encode_srgb, read_picture, write_picture
 from rawaug.io.raw import RawFrame, develop, read_raw, read_raw_and_develop
 
 __all__ = [
+    "GainMap",
     "RawFrame",
     "decode_srgb",
     "develop",
@@ -11,5 +17,6 @@ __all__ = [
     "read_picture",
     "read_raw",
     "read_raw_and_develop",
+    "write_dng",
     "write_picture",
 ]

@@ -5,11 +5,14 @@ The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and displa
     v = 12.92 l                      for l <= 0.0031308
     v = 1.055 l^(1/2.4) - 0.055      otherwise
 
-OpenEXR and Radiance files hold l, everything else is taken to hold v; an embedded ICC profile is not applied.
+OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space is
+applied (see :mod:`rawaug.io.icc`); without one, a picture is taken to be sRGB whatever else its tags say.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +21,15 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import turn
+from rawaug.io.icc import to_srgb
+
+MAX_PIXELS = 2**28
+"""Larger pictures (16384 x 16384) are refused unless told otherwise: a few bytes of header can claim any size."""
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
 
+_FORMAT = "rawaug:format"
 _LINEAR_FORMATS = ("openexr", "hdr")
 _HALF_LEVEL = 0.5 / 255
 
@@ -38,7 +46,12 @@ def decode_srgb(display: Tensor) -> Tensor:
     return torch.where(display <= 0.04045, display / 12.92, curve)
 
 
-def read_picture(path: str | Path) -> Tensor:
+def view_of_orientation(orientation: int) -> int:
+    """The view of :func:`rawaug.bayer.turn` that shows a picture of this EXIF orientation upright; 0 if unknown."""
+    return _VIEW_OF_EXIF_ORIENTATION[orientation - 1] if 1 <= orientation <= 8 else 0
+
+
+def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
     """The first picture of a file as sRGB, uint8 ``(3, H, W)``, upright as its EXIF orientation says.
 
     Grey becomes three equal channels. Transparency is composited over black. 16 bits become 8 by rounding to the
@@ -47,15 +60,29 @@ def read_picture(path: str | Path) -> Tensor:
     Raises:
         FileNotFoundError: if there is no such file.
         OSError: if the file is no picture, or is cut short.
-        ValueError: if its colours are not sRGB (CMYK, CIELAB, more than four channels), or leave [0, 1].
+        ValueError: if its header tells more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
+            CIELAB, more than four channels, a damaged profile), or leave [0, 1].
 
     Example:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    pixels, orientation = _read(Path(path))
-    view = _VIEW_OF_EXIF_ORIENTATION[orientation - 1] if 1 <= orientation <= 8 else 0
-    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view).contiguous()
+    pixels, orientation = _read(Path(path), max_pixels)
+    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
+
+
+def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG.
+
+    Raises:
+        FileNotFoundError, OSError: as :func:`read_picture`.
+        ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
+    """
+    pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
+    if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
+        names = ", ".join(spec.channelnames)
+        raise ValueError(f"{path}: holds {pixels.dtype} in channels {names}; a mosaic is one channel of 8 or 16 bits")
+    return pixels[..., 0]
 
 
 def write_picture(path: str | Path, srgb: Tensor) -> None:
@@ -81,27 +108,62 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_first_line(output.geterror())})")
 
 
-def _read(path: Path) -> tuple[np.ndarray, int]:
+def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
+
+    def kind(spec: Any) -> str:
+        _require_srgb(spec, path)
+        return "float" if spec.format.basetype in _floating() else "uint8"
+
+    pixels, spec = _decoded(path, max_pixels, kind)
+    pixels = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    if pixels.dtype != np.uint8:
+        pixels = _round_to_8_bits(pixels, path, linear=spec.get_string_attribute(_FORMAT) in _LINEAR_FORMATS)
+    profile = spec.getattribute("ICCProfile")
+    if profile is not None:
+        pixels = to_srgb(np.ascontiguousarray(pixels), bytes(profile), path)
+    return pixels, spec.get_int_attribute("Orientation", 1)
+
+
+def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
+    """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
     import OpenImageIO as oiio
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python holds bytes that are no UTF-8
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened, its name is not UTF-8; rename it")
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
     spec = source.spec()
-    _require_srgb(spec, path)
-    floating = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    pixels = source.read_image("float" if floating else "uint8")
+    spec.attribute(_FORMAT, source.format_name())
+    _require_size(spec, path, max_pixels)
+    pixels = source.read_image(kind(spec))
     error = source.geterror()  # set also where a decoder filled up a file that is cut short
+    # a GIF tells of its movement only where its frames have a duration
+    moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
     source.close()
+    if moves:
+        raise ValueError(f"{path}: is an animation; save one frame of it as a picture")
     if pixels is None or error:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(error)})")
-    pixels = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    if floating:
-        pixels = _round_to_8_bits(pixels, path, linear=source.format_name() in _LINEAR_FORMATS)
-    return pixels, spec.get_int_attribute("Orientation", 1)
+    return pixels, spec
+
+
+def _floating() -> tuple[Any, ...]:
+    import OpenImageIO as oiio
+
+    return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
+
+
+def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
+    """Refuse what would fill the memory before anything is decoded."""
+    if spec.width * spec.height * spec.depth > max_pixels:
+        raise ValueError(
+            f"{path}: its header tells {spec.height} x {spec.width} pixels, above the limit of {max_pixels}; "
+            "cut it up, or raise max_pixels"
+        )
 
 
 def _require_srgb(spec: Any, path: Path) -> None:

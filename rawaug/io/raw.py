@@ -14,7 +14,7 @@ The mosaic and the rendering are both in the sensor's orientation, and agree pix
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -26,14 +26,25 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.tiff_tags import TiffTags, read_tiff_tags
 
-_XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
 _EXIF_MAKE, _EXIF_MODEL = 271, 272
 
 _developed_in: int | None = None
 """The process that last used LibRaw's OpenMP threads: they do not survive a fork."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How a shot was taken; None where the file does not tell."""
+
+    seconds: float | None = None
+    f_number: float | None = None
+    focal_length: float | None = None
+    date: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,9 +54,10 @@ class RawFrame:
     Attributes:
         mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
         cfa: the pattern of ``mosaic``.
-        black: levels of the sites R, Gr, Gb, B, in digital numbers.
+        black: levels of the sites R, Gr, Gb, B, in digital numbers; with the fractions that a DNG tells.
         white: the saturated level, in digital numbers.
         white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
+        daylight: the multipliers for the white of sRGB (D65), green being 1.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1: the one that
             LibRaw renders with, or a typical camera's where the file and LibRaw tell nothing.
         camera: make and model, ``"unknown"`` where the file does not tell.
@@ -54,6 +66,8 @@ class RawFrame:
         orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
         name: the file's name without extension.
         color_known: false where ``color_matrix`` is the typical one.
+        gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
+        exposure: seconds, f-number, focal length in mm and EXIF date, each None where the file does not tell.
     """
 
     mosaic: Tensor
@@ -61,6 +75,7 @@ class RawFrame:
     black: tuple[float, float, float, float]
     white: float
     white_balance: tuple[float, float, float]
+    daylight: tuple[float, float, float]
     color_matrix: Tensor
     camera: str
     iso: float | None
@@ -68,6 +83,13 @@ class RawFrame:
     orientation: int
     name: str
     color_known: bool = True
+    gain_maps: tuple[GainMap, ...] = ()
+    exposure: Exposure = Exposure()
+
+    @property
+    def shading_gains(self) -> Tensor:
+        """What corrects the lens shading when ``mosaic`` is multiplied with it: float32 ``(1, H, W)``, 1 if unknown."""
+        return gains_at_sites(self.gain_maps, self.cfa, *self.mosaic.shape[-2:])
 
     @property
     def upright_view(self) -> int:
@@ -159,26 +181,46 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
 def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     cell = _bayer_cell(path, raw)
     cfa = CFA("".join(raw.color_desc.decode()[k] for k in cell.flatten()))
-    levels, white = raw.black_level_per_channel, float(raw.white_level)
-    black = np.array([[levels[k] for k in row] for row in cell], np.float32)
+    black, white = _black(raw, cell, tags), float(raw.white_level)
     if white <= black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
     matrix, color_known = _color_matrix(raw)
-    iso = getattr(getattr(raw, "other", None), "iso_speed", 0)  # rawpy tells since 0.27
+    other = getattr(raw, "other", None)  # rawpy tells since 0.27
     return RawFrame(
         mosaic=_normalised(raw.raw_image_visible, black, white),
         cfa=cfa,
         black=tuple(float(black[site]) for site in cfa.sites),  # type: ignore[arg-type]
         white=white,
         white_balance=_white_balance(raw),
+        daylight=_green_is_1(raw.daylight_whitebalance if color_known else _white_balance(raw)),
         color_matrix=torch.from_numpy(matrix).float(),
         camera=_camera(raw, tags),
-        iso=float(iso) or None,
+        iso=float(getattr(other, "iso_speed", 0)) or None,
         noise_profile=tags.noise_profile,
         orientation=int(raw.sizes.flip),
         name=path.stem,
         color_known=color_known,
+        gain_maps=tags.gain_maps,
+        exposure=_exposure(other),
     )
+
+
+def _exposure(other: Any) -> Exposure:
+    """LibRaw says 0 where it does not know, and 1970 of a date."""
+    seconds, f_number, focal_length = (
+        float(getattr(other, name, 0)) or None for name in ("shutter_speed", "aperture", "focal_length")
+    )
+    taken = getattr(other, "timestamp", None)
+    date = f"{taken:%Y:%m:%d %H:%M:%S}" if taken is not None and taken.year > 1970 else None
+    return Exposure(seconds, f_number, focal_length, date)
+
+
+def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
+    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with the fractions that a DNG tells."""
+    levels = raw.black_level_per_channel
+    black = np.array([[levels[k] for k in row] for row in cell], np.float32)
+    told = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
+    return told if np.abs(told - black).max() < 1 else black
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
@@ -195,15 +237,31 @@ def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
     """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(2, 2)``: 0 to 3 are R, G, B, G."""
     pattern = raw.raw_pattern
     if pattern is None or pattern.shape != (2, 2) or raw.color_desc != b"RGBG" or set(pattern.flat) != {0, 1, 2, 3}:
-        raise ValueError(
-            f"{path}: holds no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW?); only Bayer RAW can be used"
-        )
+        raise ValueError(f"{path}: holds no Bayer mosaic but {_kind(raw)}; only Bayer RAW can be used")
     return np.asarray(raw.raw_colors_visible[:2, :2])
+
+
+def _kind(raw: Any) -> str:
+    """What a file holds instead of a Bayer mosaic, in words."""
+    import rawpy
+
+    if raw.raw_type == rawpy.RawType.Stack:
+        return "full colour at every pixel (linear DNG, small RAW, Foveon)"
+    pattern = raw.raw_pattern
+    if pattern is None or len(set(pattern.flat)) == 1:
+        return "a monochrome picture"
+    if pattern.shape == (6, 6):
+        return "an X-Trans mosaic"
+    return f"a mosaic of other colours ({raw.color_desc.decode()}, cell {pattern.shape[0]} x {pattern.shape[1]})"
 
 
 def _white_balance(raw: Any) -> tuple[float, float, float]:
     """As LibRaw chooses: as shot, else for daylight."""
-    gains = raw.camera_whitebalance if min(raw.camera_whitebalance[:3]) > 0 else raw.daylight_whitebalance
+    as_shot = raw.camera_whitebalance
+    return _green_is_1(as_shot if min(as_shot[:3]) > 0 else raw.daylight_whitebalance)
+
+
+def _green_is_1(gains: Sequence[float]) -> tuple[float, float, float]:
     return float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])
 
 
@@ -212,7 +270,7 @@ def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
     own = np.asarray(raw.color_matrix, np.float64)[:, :3]
     if own.any():
         return own / own.sum(axis=1, keepdims=True), True
-    camera = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3] @ _XYZ_FROM_SRGB
+    camera = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3] @ XYZ_FROM_SRGB
     if not camera.any():
         return _TYPICAL_COLOR_MATRIX, False
     return np.linalg.inv(camera / camera.sum(axis=1, keepdims=True)), True

@@ -11,8 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rawaug.io.gain_map import GainMap, parse_gain_maps
+
 _MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
-_CFA_PHOTOMETRIC = 32803
+_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50715, 50716)
+_OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
+CFA_PHOTOMETRIC = 32803
+_RATIONAL = 5
 
 
 @dataclass(frozen=True)
@@ -23,33 +30,45 @@ class TiffTags:
         make, model: of the camera.
         noise_profile: (shot_var, read_var), the mean over colour planes.
         mosaic_end: the byte after a DNG's mosaic; a smaller file is cut short.
+        black: a DNG's black levels, row by row of the cell at the top left of the visible mosaic, fractions kept; None
+            also where they differ from row to row or repeat over more than two.
+        gain_maps: a DNG's lens shading, empty without.
     """
 
     make: str | None = None
     model: str | None = None
     noise_profile: tuple[float, float] | None = None
     mosaic_end: int | None = None
+    black: tuple[float, float, float, float] | None = None
+    gain_maps: tuple[GainMap, ...] = ()
 
 
 def read_tiff_tags(path: Path) -> TiffTags:
-    """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise."""
+    """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise.
+
+    Raises:
+        ValueError: if an opcode list of a DNG is cut short.
+    """
     import tifffile
 
     try:
         with tifffile.TiffFile(path) as tiff:
-            pages = list(_all_pages(tiff.pages))
+            pages = list(all_pages(tiff.pages))
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
                 return TiffTags(make, model)
-            return TiffTags(make, model, _noise_profile(pages), _mosaic_end(pages))
+            mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
+            black, maps = (_black(mosaics[0]), _gain_maps(mosaics[0], path)) if mosaics else (None, ())
+            return TiffTags(make, model, _noise_profile(pages), _mosaic_end(mosaics), black, maps)
     except tifffile.TiffFileError:
         return TiffTags()
 
 
-def _all_pages(pages: Any) -> Iterator[Any]:
+def all_pages(pages: Any) -> Iterator[Any]:
+    """Every page of a file, those of its SubIFDs after the one that they belong to."""
     for page in pages:
         yield page
-        yield from _all_pages(getattr(page, "pages", None) or ())
+        yield from all_pages(getattr(page, "pages", None) or ())
 
 
 def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
@@ -61,11 +80,33 @@ def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
     return None
 
 
-def _mosaic_end(pages: list[Any]) -> int | None:
+def _mosaic_end(mosaics: list[Any]) -> int | None:
     ends = [
-        offset + count
-        for page in pages
-        if page.photometric == _CFA_PHOTOMETRIC
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
+        offset + count for page in mosaics for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
     ]
     return max(ends, default=None)
+
+
+def _black(mosaic: Any) -> tuple[float, float, float, float] | None:
+    tag = mosaic.tags.get(_BLACK)
+    if tag is None or any(code in mosaic.tags for code in _BLACK_DELTAS):
+        return None
+    levels = np.ravel(tag.value).astype(np.float64)
+    if tag.dtype == _RATIONAL:
+        levels = levels[0::2] / levels[1::2]
+    rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
+    if len(levels) != rows * columns or 2 % rows or 2 % columns:
+        return None
+    a, b, c, d = np.tile(levels.reshape(rows, columns), (2 // rows, 2 // columns)).ravel().tolist()
+    return a, b, c, d
+
+
+def _gain_maps(mosaic: Any, path: Path) -> tuple[GainMap, ...]:
+    found: tuple[GainMap, ...] = ()
+    for code in (_OPCODE_LIST_2, _OPCODE_LIST_3):
+        opcodes = mosaic.tags.valueof(code)
+        try:
+            found += parse_gain_maps(opcodes, code == _OPCODE_LIST_2) if opcodes else ()
+        except ValueError as error:
+            raise ValueError(f"{path}: OpcodeList{2 if code == _OPCODE_LIST_2 else 3}: {error}") from None
+    return found

@@ -1,9 +1,17 @@
 from __future__ import annotations
 
+import logging
+import os
+import pickle
+import struct
+import time
+import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.utils.data import DataLoader
 
 from rawaug.data import PictureFolder, open_pictures
@@ -23,34 +31,179 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def huge_png(side: int) -> bytes:
+    """A header that claims ``side`` x ``side``, and data enough for the claim to look honest."""
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)), (b"IDAT", bytes(400_000)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+def damage(folder: Path) -> set[str]:
+    """One file for each way of being no usable picture; their names."""
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
+    frames = [Image.fromarray(np.roll(pixels, k, 1)) for k in range(3)]
+    frames[0].save(folder / "x_truncated.jpg", quality=95)
+    whole = (folder / "x_truncated.jpg").read_bytes()
+    (folder / "x_truncated.jpg").write_bytes(whole[: len(whole) * 2 // 3])
+    frames[0].save(folder / "x_truncated.png")
+    (folder / "x_truncated.png").write_bytes((folder / "x_truncated.png").read_bytes()[:-3000])
+    (folder / "x_empty.jpg").write_bytes(b"")
+    (folder / "x_text.jpeg").write_text("<html>404 Not Found</html>")
+    (folder / "x_zeros.tif").write_bytes(bytes(5000))
+    Image.fromarray(pixels[:1, :1]).save(folder / "x_1x1.png")
+    Image.fromarray(pixels).convert("CMYK").save(folder / "x_cmyk.jpg")
+    frames[0].save(folder / "x_animated.gif", save_all=True, append_images=frames[1:])
+    frames[0].save(folder / "x_animated.webp", save_all=True, append_images=frames[1:])
+    (folder / "x_dangling.jpg").symlink_to(folder / "nowhere.jpg")
+    (folder / "x_huge.png").write_bytes(huge_png(60_000))
+    (folder / "x_wide.png").write_bytes(huge_png(17_000))
+    os.mkfifo(folder / "x_pipe.jpg")
+    return {path.name for path in folder.glob("x_*")}
+
+
+def unusual(folder: Path) -> set[str]:
+    """What only looks damaged: a wrong extension, 16 bits, a folder with a picture's name; names of the files."""
+    pixels = np.random.default_rng(1).integers(0, 256, (40, 50, 3), np.uint8)
+    Image.fromarray(pixels).save(folder / "y_png_inside.jpg", format="png")
+    Image.fromarray(pixels[..., 0].astype(np.uint16) * 257).save(folder / "y_16_bits.png")
+    (folder / "y_folder.jpg").mkdir()
+    Image.fromarray(pixels).save(folder / "y_folder.jpg" / "y_inside.png")
+    return {"y_png_inside.jpg", "y_16_bits.png", "y_inside.png"}
+
+
+@pytest.fixture(scope="module")
+def messy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, set[str]]:
+    """Three hundred pictures, some unusual, and thirteen that cannot be used."""
+    folder = tmp_path_factory.mktemp("messy")
+    for k in range(300):
+        (folder / f"{k % 7}").mkdir(exist_ok=True)
+        Image.fromarray(np.full((40, 50, 3), k % 256, np.uint8)).save(folder / f"{k % 7}" / f"{k:03d}.jpg")
+    unusual(folder)
+    return folder, damage(folder)
+
+
 def test_pictures_come_sorted_by_path(folder: Path) -> None:
     pictures = PictureFolder(folder)
-    assert len(pictures) == 3
+    assert len(pictures) == 3 and list(pictures.names) == ["a/z.TIF", "b.png", "c.bmp"]
     assert [picture[0, 0, 0].item() for picture in (pictures[0], pictures[1], pictures[2])] == [10, 20, 30]
     assert torch.equal(pictures[-1], grey(30)) and pictures.skipped == {}
+    assert pictures.report() == f"{folder}: all of its 3 pictures that were read are fine"
     with pytest.raises(IndexError):
         pictures[3]
 
 
 def test_an_unreadable_file_is_named_and_replaced_by_the_next(folder: Path) -> None:
     (folder / "b.png").write_bytes(b"broken")
-    pictures = PictureFolder(folder)
-    with pytest.warns(UserWarning, match=r"b\.png: cannot be read as a picture.*; skipped"):
-        assert torch.equal(pictures[1], grey(30))
-    assert torch.equal(pictures[1], grey(30)), "asked again, without a warning"
+    pictures = PictureFolder(folder, allowed_share=0.5)
+    assert torch.equal(pictures[1], grey(30))
+    (folder / "b.png").unlink()
+    assert torch.equal(pictures[1], grey(30)), "and not tried again"
     assert list(pictures.skipped) == [folder / "b.png"] and "cannot be read" in pictures.skipped[folder / "b.png"]
 
 
 def test_the_last_file_wraps_to_the_first(folder: Path) -> None:
     (folder / "c.bmp").write_bytes(b"broken")
+    assert torch.equal(PictureFolder(folder, allowed_share=0.5)[2], grey(10))
+
+
+def test_more_than_the_allowed_share_is_an_error_that_names_them(folder: Path) -> None:
+    (folder / "b.png").write_bytes(b"broken")
+    (folder / "c.bmp").write_bytes(b"broken")
+    pictures = PictureFolder(folder, allowed_share=0.4)
+    assert torch.equal(pictures[0], grey(10)), "nothing is wrong yet"
+    with pytest.raises(
+        ValueError,
+        match=r"2 of 3 pictures cannot be used, above the allowed share of 40%: .*b\.png, .*c\.bmp; the last",
+    ) as caught:
+        pictures[1]
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="1 of 3 pictures cannot be used, above the allowed share of 5%"):
+        PictureFolder(folder)[1]
+
+
+def test_small_pictures_are_skipped_where_a_crop_would_not_fit(folder: Path) -> None:
+    write_picture(folder / "b.png", grey(40, 9, 9))
+    pictures = PictureFolder(folder, min_side=9, allowed_share=0.7)
+    assert [torch.equal(pictures[k], grey(40, 9, 9)) for k in range(3)] == [True] * 3
+    assert "a/z.TIF: is 6 x 8, a side below 9" in pictures.skipped[folder / "a" / "z.TIF"].replace(os.sep, "/")
+
+
+@pytest.mark.parametrize("context", [None, "fork", "forkserver"])
+def test_an_epoch_over_a_damaged_folder_completes_and_names_every_file(
+    messy: tuple[Path, set[str]], context: str | None
+) -> None:
+    folder, damaged = messy
     pictures = PictureFolder(folder)
-    with pytest.warns(UserWarning, match="skipped"):
-        assert torch.equal(pictures[2], grey(10))
+    assert len(damaged) == 13 and len(pictures) == 316
+    loader = DataLoader(
+        pictures,
+        batch_size=None,
+        shuffle=True,
+        generator=torch.Generator().manual_seed(0),
+        num_workers=2 if context else 0,
+        multiprocessing_context=context,
+    )
+    assert sum(1 for _ in loader) == len(pictures)
+    assert {path.name for path in pictures.skipped} == damaged
+    report = pictures.report().splitlines()
+    assert report[0] == f"{folder}: 13 of 316 pictures skipped"
+    assert all(sum(name in line for line in report) == 1 for name in damaged)
 
 
-def test_a_loader_with_workers_reads_it(folder: Path) -> None:
-    loader = DataLoader(PictureFolder(folder), batch_size=3, num_workers=1)
-    assert next(iter(loader)).shape == (3, 3, 6, 8)
+def test_each_damage_is_told_for_what_it_is(messy: tuple[Path, set[str]]) -> None:
+    folder, _ = messy
+    pictures = PictureFolder(folder)
+    for k in range(len(pictures)):
+        pictures[k]
+    reasons = {path.name: reason for path, reason in pictures.skipped.items()}
+    assert "60000 x 60000 pixels, above the limit" in reasons["x_huge.png"] or "too large" in reasons["x_huge.png"]
+    assert "17000 x 17000 pixels, above the limit of 268435456" in reasons["x_wide.png"]
+    assert "is an animation" in reasons["x_animated.gif"] and "is an animation" in reasons["x_animated.webp"]
+    assert "holds CMYK colours" in reasons["x_cmyk.jpg"] and "a side below 2" in reasons["x_1x1.png"]
+    assert "no such picture file" in reasons["x_dangling.jpg"] and "no such picture file" in reasons["x_pipe.jpg"]
+    assert all("\n" not in reason and name in reason for name, reason in reasons.items())
+
+
+def test_the_replacement_does_not_depend_on_who_asks_in_which_order(messy: tuple[Path, set[str]]) -> None:
+    folder, _ = messy
+    forwards, backwards = PictureFolder(folder), PictureFolder(folder)
+    chosen = range(290, len(forwards))
+    there = {k: forwards[k] for k in chosen}
+    back = {k: backwards[k] for k in reversed(chosen)}
+    assert all(torch.equal(there[k], back[k]) for k in chosen)
+
+
+def test_the_end_of_an_epoch_is_told(messy: tuple[Path, set[str]], caplog: pytest.LogCaptureFixture) -> None:
+    pictures = PictureFolder(messy[0])
+    with caplog.at_level(logging.WARNING):
+        for k in range(len(pictures) - 1):
+            pictures[k]
+        assert not caplog.records
+        pictures[0]
+    (record,) = caplog.records
+    assert "13 of 316 pictures skipped" in record.getMessage() and "x_empty.jpg" in record.getMessage()
+
+
+def test_nothing_is_opened_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(3000):
+        (tmp_path / f"{k:04d}.jpg").touch()
+    monkeypatch.setattr("rawaug.data.picture_folder.read_picture", lambda *_: pytest.fail("opened"))
+    start = time.perf_counter()
+    assert len(PictureFolder(tmp_path)) == 3000
+    assert time.perf_counter() - start < 2
+
+
+def test_names_take_two_arrays_however_many_there_are(tmp_path: Path) -> None:
+    strange = ["ä.png", "b c.png", os.fsdecode(b"\xff.png")]
+    for name in strange:
+        write_picture(tmp_path / "a.png", grey(1))
+        (tmp_path / "a.png").rename(tmp_path / name)
+    pictures = PictureFolder(tmp_path, allowed_share=0.5)
+    assert sorted(pictures.names) == sorted(strange)
+    assert pickle.loads(pickle.dumps(pictures)).names[-1] == pictures.names[-1]
+    assert pictures[2].shape == (3, 6, 8)
+    assert "name is not UTF-8; rename it" in pictures.report()
 
 
 def test_nothing_to_read_is_told_at_once(tmp_path: Path) -> None:
@@ -59,11 +212,8 @@ def test_nothing_to_read_is_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"holds no picture; known are \.bmp"):
         PictureFolder(tmp_path)
     (tmp_path / "a.png").write_bytes(b"broken")
-    with (
-        pytest.warns(UserWarning, match="skipped"),
-        pytest.raises(ValueError, match=r"none of its 1 pictures can be read; .*a\.png: cannot be read"),
-    ):
-        PictureFolder(tmp_path)
+    with pytest.raises(ValueError, match=r"1 of 1 pictures cannot be used.*a\.png: cannot be read"):
+        PictureFolder(tmp_path)[0]
 
 
 def test_open_pictures(folder: Path) -> None:

@@ -72,8 +72,8 @@ def test_nothing_to_read_is_named(tmp_path: Path) -> None:
         RawFolder(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
         RawFolder(tmp_path / "none.dng")
-    with pytest.raises(ValueError, match="fivek:x: no such kind of data; there are demo:"):
-        open_pairs("fivek:x")
+    with pytest.raises(ValueError, match="flickr:x: no such kind of data; there are demo:"):
+        open_pairs("flickr:x")
 
 
 def test_a_gopro_and_its_jpeg_are_the_same_picture(camera_files: Path) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -8,9 +10,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image, ImageOps
+from PIL import Image, ImageCms, ImageOps
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
+from rawaug.io.pictures import read_plane
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
 SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)
@@ -101,6 +104,90 @@ def test_five_channels_are_refused(tmp_path: Path) -> None:
     write_with_oiio(tmp_path / "layers.tif", np.zeros((4, 4, 5), np.uint8), "uint8")
     with pytest.raises(ValueError, match=r"layers\.tif: holds channels R, G, B, A,"):
         read_picture(tmp_path / "layers.tif")
+
+
+@pytest.mark.parametrize("extension", ["gif", "webp"])
+@pytest.mark.parametrize("settings", [{}, {"duration": 100}], ids=["frames", "timed"])
+def test_animations_are_refused_and_stills_are_not(tmp_path: Path, extension: str, settings: dict[str, Any]) -> None:
+    frames = [Image.fromarray(np.roll(PIXELS, k, 1)) for k in range(3)]
+    frames[0].save(tmp_path / f"still.{extension}")
+    assert read_picture(tmp_path / f"still.{extension}").shape == SRGB.shape
+    frames[0].save(tmp_path / f"moves.{extension}", save_all=True, append_images=frames[1:], **settings)
+    with pytest.raises(ValueError, match=rf"moves\.{extension}: is an animation; save one frame"):
+        read_picture(tmp_path / f"moves.{extension}")
+
+
+def test_more_pixels_than_the_limit_are_refused_by_the_header(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", SRGB)
+    assert read_picture(tmp_path / "a.png", max_pixels=24 * 37).shape == SRGB.shape
+    with pytest.raises(ValueError, match=r"a\.png: its header tells 24 x 37 pixels, above the limit of 887"):
+        read_picture(tmp_path / "a.png", max_pixels=24 * 37 - 1)
+
+
+def s15_fixed16(*values: float) -> bytes:
+    return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
+
+
+def icc_profile(space: bytes, tags: dict[bytes, bytes]) -> bytes:
+    """A display profile of version 2; a description that does not say sRGB is added."""
+    text = b"other space\0"
+    tags = {b"desc": b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78), **tags}
+    data, table = b"", b""
+    for name, tag in tags.items():
+        table += name + struct.pack(">II", 128 + 4 + 12 * len(tags) + len(data), len(tag))
+        data += tag + bytes(-len(tag) % 4)
+    size = 128 + 4 + len(table) + len(data)
+    header = struct.pack(">I4sI4s4s4s", size, b"test", 0x02400000, b"mntr", space, b"XYZ ")
+    header = header.ljust(36, b"\0") + b"acsp"
+    header = header.ljust(68, b"\0") + s15_fixed16(0.9642, 1, 0.8249)
+    return header.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + data
+
+
+def curve(gamma: float) -> bytes:
+    return b"curv" + bytes(4) + struct.pack(">IH", 1, round(256 * gamma)) + bytes(2)
+
+
+def test_a_profile_is_applied_and_srgb_by_name_is_left_alone(tmp_path: Path) -> None:
+    """In a space whose red is sRGB's green and the other way round, the two channels change places."""
+    red, green, blue = ((0.4361, 0.2225, 0.0139), (0.3851, 0.7169, 0.0971), (0.1431, 0.0606, 0.7141))
+    primaries = {b"rXYZ": green, b"gXYZ": red, b"bXYZ": blue, b"wtpt": (0.9642, 1, 0.8249)}
+    tags = {name: b"XYZ " + bytes(4) + s15_fixed16(*xyz) for name, xyz in primaries.items()}
+    profile = icc_profile(b"RGB ", {**tags, **{name: curve(2.2) for name in (b"rTRC", b"gTRC", b"bTRC")}})
+    bright = np.clip(PIXELS, 64, 255)  # above the straight part of sRGB's curve
+    for extension in ("png", "tif"):
+        Image.fromarray(bright).save(tmp_path / f"a.{extension}", icc_profile=profile)
+        expected = torch.from_numpy(bright[..., [1, 0, 2]].astype(int)).permute(2, 0, 1)
+        assert (read_picture(tmp_path / f"a.{extension}").int() - expected).abs().max() <= 3
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(PIXELS).save(tmp_path / "srgb.png", icc_profile=srgb)
+    assert torch.equal(read_picture(tmp_path / "srgb.png"), SRGB)
+
+
+def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
+    white = b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)
+    profile = icc_profile(b"GRAY", {b"wtpt": white, b"kTRC": curve(1.0)})
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "grey.png", icc_profile=profile)
+    expected = encode_srgb(SRGB[:1].double() / 255) * 255
+    error = (read_picture(tmp_path / "grey.png") - expected).abs()  # LittleCMS is coarse near black
+    assert error[SRGB[:1].expand_as(error) >= 12].max() <= 2
+
+
+def test_a_damaged_profile_is_told(tmp_path: Path) -> None:
+    profile = bytearray(icc_profile(b"RGB ", {b"wtpt": b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)}))
+    Image.fromarray(PIXELS).save(tmp_path / "a.tif", icc_profile=bytes(profile))
+    with pytest.raises(ValueError, match=r"a\.tif: its ICC profile cannot be used .*; convert the picture to sRGB"):
+        read_picture(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_plane_is_read_as_stored(tmp_path: Path, kind: type[np.unsignedinteger]) -> None:
+    numbers = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (6, 9), kind)
+    Image.fromarray(numbers).save(tmp_path / "a.png")
+    plane = read_plane(tmp_path / "a.png")
+    assert plane.dtype == kind and np.array_equal(plane, numbers)
+    write_picture(tmp_path / "rgb.png", SRGB)
+    with pytest.raises(ValueError, match=r"rgb\.png: holds uint8 in channels R, G, B; a mosaic is one channel"):
+        read_plane(tmp_path / "rgb.png")
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg"])

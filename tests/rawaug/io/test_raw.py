@@ -75,6 +75,24 @@ def test_metadata_is_read(tmp_path: Path, bayer_dng: Dng) -> None:
     assert frame.color_known
 
 
+def test_fractions_of_black_levels_are_kept(tmp_path: Path, bayer_dng: Dng) -> None:
+    path = bayer_dng(tmp_path / "a.dng", NUMBERS, black=(1, 1, 1, 1))
+    with tifffile.TiffFile(path, mode="r+") as tiff:
+        tiff.pages.first.tags["BlackLevel"].overwrite((257, 4, 129, 2, 255, 4, 64, 1), dtype=5)
+    frame = read_raw(path)
+    assert frame.black == (64.25, 64.5, 63.75, 64.0)
+    assert frame.mosaic[0, 1, 0].item() == pytest.approx((NUMBERS[1, 0] - 63.75) / (4095 - 63.75), abs=1e-7)
+
+
+def test_daylight_is_what_the_white_of_srgb_needs(tmp_path: Path, bayer_dng: Dng) -> None:
+    matrix = np.array([[0.80, -0.20, -0.10], [-0.40, 1.20, 0.20], [-0.05, 0.15, 0.60]])
+    white = matrix @ raw.XYZ_FROM_SRGB.sum(1)
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", NUMBERS, color_matrix=matrix))
+    assert frame.daylight == pytest.approx(tuple(white[1] / white), rel=1e-3)
+    unknown = read_raw(bayer_dng(tmp_path / "b.dng", NUMBERS, color_matrix=None))
+    assert unknown.daylight == pytest.approx(unknown.white_balance)
+
+
 def test_a_file_without_colour_or_noise_says_so(tmp_path: Path, bayer_dng: Dng) -> None:
     frame = read_raw(bayer_dng(tmp_path / "a.dng", NUMBERS, color_matrix=None))
     assert frame.noise_profile is None
@@ -112,10 +130,17 @@ def not_bayer(name: str) -> dict[str, object]:
     return {"numbers": np.stack([NUMBERS] * 3, -1), "cfa": None}
 
 
-@pytest.mark.parametrize("name", ["X-Trans", "monochrome", "linear"])
-def test_what_is_not_bayer_is_refused_in_one_line(tmp_path: Path, bayer_dng: Dng, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("X-Trans", "but an X-Trans mosaic;"),
+        ("monochrome", "but a monochrome picture;"),
+        ("linear", r"but full colour at every pixel \(linear DNG, small RAW, Foveon\);"),
+    ],
+)
+def test_what_is_not_bayer_is_refused_in_one_line(tmp_path: Path, bayer_dng: Dng, name: str, said: str) -> None:
     path = bayer_dng(tmp_path / "other.dng", **{"numbers": NUMBERS, **not_bayer(name)})
-    with pytest.raises(ValueError, match=r"other\.dng: holds no Bayer mosaic") as caught:
+    with pytest.raises(ValueError, match=rf"other\.dng: holds no Bayer mosaic {said}") as caught:
         read_raw(path)
     assert "\n" not in str(caught.value)
 
@@ -161,8 +186,13 @@ def test_canon_and_gopro_frames(camera_files: Path) -> None:
     frame = read_raw(path)
     assert frame.camera == "GoPro HERO6 Black" and frame.orientation == 1
     assert frame.noise_profile == pytest.approx((1.562e-4, 4.88e-8), rel=1e-3)
+    assert frame.exposure.seconds == pytest.approx(1 / 455) and frame.exposure.date == "2016:01:01 23:07:27"
+    assert len(frame.gain_maps) == 4
+    gains = frame.shading_gains[0]
+    assert gains.shape == (3000, 4000) and gains.min() >= 1
+    assert gains[1400:1600, 1900:2100].max() < 1.05 < 1.5 < gains[0, 0]
     with tifffile.TiffFile(path) as tiff:
         tag = np.array(tiff.pages[0].tags["ColorMatrix2"].value, np.float64)  # for D50; the other is for tungsten
-    camera = (tag[0::2] / tag[1::2]).reshape(3, 3) @ raw._XYZ_FROM_SRGB
+    camera = (tag[0::2] / tag[1::2]).reshape(3, 3) @ raw.XYZ_FROM_SRGB
     expected = np.linalg.inv(camera / camera.sum(1, keepdims=True))
     assert np.allclose(frame.color_matrix.numpy(), expected, atol=1e-3)

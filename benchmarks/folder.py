@@ -1,0 +1,123 @@
+"""What a large folder of pictures with damaged files costs: its start, an epoch with workers, and their memory.
+
+    python benchmarks/folder.py [--files 20000] [--damaged 0.01] [--workers 2] [--json FILE]
+
+The folder is made first, in a temporary place: small JPEGs in a hundred subfolders, of which a share is truncated,
+empty, text, or a link to nowhere. Printed are the seconds until the dataset is there and until the first batch, the
+pictures a second of an epoch relative to reading the good files alone without workers, each worker's own memory early
+and late in the epoch, and whether the report names every damaged file and no other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch.utils.data import DataLoader
+
+from rawaug.data import PictureFolder
+from rawaug.io import read_picture
+
+DAMAGES = ("truncated", "empty", "text", "dangling")
+
+
+def make_folder(folder: Path, files: int, damaged: float) -> set[str]:
+    """Fill ``folder``; the names of the damaged files."""
+    rng = np.random.default_rng(0)
+    jpegs = []
+    for _ in range(50):
+        buffer = BytesIO()
+        Image.fromarray(rng.integers(0, 256, (12, 16, 3), np.uint8)).resize((160, 120)).save(buffer, "jpeg", quality=90)
+        jpegs.append(buffer.getvalue())
+    bad = set(rng.permutation(files)[: round(files * damaged)].tolist())
+    names = set()
+    for k in range(files):
+        path = folder / f"{k % 100:02d}" / f"{k:06d}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        whole = jpegs[k % len(jpegs)]
+        if k not in bad:
+            path.write_bytes(whole)
+            continue
+        names.add(path.name)
+        damage = DAMAGES[len(names) % len(DAMAGES)]
+        if damage == "dangling":
+            path.symlink_to(folder / "nowhere")
+        else:
+            path.write_bytes({"truncated": whole[: len(whole) // 2], "empty": b"", "text": b"<html>"}[damage])
+    return names
+
+
+def own_megabytes(processes: list[int]) -> list[float]:
+    """Memory that each process shares with no other, where the system tells."""
+    sizes = []
+    for process in processes:
+        try:
+            lines = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii").splitlines()
+        except OSError:
+            return []
+        sizes.append(sum(int(line.split()[1]) for line in lines if line.startswith("Private")) / 1024)
+    return sizes
+
+
+def epoch(pictures: PictureFolder, workers: int, start: float) -> dict[str, Any]:
+    """Read every picture once, shuffled."""
+    order = torch.Generator().manual_seed(0)
+    loader = DataLoader(pictures, batch_size=50, shuffle=True, generator=order, num_workers=workers)
+    batches = iter(loader)
+    processes = [worker.pid for worker in getattr(batches, "_workers", [])]
+    memory, count, first = [], 0, 0.0
+    for number, batch in enumerate(batches):
+        if number == 0:
+            first = time.perf_counter() - start
+        if number in (len(loader) // 10, len(loader) * 9 // 10):
+            memory.append(own_megabytes(processes))
+        count += len(batch)
+    seconds = time.perf_counter() - start
+    return {"first_batch_s": first, "epoch_s": seconds, "pictures": count, "own_mb_early_late": memory}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--files", type=int, default=20_000)
+    parser.add_argument("--damaged", type=float, default=0.01, help="share of them")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        damaged = make_folder(folder, args.files, args.damaged)
+        good = [path for path in sorted(folder.rglob("*.jpg"))[:1000] if path.name not in damaged]
+        start = time.perf_counter()
+        for path in good:
+            read_picture(path)
+        alone = len(good) / (time.perf_counter() - start)
+        start = time.perf_counter()
+        pictures = PictureFolder(folder)
+        result: dict[str, Any] = {"start_s": time.perf_counter() - start}
+        result |= epoch(pictures, args.workers, start)
+        named = {path.name for path in pictures.skipped}
+    rate = result["pictures"] / result["epoch_s"]
+    result |= {"pictures_per_s": rate, "ratio_to_reading_alone": rate / alone, "report_is_exact": named == damaged}
+    result["machine"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, {args.workers} workers, torch {torch.__version__}"
+    )
+    print(json.dumps(result, indent=1))
+    if args.json:
+        args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0 if named == damaged else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

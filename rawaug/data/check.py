@@ -1,0 +1,205 @@
+"""What is in a folder: which dataset, how much of it, of which sizes, patterns and levels, and what is broken.
+
+Everything is read once, as training would read it. A folder is recognised by the names that its publishers gave to the
+files; what has none of these is a folder of RAW files, of pictures, or both.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from rawaug.data import picture_folder, raw_folder
+from rawaug.data.dnd import Dnd
+from rawaug.data.fivek import CAMERAS, fivek_numbers
+from rawaug.data.pairs import Pair
+from rawaug.data.picture_folder import PictureFolder
+from rawaug.data.rawir import Rawir
+from rawaug.data.sidd import SiddFrames
+from rawaug.data.sidd_blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd_scenes import is_scene
+from rawaug.data.sidd_submission import check_submission
+from rawaug.data.zurich import Zurich
+from rawaug.io import RawFrame, read_raw
+
+_SHOWN = 6
+
+
+@dataclass
+class PartReport:
+    """One kind of data in a folder.
+
+    Attributes:
+        what: it was recognised as.
+        items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
+        sizes, cfas, cameras, levels: how often each occurs among those that could be read.
+        signal: least and greatest value of RAW.
+        broken: one line each, naming the file.
+    """
+
+    what: str
+    items: int = 0
+    examined: int = 0
+    sizes: Counter[str] = field(default_factory=Counter)
+    cfas: Counter[str] = field(default_factory=Counter)
+    cameras: Counter[str] = field(default_factory=Counter)
+    levels: Counter[str] = field(default_factory=Counter)
+    signal: tuple[float, float] | None = None
+    broken: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        examined = "" if self.examined == self.items else f", {self.examined} of them examined"
+        lines = [f"{self.what}: {self.items}{examined}"]
+        for name in ("sizes", "cfas", "cameras", "levels"):
+            counts: Counter[str] = getattr(self, name)
+            if counts:
+                more = f", {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+                shown = ", ".join(f"{value} ({count})" for value, count in counts.most_common(_SHOWN))
+                lines.append(f"  {name}: {shown}{more}")
+        if self.signal is not None:
+            lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
+        lines.append(f"  broken: {len(self.broken) or 'none'}")
+        return "\n".join([*lines, *(f"    {line}" for line in self.broken)])
+
+
+@dataclass
+class DataReport:
+    """What :func:`check` found; ``str()`` is the text that ``rawaug data check`` prints."""
+
+    path: Path
+    parts: list[PartReport]
+
+    @property
+    def broken(self) -> list[str]:
+        return [line for part in self.parts for line in part.broken]
+
+    def __str__(self) -> str:
+        return "\n".join([str(self.path), *map(str, self.parts)])
+
+
+def check(path: str | Path, first: int | None = None) -> DataReport:
+    """Recognise what is in a folder (or a file to be handed in to SIDD) and read it.
+
+    Args:
+        path: a folder, a RAW file, or a SIDD submission.
+        first: read only so many of each kind.
+
+    Raises:
+        FileNotFoundError: if there is no such path.
+        ValueError: if nothing in it is known.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.is_file() and path.suffix in (".csv", ".mat"):
+        return DataReport(path, [_part("submission to SIDD", lambda: list(check_submission(path)), first)])
+    known = list(_datasets(path)) or list(_files(path))
+    if not known:
+        raise ValueError(f"{path}: holds no dataset, RAW file or picture that is known; see the page on datasets")
+    return DataReport(path, [_part(what, open_part, first) for what, open_part in known])
+
+
+def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The published datasets that the names in a folder tell of, and how to open each."""
+    files = {name for _, _, names in os.walk(path) for name in names}
+    scenes = {Path(parent) for parent, _, names in os.walk(path) if is_scene(Path(parent).name) and names}
+    if any("GT_RAW" in file.name.upper() for scene in scenes for file in scene.iterdir()):
+        yield "SIDD, full frames", lambda: SiddFrames(path)
+    if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
+        yield "SIDD, validation blocks", lambda: SiddBlocks(path)
+    if "BenchmarkNoisyBlocksRaw.mat" in files:
+        yield "SIDD, benchmark blocks (noisy alone)", lambda: SiddBenchmark(path)
+    if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
+        yield "SIDD+, validation blocks", lambda: SiddPlusBlocks(path)
+    if (path / "info.mat").is_file():
+        yield "DND, boxes (noisy alone)", lambda: Dnd(path)
+    if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
+        for split in ("train", "test"):
+            yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
+    elif any(name.endswith(".npy") for name in files):
+        splits = [
+            s for s, name in {"train": "train", "validation": "val", "test": "test"}.items() if (path / name).is_dir()
+        ]
+        for split in splits or ["train"]:
+            yield f"RAWIR or AIM 2022{', ' + split if splits else ''}", partial(Rawir, path, split)
+
+
+def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
+    files = [path] if path.is_file() else [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
+    raws = sorted(file for file in files if file.suffix.lower() in raw_folder.EXTENSIONS)
+    numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
+    if raws:
+        yield f"RAW files{_fivek(numbers)}", lambda: _RawFrames(raws)
+    if any(file.suffix.lower() in picture_folder.EXTENSIONS for file in files) and path.is_dir():
+        yield "pictures", lambda: PictureFolder(path, allowed_share=1)
+
+
+def _fivek(numbers: set[str]) -> str:
+    parts = []
+    for camera in CAMERAS:
+        for split in ("train", "test"):
+            wanted = fivek_numbers(camera, split)
+            if there := len(numbers.intersection(wanted)):
+                parts.append(f"{camera} {split} {there} of {len(wanted)}")
+    return f" (FiveK: {', '.join(parts)})" if parts else ""
+
+
+class _RawFrames(Sequence[RawFrame]):
+    """RAW files without a rendering of them."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self.files = files
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, index: int) -> RawFrame:  # type: ignore[override]
+        return read_raw(self.files[index])
+
+
+def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
+    """Read the items one by one; what fails is a line of the report."""
+    part = PartReport(what)
+    try:
+        items = open_part()
+    except (OSError, ValueError) as error:
+        part.broken.append(" ".join(str(error).split()))
+        return part
+    part.items = len(items)
+    part.examined = part.items if first is None else min(first, part.items)
+    for index in range(part.examined):
+        try:
+            _take(part, items.read(index) if isinstance(items, PictureFolder) else items[index])
+        except (OSError, ValueError) as error:
+            line = " ".join(str(error).split())
+            if line not in part.broken:  # one damaged file of many blocks is one line
+                part.broken.append(line)
+    return part
+
+
+def _take(part: PartReport, item: Any) -> None:
+    """Count one item: a picture, pair, RAW frame or noisy block."""
+    if isinstance(item, Tensor):
+        part.sizes[f"{item.shape[-2]} x {item.shape[-1]}"] += 1
+        return
+    raw: Tensor = item.raw if isinstance(item, Pair) else item.mosaic if isinstance(item, RawFrame) else item.noisy
+    part.sizes[f"{raw.shape[-2]} x {raw.shape[-1]}"] += 1
+    part.cfas[str(item.cfa)] += 1
+    if isinstance(item, RawFrame):
+        black = "/".join(f"{level:g}" for level in dict.fromkeys(item.black))
+        part.levels[f"black {black}, white {item.white:g}"] += 1
+    if getattr(item, "shot_var", None) is not None:
+        part.levels[f"shot_var {item.shot_var:.1e}, read_var {item.read_var:.1e}"] += 1
+    if camera := getattr(item, "camera", None):
+        part.cameras[camera] += 1
+    low, high = part.signal or (float("inf"), float("-inf"))
+    part.signal = min(low, raw.min().item()), max(high, raw.max().item())

@@ -1,0 +1,39 @@
+r"""Colour of frames whose files tell it as a DNG does, and a plain rendering of them.
+
+    srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
+
+with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ (IEC 61966-2-1): grey stays grey. The
+white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's: so were SIDD's pictures made
+(A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.malvar import demosaic_malvar
+from rawaug.io import encode_srgb
+
+_XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
+    """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1."""
+    camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ _XYZ_FROM_SRGB
+    return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
+
+
+def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
+    """Multipliers of R, G, B, green being 1."""
+    red, green, blue = (float(value) for value in np.ravel(as_shot_neutral))
+    return green / red, 1.0, green / blue
+
+
+def rendered(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
+    """A mosaic ``(1, H, W)`` as a picture, uint8 ``(3, H, W)``."""
+    balanced = (demosaic_malvar(raw, cfa) * torch.tensor(gains).reshape(3, 1, 1)).clamp_(0, 1)
+    linear = torch.einsum("ij,jhw->ihw", matrix, balanced).clamp_(0, 1)
+    return (encode_srgb(linear) * 255).round_().to(torch.uint8)

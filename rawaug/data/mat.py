@@ -1,0 +1,137 @@
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, told apart by their header.
+
+A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
+naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
+"MAT-File Format", for version 5; 7.3 is HDF5 behind 512 bytes of header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_TEXT = b"MATLAB 5.0"
+
+
+def mat_version(path: str | Path) -> str:
+    """``"5"`` or ``"7.3"``, by the header.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is neither.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such MATLAB file")
+    with path.open("rb") as file:
+        header = file.read(512 + len(_HDF5))
+    if header.startswith(_HDF5) or header[512:] == _HDF5:
+        return "7.3"
+    if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
+        return "5"
+    raise ValueError(f"{path}: is no MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
+
+
+def read_array(path: str | Path, name: str) -> np.ndarray:
+    """The numeric array ``name``, axes and type as in MATLAB.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`mat_version`; ValueError also if there is no such array.
+        OSError: if the file is damaged.
+
+    Example:
+        >>> read_array("0001_NOISY_RAW_010.MAT", "x").shape  # doctest: +SKIP
+        (3000, 5328)
+    """
+    value = _read(Path(path), name, plain=False)
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+        raise ValueError(f"{path}: {name} is no numeric array, but {type(value).__name__}")
+    return value
+
+
+def read_value(path: str | Path, name: str) -> Any:
+    """The variable ``name`` as plain values: structs are dicts, struct arrays lists of dicts, cells lists, characters
+    strings, numbers arrays without axes of length 1. A matrix of cells or structs is listed row by row.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: as :func:`read_array`.
+    """
+    return _read(Path(path), name, plain=True)
+
+
+def _read(path: Path, name: str, plain: bool) -> Any:
+    if mat_version(path) == "5":
+        return _read_5(path, name, plain)
+    with _damage_told(path):
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            if name not in file:
+                raise _missing(path, name, [key for key in file if not key.startswith("#")])
+            return _plain(file[name], file) if plain else np.ascontiguousarray(file[name][()].T)
+
+
+def _read_5(path: Path, name: str, plain: bool) -> Any:
+    from scipy.io import loadmat, whosmat
+
+    with _damage_told(path):
+        variables = loadmat(path, variable_names=[name], simplify_cells=plain)
+        if name not in variables:
+            raise _missing(path, name, [found for found, *_ in whosmat(path)])
+        return variables[name]
+
+
+@contextmanager
+def _damage_told(path: Path) -> Iterator[None]:
+    """The many ways in which the libraries fail on a damaged file as one OSError that names it."""
+    import zlib
+
+    from scipy.io.matlab import MatReadError
+
+    try:
+        yield
+    except _Missing:
+        raise
+    except (OSError, MatReadError, zlib.error, ValueError, TypeError, KeyError, RuntimeError, MemoryError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{path}: cannot be read as a MATLAB file ({reason}); copy it again") from error
+
+
+class _Missing(ValueError):
+    """A variable that is not there: no damage."""
+
+
+def _missing(path: Path, name: str, there: list[str]) -> _Missing:
+    return _Missing(f"{path}: holds no variable {name}, but {', '.join(there) or 'none'}")
+
+
+def _plain(node: Any, file: Any) -> Any:
+    """An HDF5 node of a 7.3 file as plain values."""
+    import h5py
+
+    if isinstance(node, h5py.Group):
+        fields = {key: _plain(node[key], file) for key in node}
+        # the fields of a struct array refer to their values, and unlike cells they have no class of their own
+        if fields and all(_refers(node[key]) and "MATLAB_class" not in node[key].attrs for key in node):
+            return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
+        return fields
+    value = node[()]
+    if _refers(node):
+        return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
+    if node.attrs.get("MATLAB_class") == b"char":
+        return "".join(map(chr, np.ravel(value)))
+    if node.attrs.get("MATLAB_empty", 0):
+        return np.zeros(0)
+    return np.array(np.asarray(value).T.squeeze(), order="C")
+
+
+def _refers(node: Any) -> bool:
+    """Whether a node holds references: a cell, or a field of a struct array."""
+    import h5py
+
+    return isinstance(node, h5py.Dataset) and h5py.check_ref_dtype(node.dtype) is not None

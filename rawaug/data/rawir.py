@@ -1,0 +1,101 @@
+"""RAWIR and AIM 2022 Reversed ISP: crops of phone RAW, packed in ``.npy`` files, with the phone's picture beside them.
+
+A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
+be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
+Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). No file tells white balance or colour
+matrix in a way that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+
+The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
+"Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rawaug.bayer import CFA, unpack
+from rawaug.data.lazy import LazyPairs
+from rawaug.data.pairs import Pair
+from rawaug.io import read_picture
+
+WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
+"""White level by the picture's extension."""
+
+_SPLITS = {"train": "train", "validation": "val", "test": "test"}
+
+
+class Rawir(LazyPairs):
+    """The pairs below a folder, in RGGB.
+
+    Args:
+        path: contains ``.npy`` files with a picture beside each, at any depth. Where it has subfolders ``train``,
+            ``val`` or ``test``, only the one of the split is taken.
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        white: in digital numbers; by default as :data:`WHITE` says.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or an ``.npy`` has no picture beside it.
+        ValueError: if there is no such split, or it holds no pair.
+
+    Example:
+        >>> Rawir("data-s7", "train")[0].raw.shape  # doctest: +SKIP
+        torch.Size([1, 504, 504])
+    """
+
+    def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
+        folder, self.white = Path(path), white
+        if split not in _SPLITS:
+            raise ValueError(f"rawir: no split {split}; there are {', '.join(_SPLITS)}")
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{path}: no such folder of RAWIR")
+        if any((folder / name).is_dir() for name in _SPLITS.values()):
+            folder = folder / _SPLITS[split]
+        self.files = sorted(
+            Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(".npy")
+        )
+        if not self.files:
+            raise ValueError(f"{folder}: holds no .npy file of RAWIR")
+        self.pictures = [picture_beside(file) for file in self.files]
+        super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
+
+    def read(self, index: int) -> Pair:
+        file, picture = self.files[index], self.pictures[index]
+        try:
+            numbers = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise OSError(f"{file}: cannot be read as an array ({error}); copy it again") from error
+        if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u":
+            raise ValueError(f"{file}: packed RAW is unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
+        white = self.white or WHITE[picture.suffix.lower()]
+        if numbers.max() > white:
+            raise ValueError(f"{file}: holds {numbers.max()}, above white at {white:g}; give white=")
+        packed = torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
+        return Pair(
+            name=self.names[index],
+            srgb=read_picture(picture),
+            raw=unpack(packed, CFA.RGGB),
+            cfa=CFA.RGGB,
+            white_balance=(1.0, 1.0, 1.0),
+            color_matrix=torch.eye(3),
+            registered=not _is_p20(file),
+        )
+
+
+def picture_beside(file: Path) -> Path:
+    """The picture of the same stem.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    for suffix in WHITE:
+        if file.with_suffix(suffix).is_file():
+            return file.with_suffix(suffix)
+    raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; get both")
+
+
+def _is_p20(file: Path) -> bool:
+    return any("p20" in part.lower() for part in file.parts)

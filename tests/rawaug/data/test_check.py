@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.io import savemat
+
+from rawaug.cli import main
+from rawaug.data import check
+from rawaug.data.sidd_scenes import HELD_BACK
+from rawaug.io import write_picture
+
+Writer = Callable[[Path, dict[str, Any]], Path]
+
+
+def write_pictures(folder: Path, count: int = 3) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(count):
+        write_picture(folder / f"{k}.png", torch.full((3, 6, 8 + 2 * (k % 2)), k, dtype=torch.uint8))
+
+
+def test_pictures_are_counted_by_size_and_the_broken_ones_named(tmp_path: Path) -> None:
+    write_pictures(tmp_path, 5)
+    (tmp_path / "3.png").write_bytes(b"broken")
+    report = check(tmp_path)
+    assert str(report).splitlines()[:4] == [
+        str(tmp_path),
+        "pictures: 5",
+        "  sizes: 6 x 8 (3), 6 x 10 (1)",
+        "  broken: 1",
+    ]
+    (line,) = report.broken
+    assert "3.png: cannot be read as a picture" in line
+    assert "pictures: 5, 2 of them examined" in str(check(tmp_path, first=2))
+
+
+def test_raw_files_tell_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.full((32, 48), 1000, np.uint16)
+    bayer_dng(tmp_path / "a.dng", numbers, cfa="GRBG", black=(64,), white=1023)
+    bayer_dng(tmp_path / "b.dng", numbers, cfa="BGGR", black=(64,), white=1023)
+    (tmp_path / "c.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:300])
+    write_pictures(tmp_path)
+    raws, pictures = check(tmp_path).parts
+    assert raws.what == "RAW files" and raws.items == 3 and dict(raws.cfas) == {"GRBG": 1, "BGGR": 1}
+    assert dict(raws.levels) == {"black 64, white 1023": 2} and dict(raws.cameras) == {"Maker Model 1": 2}
+    assert raws.signal == pytest.approx((936 / 959, 936 / 959)) and "c.dng" in raws.broken[0]
+    assert pictures.what == "pictures" and pictures.items == 3
+
+
+def test_every_dataset_is_recognised(tmp_path: Path, mat73: Writer) -> None:
+    scene = tmp_path / "sidd" / "Data" / "0001_001_S6_00100_00060_3200_L"
+    frame = np.random.default_rng(0).random((64, 66)).astype(np.float32)
+    for kind in ("GT", "NOISY"):
+        mat73(scene / f"0001_{kind}_RAW_010.MAT", {"x": frame})
+    tags = {"AsShotNeutral": [[0.5, 1.0, 0.7]], "ColorMatrix2": np.eye(3).reshape(1, 9)}
+    savemat(scene / "0001_METADATA_RAW_010.MAT", {"metadata": tags})
+    blocks = np.full((len(HELD_BACK), 32, 8, 8), 0.5, np.float32)
+    savemat(tmp_path / "sidd" / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
+    savemat(tmp_path / "sidd" / "ValidationNoisyBlocksRaw.mat", {"ValidationNoisyBlocksRaw": blocks})
+    frames, validation, benchmark = check(tmp_path / "sidd", first=40).parts
+    assert frames.what == "SIDD, full frames" and dict(frames.cfas) == {"GRBG": 1} and not frames.broken
+    assert validation.items == 0 and "holds no ValidationGtBlocksRaw.mat" in validation.broken[0]
+    assert benchmark.items == 1280 and dict(benchmark.cfas) == {"GRBG": 32, "BGGR": 8}
+
+    np.save(tmp_path / "a.npy", np.zeros((4, 6, 4), np.uint16))
+    write_picture(tmp_path / "a.png", torch.zeros(3, 8, 12, dtype=torch.uint8))
+    (rawir,) = (part for part in check(tmp_path, first=1).parts if part.what.startswith("RAWIR"))
+    assert rawir.items == 1 and dict(rawir.sizes) == {"8 x 12": 1} and not rawir.broken
+
+
+def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
+    blocks = np.full((len(HELD_BACK), 32, 8, 8), 2.0, np.float32)
+    savemat(tmp_path / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
+    report = check(tmp_path, first=5)
+    assert len(report.broken) == 1 and "values run from 2 to 2" in report.broken[0]
+
+
+def test_what_is_unknown_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
+        check(tmp_path / "none")
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(ValueError, match="holds no dataset, RAW file or picture that is known"):
+        check(tmp_path)
+
+
+def test_the_command_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_pictures(tmp_path)
+    assert main(["data", "check", str(tmp_path)]) == 0
+    assert "pictures: 3" in capsys.readouterr().out
+    (tmp_path / "1.png").write_bytes(b"")
+    assert main(["data", "check", str(tmp_path), "--first", "2"]) == 2
+    printed = capsys.readouterr()
+    assert "1.png" in printed.out and printed.err.strip().endswith("1 broken, listed above")
+    assert main(["data", "check", str(tmp_path / "none")]) == 2
+    assert "none: no such file or folder" in capsys.readouterr().err

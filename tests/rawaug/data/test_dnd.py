@@ -1,0 +1,117 @@
+"""DND in its published form, small: struct array and frames of version 7.3, submission of version 5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rawaug.bayer import CFA
+from rawaug.data import Dnd, check_dnd_submission, open_pairs, write_dnd_submission
+from rawaug.data.mat import read_value
+
+Writer = Callable[[Path, dict[str, Any]], Path]
+CFAS = ("RGGB", "GBRG", "GRBG", "BGGR")
+
+
+def frame(k: int) -> np.ndarray:
+    return np.random.default_rng(k).random((20 + k % 3, 34)).astype(np.float32)
+
+
+def info(k: int) -> dict[str, Any]:
+    """An element of ``info``; boxes of 6 x 8 from (2 b + k % 2, 3) on, counted from 1."""
+    pattern = np.array(["RGB".index(colour) + 1.0 for colour in CFAS[k % 4]]).reshape(2, 2)
+    boxes = np.array([[1 + b // 2 + k % 2, 4 + b % 4, 6 + b // 2 + k % 2, 11 + b % 4] for b in range(20)], float)
+    camera = {
+        "pattern": pattern,
+        "AsShotNeutral": np.array([[0.5], [1.0], [0.8]]),
+        "ColorMatrix2": np.eye(3).reshape(1, 9),
+    }
+    return {"boundingboxes": boxes, "camera": camera, "nlf": {"a": 1e-3 * (k + 1), "b": 1e-6}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, mat73: Writer) -> Path:
+    folder = tmp_path_factory.mktemp("dnd")
+    mat73(folder / "info.mat", {"info": [info(k) for k in range(50)]})
+    for k in range(50):
+        mat73(folder / "images_raw" / f"{k + 1:04d}.mat", {"Inoisy": frame(k)})
+    return folder
+
+
+def test_boxes_are_cut_where_the_kit_cuts_them(folder: Path) -> None:
+    dnd = Dnd(folder)
+    assert len(dnd) == 1000
+    for index in (0, 19, 20, 21 * 20 + 7, 999):
+        k, b = divmod(index, 20)
+        top, left, bottom, right = info(k)["boundingboxes"][b].astype(int)
+        crop = dnd[index]
+        assert crop.name == f"{k + 1:04d}_{b + 1:02d}" and crop.noisy.shape == (1, 6, 8)
+        assert np.array_equal(crop.noisy[0].numpy(), frame(k)[top - 1 : bottom, left - 1 : right])
+        assert (crop.shot_var, crop.read_var) == pytest.approx((1e-3 * (k + 1), 1e-6))
+        assert crop.white_balance == pytest.approx((2, 1, 1.25))
+
+
+def test_patterns_are_matlabs_and_move_with_the_box(folder: Path) -> None:
+    dnd = Dnd(folder)
+    for k, name in enumerate(CFAS):
+        assert dnd.frames[k].cfa == CFA(name)
+        top, left = (info(k)["boundingboxes"][0][:2] - 1).astype(int)
+        assert dnd[20 * k].cfa == CFA(name).shifted(top, left)
+
+
+def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:
+    dnd = Dnd(folder)
+    out = tmp_path / "bundled"
+    write_dnd_submission(out, (crop.noisy * 0.5 for crop in dnd))
+    assert len(list(out.iterdir())) == 50
+    check_dnd_submission(out, dnd)
+    cells = read_value(out / "0022.mat", "Idenoised")
+    assert np.array_equal(cells[7], dnd[21 * 20 + 7].noisy[0].numpy() * 0.5) and cells[7].dtype == np.float32
+    assert int(read_value(out / "0022.mat", "israw")) == 1 and read_value(out / "0022.mat", "eval_version") == "1.0"
+
+
+def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
+    dnd = Dnd(folder)
+    with pytest.raises(ValueError, match="a submission has 1000 boxes, got 3"):
+        write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8)] * 3)
+    with pytest.raises(ValueError, match="box 1: a denoised box is finite"):
+        write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), torch.full((1, 6, 8), torch.nan)])
+    write_dnd_submission(tmp_path / "a", [torch.zeros(1, 8, 6)] * 1000)
+    with pytest.raises(ValueError, match=r"0001\.mat: box 1 is float32 \(6, 8\), got float32 \(8, 6\)"):
+        check_dnd_submission(tmp_path / "a", dnd)
+    write_dnd_submission(tmp_path / "a", [torch.full((1, 6, 8), 1.5)] * 1000)
+    with pytest.raises(ValueError, match=r"box 1 runs from 1\.5 to 1\.5; clip it"):
+        check_dnd_submission(tmp_path / "a", dnd)
+    (tmp_path / "a" / "0050.mat").unlink()
+    write_dnd_submission(tmp_path / "b", [crop.noisy for crop in dnd])
+    (tmp_path / "b" / "0050.mat").unlink()
+    with pytest.raises(FileNotFoundError, match=r"0050\.mat: no such MATLAB file"):
+        check_dnd_submission(tmp_path / "b", dnd)
+
+
+def test_what_is_missing_or_wrong_is_told(tmp_path: Path, mat73: Writer) -> None:
+    with pytest.raises(FileNotFoundError, match=r"info\.mat: no such MATLAB file"):
+        Dnd(tmp_path)
+    mat73(tmp_path / "info.mat", {"info": [info(0), info(1)]})
+    mat73(tmp_path / "images_raw" / "0001.mat", {"Inoisy": 1000 * frame(0)})
+    with pytest.raises(FileNotFoundError, match=r"0002\.mat: no such frame of DND; 1 of 2 are missing"):
+        Dnd(tmp_path)
+    mat73(tmp_path / "images_raw" / "0002.mat", {"Inoisy": frame(1)[:5]})
+    dnd = Dnd(tmp_path)
+    with pytest.raises(ValueError, match=r"0001\.mat: Inoisy \(20, 34\) runs from"):
+        dnd[0]
+    with pytest.raises(ValueError, match=r"0002\.mat: box 1 of info\.mat leaves the frame of \(5, 34\)"):
+        dnd[20]
+    mat73(tmp_path / "info.mat", {"info": [info(0), {**info(1), "nlf": {"a": 1.0}}]})
+    with pytest.raises(ValueError, match=r"info\.mat: frame 2 of info is not as published \('b'\)"):
+        Dnd(tmp_path)
+
+
+def test_there_are_no_pairs(folder: Path) -> None:
+    with pytest.raises(ValueError, match="the clean frames of DND are not public"):
+        open_pairs(f"dnd:{folder}")

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rawaug.bayer import CFA, pack
+from rawaug.data import Rawir, open_pairs
+from rawaug.io import write_picture
+
+PLANES = (100, 200, 300, 400)
+
+
+def write_pair(folder: Path, stem: str, picture: str, scale: int = 1) -> None:
+    """Packed (h, w, 4): flat planes, but for a bright cell at the left of the third row."""
+    folder.mkdir(parents=True, exist_ok=True)
+    packed = np.tile(np.array(PLANES, np.uint16) * scale, (6, 8, 1))
+    packed[2, 0] += 7
+    np.save(folder / f"{stem}.npy", packed)
+    write_picture(folder / f"{stem}.{picture}", torch.arange(3 * 12 * 16).reshape(3, 12, 16).to(torch.uint8))
+
+
+@pytest.mark.parametrize(("picture", "white"), [("jpg", 1024), ("png", 4095)])
+def test_planes_rows_and_white_are_the_published_ones(tmp_path: Path, picture: str, white: int) -> None:
+    write_pair(tmp_path, "12_3", picture)
+    (pair,) = Rawir(tmp_path)
+    assert pair.name == "12_3" and pair.cfa == CFA.RGGB and pair.registered and pair.raw.shape == (1, 12, 16)
+    packed = pack(pair.raw, pair.cfa) * white
+    assert torch.allclose(packed[:, 0, 1], torch.tensor(PLANES, dtype=torch.float32), atol=1e-3)
+    assert torch.allclose(packed[:, 2, 0] - packed[:, 0, 1], torch.full((4,), 7.0), atol=1e-3)
+    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / white) and pair.raw[0, 1, 2].item() == pytest.approx(
+        300 / white
+    )
+
+
+def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> None:
+    write_pair(tmp_path / "data-p20" / "train", "a", "jpg")
+    (tmp_path / "data-p20" / "val_rgb").mkdir()
+    write_pair(tmp_path / "data-p20" / "val", "b", "jpg")
+    assert [pair.name for pair in open_pairs(f"rawir:{tmp_path / 'data-p20'}", "train")] == ["a"]
+    (pair,) = open_pairs(f"rawir:{tmp_path / 'data-p20'}", "validation")
+    assert pair.name == "b" and not pair.registered
+    with pytest.raises(ValueError, match=r"test: holds no \.npy file"):
+        open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
+
+
+def test_what_is_wrong_is_told(tmp_path: Path) -> None:
+    write_pair(tmp_path, "a", "jpg", scale=3)
+    with pytest.raises(ValueError, match=r"a\.npy: holds 1207, above white at 1024; give white="):
+        Rawir(tmp_path)[0]
+    assert Rawir(tmp_path, white=4095)[0].raw.max().item() == pytest.approx(1207 / 4095)
+    np.save(tmp_path / "a.npy", np.zeros((4, 6, 8), np.uint16))
+    with pytest.raises(ValueError, match=r"packed RAW is unsigned \(h, w, 4\), got uint16 \(4, 6, 8\)"):
+        Rawir(tmp_path)[0]
+    np.save(tmp_path / "a.npy", np.array([{"code": "to run"}], object), allow_pickle=True)
+    with pytest.raises(OSError, match=r"a\.npy: cannot be read as an array"):
+        Rawir(tmp_path)[0]
+    (tmp_path / "a.jpg").unlink()
+    with pytest.raises(FileNotFoundError, match=r"a\.npy: has no \.jpg or \.png of the same stem"):
+        Rawir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="none: no such folder of RAWIR"):
+        Rawir(tmp_path / "none")

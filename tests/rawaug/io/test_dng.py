@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rawpy
+import tifffile
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from rawaug.bayer import CFA, mosaic
+from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
+from rawaug.io.raw import Exposure
+
+MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
+WHITE_BALANCE = (2.1, 1.0, 1.4)
+
+
+def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int, **told: object) -> RawFrame:
+    """The frame whose digital numbers are ``numbers`` ``(H, W)``."""
+    levels = np.zeros((2, 2))
+    for site, level in zip(cfa.sites, black, strict=True):
+        levels[site] = level
+    per_site = np.tile(levels, (numbers.shape[0] // 2, numbers.shape[1] // 2))
+    raw = torch.from_numpy(((numbers - per_site) / (white - per_site)).astype(np.float32))[None]
+    usual = {
+        "white_balance": WHITE_BALANCE,
+        "daylight": (1.9, 1.0, 1.6),
+        "color_matrix": MATRIX,
+        "camera": "Maker Model 1",
+        "iso": None,
+        "noise_profile": None,
+        "orientation": 0,
+        "name": "a",
+    }
+    return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **told})  # type: ignore[arg-type]
+
+
+def numbers_in(path: Path) -> np.ndarray:
+    with rawpy.imread(str(path)) as file:
+        return file.raw_image_visible.copy()
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    cfa=st.sampled_from(list(CFA)),
+    bits=st.integers(10, 16),
+    blacks=st.lists(st.integers(0, 255), min_size=4, max_size=4),
+    size=st.tuples(st.integers(16, 24), st.integers(16, 24)),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_libraw_reads_back_the_same_bits(
+    tmp_path: Path, cfa: CFA, bits: int, blacks: list[int], size: tuple[int, int], seed: int
+) -> None:
+    white = 2**bits - 1
+    shape = 2 * size[0], 2 * size[1]
+    numbers = np.random.default_rng(seed).integers(0, white + 1, shape).astype(np.uint16)
+    frame = a_frame(numbers, cfa, tuple(blacks), white)
+    write_dng(tmp_path / "a.dng", frame)
+    assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers)
+    back = read_raw(tmp_path / "a.dng")
+    assert (back.cfa, back.black, back.white) == (cfa, tuple(blacks), white)
+    assert torch.allclose(back.mosaic, frame.mosaic, atol=1e-7, rtol=0)
+
+
+def test_fractions_of_black_levels_are_kept(tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(0, 1024, (32, 32)).astype(np.uint16)
+    write_dng(tmp_path / "a.dng", a_frame(numbers, CFA.GBRG, (63.75, 64.25, 64.5, 64.0), 1023))
+    assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers)
+    assert read_raw(tmp_path / "a.dng").black == (63.75, 64.25, 64.5, 64.0)
+
+
+@pytest.mark.parametrize("flip", range(8))
+def test_metadata_goes_there_and_back(tmp_path: Path, flip: int) -> None:
+    gain_map = GainMap((0, 0, 32, 48), (1, 1), (0, 1), (0.0, 0.0), (0.5, 0.5), torch.rand(1, 3, 3) + 1)
+    frame = a_frame(
+        np.full((32, 48), 700, np.uint16), CFA.BGGR, (64,) * 4, 1023,
+        iso=800.0, noise_profile=(2e-3, 3e-6), orientation=flip, gain_maps=(gain_map,),
+        exposure=Exposure(1 / 60, 2.8, 35.0, "2020:02:29 12:00:00"),
+    )  # fmt: skip
+    write_dng(tmp_path / "a.dng", frame)
+    back = read_raw(tmp_path / "a.dng")
+    assert (back.camera, back.iso, back.orientation, back.color_known) == ("Maker Model 1", 800, flip, True)
+    assert back.noise_profile == (2e-3, 3e-6)
+    assert back.white_balance == pytest.approx(frame.white_balance, rel=1e-5)
+    assert back.daylight == pytest.approx(frame.daylight, rel=1e-3)
+    assert torch.allclose(back.color_matrix, MATRIX, atol=2e-4)
+    assert torch.equal(back.gain_maps[0].gains, gain_map.gains)
+    assert back.exposure.seconds == pytest.approx(1 / 60, rel=1e-3) and back.exposure.f_number == pytest.approx(2.8)
+    assert back.exposure.date == "2020:02:29 12:00:00"
+
+
+def colour_patches() -> Tensor:
+    """Linear sRGB ``(3, 64, 96)``: six flat patches."""
+    tones = torch.tensor(
+        [[0.2, 0.2, 0.2], [0.4, 0.1, 0.1], [0.1, 0.4, 0.1], [0.1, 0.1, 0.4], [0.4, 0.4, 0.1], [0.4] * 3]
+    )
+    return tones.reshape(2, 3, 3).repeat_interleave(32, 0).repeat_interleave(32, 1).permute(2, 0, 1)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_a_raw_developer_shows_the_colours_that_were_meant(tmp_path: Path, cfa: CFA) -> None:
+    srgb = colour_patches()
+    camera = torch.einsum("ij,jhw->ihw", torch.linalg.inv(MATRIX), srgb) / torch.tensor(WHITE_BALANCE)[:, None, None]
+    numbers = (mosaic(camera, cfa)[0] * (16383 - 512) + 512).round().numpy().astype(np.uint16)
+    write_dng(tmp_path / "a.dng", a_frame(numbers, cfa, (512,) * 4, 16383))
+    shown = read_raw_and_develop(tmp_path / "a.dng")[1].float() / 255
+    expected = torch.where(srgb < 0.018, 4.5 * srgb, 1.099 * srgb**0.45 - 0.099)  # BT.709, LibRaw's default
+    inner = torch.zeros(64, 96, dtype=torch.bool)
+    for i in (0, 32):
+        for j in (0, 32, 64):
+            inner[i + 8 : i + 24, j + 8 : j + 24] = True
+    assert (shown - expected)[:, inner].abs().max() < 0.02
+
+
+def test_what_a_source_tells_is_kept(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    numbers = np.random.default_rng(0).integers(0, 4096, (32, 48)).astype(np.uint16)
+    matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    extra = [(50940, 11, 4, (0.0, 0.0, 1.0, 1.0), True), (50936, 2, 0, "Vivid", True), (51111, 1, 16, bytes(16), True)]
+    source = bayer_dng(tmp_path / "source.dng", numbers, color_matrix=matrix, orientation=6, extra=extra)
+    frame = read_raw(source)
+    write_dng(tmp_path / "plain.dng", dataclasses.replace(frame, iso=1600.0))  # a file with EXIF, to be a source too
+    halved = dataclasses.replace(frame, mosaic=frame.mosaic.clamp(max=0.5), noise_profile=None)
+    write_dng(tmp_path / "a.dng", halved, source)
+    with tifffile.TiffFile(tmp_path / "a.dng") as tiff:
+        tags = tiff.pages.first.tags
+        assert tags["ProfileName"].value == "Vivid" and tags.valueof(50940) == (0.0, 0.0, 1.0, 1.0)
+        assert 51111 not in tags and tags["Orientation"].value == 6
+        assert np.array_equal(tags["ColorMatrix1"].value[::2], 10000 * np.eye(3).ravel())
+    back = read_raw(tmp_path / "a.dng")
+    assert back.mosaic.max() < 0.51 and back.orientation == frame.orientation
+    write_dng(tmp_path / "b.dng", frame, tmp_path / "plain.dng")
+    assert read_raw(tmp_path / "b.dng").iso == 1600
+
+
+def test_directories_are_copied_in_either_byte_order(tmp_path: Path) -> None:
+    exif = [(33434, 5, struct.pack(">2I", 1, 125)), (36867, 2, b"2020:02:29 12:00:00\0"), (37500, 7, b"maker note")]
+    source = tmp_path / "big.tif"
+    tifffile.imwrite(
+        source, np.zeros((4, 4), np.uint8), byteorder=">", metadata=None, extratags=[("ExifTag", 4, 1, 0, True)]
+    )
+    data = bytearray(source.read_bytes())
+    start = len(data)
+    table, values, beyond = struct.pack(">H", len(exif)), b"", start + 2 + 12 * len(exif) + 4
+    for code, dtype, value in exif:
+        count = 1 if dtype == 5 else len(value)
+        table += struct.pack(">HHII", code, dtype, count, beyond + len(values))
+        values += value
+    pointer = data.index(struct.pack(">HHI", 34665, 4, 1)) + 8
+    data[pointer : pointer + 4] = struct.pack(">I", start)
+    source.write_bytes(bytes(data) + table + bytes(4) + values)
+    write_dng(tmp_path / "a.dng", a_frame(np.full((32, 32), 500, np.uint16), CFA.RGGB, (64,) * 4, 1023), source)
+    exposure = read_raw(tmp_path / "a.dng").exposure
+    assert exposure.seconds == pytest.approx(1 / 125) and exposure.date == "2020:02:29 12:00:00"
+    with tifffile.TiffFile(tmp_path / "a.dng") as tiff:
+        assert tiff.byteorder == ">" and "MakerNote" not in tiff.pages.first.tags["ExifTag"].value
+
+
+def test_what_16_bits_cannot_hold_is_refused(tmp_path: Path) -> None:
+    frame = a_frame(np.full((32, 32), 500, np.uint16), CFA.RGGB, (0,) * 4, 1023)
+    noisy = dataclasses.replace(frame, mosaic=frame.mosaic - 0.6)
+    with pytest.raises(ValueError, match=r"a\.dng: 16 bits cannot hold digital numbers from -114 .*raise the black"):
+        write_dng(tmp_path / "a.dng", noisy)
+    with pytest.raises(ValueError, match=r"a\.dng: levels are 0 <= black < white <= 65535"):
+        write_dng(tmp_path / "a.dng", dataclasses.replace(frame, white=65536.0))
+    with pytest.raises(ValueError, match=r"a\.dng: a mosaic to write is \(1, H, W\) with even sides"):
+        write_dng(tmp_path / "a.dng", dataclasses.replace(frame, mosaic=torch.zeros(1, 5, 4)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_real_dng_written_again_is_the_same(tmp_path: Path, camera_files: Path) -> None:
+    for name in ("raw/gopro/hero6_0024.dng", "raw/canon/g2_0304.crw"):
+        source = camera_files / name
+        frame = read_raw(source)
+        write_dng(tmp_path / "a.dng", frame, source)
+        back = read_raw(tmp_path / "a.dng")
+        assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers_in(source))
+        assert (back.camera, back.iso, back.orientation) == (frame.camera, frame.iso, frame.orientation)
+        assert back.noise_profile == frame.noise_profile and len(back.gain_maps) == len(frame.gain_maps)
+        assert torch.allclose(back.color_matrix, frame.color_matrix, atol=2e-4)
