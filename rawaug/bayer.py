@@ -6,17 +6,34 @@ order R, Gr, Gb, B (Gr is the green of the red row), so that a network never nee
 
 A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` does the bare movement and
 :meth:`CFA.turned` says what the pattern becomes; :func:`turn_keeping_cfa` crops a line where that brings it back.
+
+:class:`RandomCrop`, :class:`RandomTurn`, :class:`Pack` and :class:`Unpack` are the same as modules. What is random
+splits in ``sample(...) -> params`` and a pure ``apply(raw, params)``.
 """
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, IntEnum
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 N_VIEWS = 8
 """Number of flips and quarter turns of a picture (the dihedral group of the square)."""
+
+
+class View(IntEnum):
+    """The eight views of :func:`turn` by name; ``LEFT`` and ``RIGHT`` are quarter turns."""
+
+    IDENTITY = 0
+    MIRROR = 1
+    FLIP = 2
+    HALF_TURN = 3
+    TRANSPOSE = 4
+    RIGHT = 5
+    LEFT = 6
+    ANTITRANSPOSE = 7
 
 
 class CFA(str, Enum):
@@ -155,6 +172,22 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     return turned[..., rows : height - rows, columns : width - columns]
 
 
+def turn_packed(packed: Tensor, view: int) -> Tensor:
+    """Turn packed RAW ``(..., 4, h, w)`` as :func:`turn` does its mosaic, which then reads :meth:`CFA.turned`.
+
+    The planes turn, and a transposition exchanges Gr and Gb: the red row was the red column.
+
+    Example:
+        >>> raw = torch.rand(1, 1, 8, 6)
+        >>> turned = turn_packed(pack(raw, "RGGB"), View.LEFT)
+        >>> torch.equal(unpack(turned, CFA("RGGB").turned(View.LEFT)), turn(raw, View.LEFT))
+        True
+    """
+    _require_channels(packed, 4, "packed RAW")
+    turned = turn(packed, view)
+    return turned[..., [0, 2, 1, 3], :, :] if view & 4 else turned
+
+
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     """Crop ``(..., H, W)`` without moving the pattern.
 
@@ -166,3 +199,102 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     if min(top, left) < 0 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
         raise ValueError(f"crop {height} x {width} at ({top}, {left}) leaves the mosaic {tuple(raw.shape[-2:])}")
     return raw[..., top : top + height, left : left + width]
+
+
+class _Transform(nn.Module):
+    """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``."""
+
+    def apply(self, raw: Any, params: Tensor | None = None) -> Any:
+        return super().apply(raw) if params is None else self._apply_params(raw, params)
+
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class RandomCrop(_Transform):
+    """A crop ``(..., size, size)`` of mosaics ``(..., H, W)`` at a random even offset: the pattern stays.
+
+    One draw serves all that is in the tensor: noisy and clean, stacked, are cropped alike.
+
+    Args:
+        size: even side, or (height, width), in mosaic pixels.
+
+    Raises:
+        ValueError: if the size is odd, or, on use, if the mosaic is smaller.
+
+    Example:
+        >>> crop = RandomCrop(4)
+        >>> raw, generator = torch.rand(2, 1, 8, 12), torch.Generator().manual_seed(0)
+        >>> params = crop.sample(8, 12, generator)
+        >>> crop.apply(raw, params).shape
+        torch.Size([2, 1, 4, 4])
+    """
+
+    def __init__(self, size: int | tuple[int, int]) -> None:
+        super().__init__()
+        self.size = (size, size) if isinstance(size, int) else size
+        if any(side % 2 or side < 2 for side in self.size):
+            raise ValueError(f"a crop is even and at least 2, got {size}")
+
+    def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
+        """``(2,)``: top and left of a crop of a mosaic of ``height`` x ``width``."""
+        rows, columns = self.size
+        if height < rows or width < columns:
+            raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller one")
+        free = ((height - rows) // 2 + 1, (width - columns) // 2 + 1)
+        return 2 * torch.stack([torch.randint(n, (), generator=generator) for n in free])
+
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
+        top, left = params.tolist()
+        return crop(raw, top, left, *self.size)
+
+    def forward(self, raw: Tensor, generator: torch.Generator) -> Tensor:
+        return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], generator))
+
+
+class RandomTurn(_Transform):
+    """One of the eight flips and quarter turns of mosaics ``(..., H, W)``, the same for all that is in the tensor.
+
+    Args:
+        cfa: pattern of the mosaics.
+        keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turned(view)``.
+        quarter: draw quarter turns too; without them the sides are not exchanged.
+
+    Example:
+        >>> turn = RandomTurn("GRBG")
+        >>> turn.apply(torch.rand(1, 1, 8, 12), torch.tensor(View.FLIP)).shape
+        torch.Size([1, 1, 6, 12])
+    """
+
+    def __init__(self, cfa: CFA | str, keep_cfa: bool = True, quarter: bool = True) -> None:
+        super().__init__()
+        self.cfa, self.keep_cfa, self.views = CFA(cfa), keep_cfa, N_VIEWS if quarter else N_VIEWS // 2
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """The view, ``()``."""
+        return torch.randint(self.views, (), generator=generator)
+
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
+        view = int(params)
+        return turn_keeping_cfa(raw, self.cfa, view) if self.keep_cfa else turn(raw, view)
+
+    def forward(self, raw: Tensor, generator: torch.Generator) -> Tensor:
+        return self._apply_params(raw, self.sample(generator))
+
+
+class Pack(nn.Module):
+    """:func:`pack` as a module."""
+
+    def __init__(self, cfa: CFA | str) -> None:
+        super().__init__()
+        self.cfa = CFA(cfa)
+
+    def forward(self, mosaic: Tensor) -> Tensor:
+        return pack(mosaic, self.cfa)
+
+
+class Unpack(Pack):
+    """:func:`unpack` as a module, the inverse of :class:`Pack`."""
+
+    def forward(self, packed: Tensor) -> Tensor:
+        return unpack(packed, self.cfa)

@@ -1,4 +1,4 @@
-"""The command line: ``rawaug run | fit | evaluate | preview | info``, by jsonargparse on the dataclasses of recipes.
+"""The command line: ``rawaug run | fit | evaluate | synth | denoise | preview | info | data``, by jsonargparse.
 
 Bad input ends in one line on stderr that names the file or key and what to do, with exit status 2.
 """
@@ -34,25 +34,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(argv: list[str]) -> int:
-    parser = _parser()
+    kind = "training"
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
+        from rawaug.experiment.experiments import kind_of
         from rawaug.experiment.recipe import find_recipe
 
-        argv = ["run", "--recipe", str(find_recipe(argv[1])), *argv[2:]]
+        recipe = find_recipe(argv[1])
+        kind = kind_of(recipe)
+        argv = ["run", "--recipe", str(recipe), *argv[2:]]
+    parser = _parser(kind)
     if not argv:
         parser.print_help()
         return 0
     parsed = parser.parse_args(argv)
     command: str = parsed.command
-    commands = {"run": _run, "fit": _fit, "evaluate": _evaluate, "preview": _preview, "info": _info}
-    commands[command](parser.instantiate(parsed)[command])
+    commands = {
+        "fit": _fit,
+        "evaluate": _evaluate,
+        "synth": _synth,
+        "denoise": _denoise,
+        "preview": _preview,
+        "info": _info,
+        "data": _data,
+    }
+    if command == "run":
+        _run(kind, parser.instantiate(parsed)[command])
+    else:
+        commands[command](parser.instantiate(parsed)[command])
     return 0
 
 
-def _parser() -> Any:
+def _parser(kind: str) -> Any:
     from jsonargparse import ArgumentParser
 
-    from rawaug.experiment.recipe import Recipe
+    from rawaug.experiment.experiments import KINDS
     from rawaug.isp.fit import FitConfig
 
     def new(description: str) -> Any:
@@ -60,10 +75,15 @@ def _parser() -> Any:
 
     run = new("Every stage of a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a recipe in the package")
-    run.add_class_arguments(Recipe)
+    run.add_argument("--smoke", action="store_true", help="every stage in seconds on tiny built-in data")
+    run.add_class_arguments(KINDS[kind].settings)
 
     fit = new("Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where there are any).")
-    fit.add_argument("data", type=str, help="folder of RAW files, one file, or kind:path")
+    fit.add_argument("data", type=str, nargs="+", help="folders of RAW files, files, or one kind:path")
+    jpeg_help = "take the camera's JPEG of the same stem for the sRGB; false takes LibRaw's rendering always"
+    fit.add_argument("--camera-jpeg", type=bool, default=True, help=jpeg_help)
+    held_out_help = "frames that the fit does not see: their PSNR_r is shown while it runs"
+    fit.add_argument("--held-out", type=str | None, default=None, help=held_out_help)
     fit.add_argument("--out", type=str, required=True, help="the .safetensors file to write")
     noise_help = "also measure the camera's noise, for noise: camera; auto goes on where the frames do not show it"
     fit.add_argument("--noise", type=Literal["auto", "on", "off"], default="auto", help=noise_help)
@@ -76,6 +96,8 @@ def _parser() -> Any:
     evaluate.add_argument("--self-ensemble", action="store_true", help="average a denoiser over eight views")
     evaluate.add_argument("--noise", type=str | None, default=None, help="preset for frames without a noisy capture")
     evaluate.add_argument("--seed", type=int, default=0, help="of that noise")
+    classical = "also score NonLocalMeans, Wavelet, TotalVariation or BM3D on the same noise"
+    evaluate.add_argument("--classical", type=list[str], default=[], help=classical)
     evaluate.add_argument("--json", type=str | None, default=None, help="also write the result to this file")
 
     preview = new("Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.")
@@ -85,24 +107,62 @@ def _parser() -> Any:
     preview.add_argument("--count", type=int, default=4, help="augmented RAWs to draw")
     preview.add_argument("--seed", type=int, default=0, help="of these")
 
+    synth = new("RAW pairs on disk from a folder of sRGB pictures; stopped, the same command goes on from there.")
+    _add_synth(synth)
+    denoise = new("Denoise a RAW file, or a folder of them, to DNG; in a folder what is there is skipped.")
+    _add_denoise(denoise)
+
     info = new("What is in a file of weights.")
     info.add_argument("weights", type=str, help="a .safetensors file, or the name of a shipped ISP")
 
+    data = new("About data: rawaug data check PATH.")
+    check = new("What is in a folder: which dataset, how many, sizes, patterns, levels, and what is broken.")
+    check.add_argument("path", type=str, help="a folder, a RAW file, or a submission to SIDD")
+    check.add_argument("--first", type=int | None, default=None, help="read only so many of each kind")
+
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
     subcommands = parser.add_subcommands(dest="command")
-    parsers = {"run": run, "fit": fit, "evaluate": evaluate, "preview": preview, "info": info}
+    parsers = {"run": run, "fit": fit, "evaluate": evaluate, "synth": synth, "denoise": denoise}
+    parsers |= {"preview": preview, "info": info, "data": data}
     for name, subparser in parsers.items():
         subcommands.add_subcommand(name, subparser, help=subparser.description)
+    data.add_subcommands(dest="action").add_subcommand("check", check, help=check.description)  # the outer ones first
     return parser
 
 
-def _run(arguments: Any) -> None:
-    from rawaug.experiment.recipe import Recipe
-    from rawaug.experiment.run import run
+def _add_synth(synth: Any) -> None:
+    from rawaug.augment import Sampling
+    from rawaug.experiment.pair_files import Format
 
-    settings = vars(arguments)
+    synth.add_argument("pictures", type=str, help="folder of sRGB pictures")
+    synth.add_argument("out", type=str, help="folder to write")
+    synth.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
+    synth.add_argument("--per-image", type=int, default=1, help="pairs a picture")
+    synth.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
+    noise_help = "a preset, a measured camera, camera (as fitted), or [shot_var, read_var]"
+    synth.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
+    synth.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
+    synth.add_argument("--seed", type=int, default=0, help="of all draws")
+    synth.add_argument("--workers", type=int | None, default=None, help="processes; as many as cores by default")
+
+
+def _add_denoise(denoise: Any) -> None:
+    denoise.add_argument("source", type=str, help="a RAW file, or a folder of them")
+    denoise.add_argument("out", type=str, help="the DNG to write, or a folder")
+    denoise.add_argument("--denoiser", type=str, required=True, help="a .safetensors file of rawaug run")
+    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
+    denoise.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
+    denoise.add_argument("--self-ensemble", action="store_true", help="average eight views: eight times the work")
+
+
+def _run(kind: str, arguments: Any) -> None:
+    from rawaug.experiment.experiments import KINDS
+
+    experiment, settings = KINDS[kind], vars(arguments)
     settings.pop("recipe")
-    run(Recipe(**settings))
+    quick = settings.pop("smoke")
+    recipe = experiment.settings(**settings)
+    experiment.run(experiment.smoke(recipe) if quick else recipe)
 
 
 def _fit(arguments: Any) -> None:
@@ -113,10 +173,12 @@ def _fit(arguments: Any) -> None:
     _require_safetensors(out)
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
-    isp = fit(data, noise_figure=figure, **settings)
+    isp = fit(data, noise_figure=figure, state=f"{out}.state", **settings)
     isp.info["data"] = data
     isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
+    for score in isp.info.get("held_out", [])[-1:]:
+        print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")
     if "noise_not_measured" in isp.info:
         print(f"noise not measured: {isp.info['noise_not_measured']}")
     if "noise" in isp.info:
@@ -129,10 +191,11 @@ def _evaluate(arguments: Any) -> None:
     from rawaug.experiment.evaluate import evaluate, write_json
     from rawaug.experiment.report import print_scores
 
-    result = evaluate(arguments.weights, arguments.data, arguments.self_ensemble, arguments.noise, arguments.seed)
+    a = arguments
+    result = evaluate(a.weights, a.data, a.self_ensemble, a.noise, a.seed, a.classical)
     print_scores(result)
-    if arguments.json:
-        write_json(result, arguments.json)
+    if a.json:
+        write_json(result, a.json)
 
 
 def _preview(arguments: Any) -> None:
@@ -143,10 +206,37 @@ def _preview(arguments: Any) -> None:
         print(path)
 
 
+def _synth(arguments: Any) -> None:
+    from rawaug.experiment.synth import print_synthesis, synth
+
+    settings = vars(arguments)
+    print_synthesis(synth(settings.pop("pictures"), settings.pop("out"), **settings))
+
+
+def _denoise(arguments: Any) -> None:
+    from rawaug.experiment.denoise import DenoisedFolder, denoise_file, denoise_folder, print_denoised
+
+    a = arguments
+    if Path(a.source).is_dir():
+        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    else:
+        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+
+
 def _info(arguments: Any) -> None:
     from rawaug.experiment.info import describe
 
     print(describe(arguments.weights))
+
+
+def _data(arguments: Any) -> None:
+    from rawaug.data import check
+
+    path, first = arguments.check.path, arguments.check.first
+    report = check(path, first)
+    print(report)
+    if report.broken:
+        raise ValueError(f"{path}: {len(report.broken)} broken, listed above")
 
 
 def _require_safetensors(path: str) -> None:

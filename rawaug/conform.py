@@ -1,38 +1,180 @@
-"""Pictures as datasets yield them, brought to one form: RGB, channels first, even sides, values untouched."""
+"""Pictures as people have them, brought to one form: RGB, channels first, 8 bits or float32 in [0, 1].
+
+A *picture* is a tensor, a NumPy array or a PIL picture, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
+in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out. A
+*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is such a thing
+itself, or a tuple or mapping that has it among other fields.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rawaug.isp.stages import as_float
+
 _CHANNELS = (1, 3, 4)
+_PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
+_PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
+_HALF_LEVEL = 0.5 / 255
+
+Where = str | int | None
+"""Where in a sample the picture stands: a key, an index, or None where the sample is the picture."""
 
 
 def to_rgb_tensor(picture: Any) -> Tensor:
-    """A tensor, NumPy array or PIL picture to ``(3, H, W)``, uint8 or float.
+    """A picture to ``(3, H, W)``, uint8 or float32.
 
-    Grey is repeated to three channels, an alpha channel is dropped, HWC becomes CHW (the axis of 1, 3 or 4 is taken for
-    the channels, the last one first where both could be). Values are neither scaled nor clipped.
+    The axis of 1, 3 or 4 is taken for the channels; where both ends could be, the first of a tensor and the last of an
+    array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
+    them; they are looked at on the CPU only, elsewhere that would stall the device.
 
     Raises:
-        ValueError: if the shape is not that of a picture, or the type neither uint8 nor floating point.
+        ValueError: if the shape is not that of a picture, the type is another, the values leave [0, 1], or a PIL
+            picture is in CMYK, CIELAB, HSV or 32-bit integers.
     """
-    image = picture if isinstance(picture, Tensor) else torch.from_numpy(np.array(picture))
+    image = _as_tensor(picture)
     if image.ndim == 2:
         image = image[None]
-    if image.ndim != 3 or not (image.shape[0] in _CHANNELS or image.shape[2] in _CHANNELS):
-        raise ValueError(f"a picture is (3, H, W), (H, W, 3), grey or RGBA, got shape {tuple(image.shape)}")
-    if image.shape[2] in _CHANNELS and (image.shape[0] not in _CHANNELS or not isinstance(picture, Tensor)):
-        image = image.permute(2, 0, 1)
-    if image.dtype != torch.uint8 and not image.is_floating_point():
-        raise ValueError(f"a picture is uint8, or float in [0, 1], got {image.dtype}; convert it first")
-    return image.expand(3, -1, -1) if image.shape[0] == 1 else image[:3]
+    if image.ndim != 3:
+        raise ValueError(f"a picture is (3, H, W), (H, W, 3), grey or RGBA, got {_described(picture)}")
+    return _rgb(image, picture)
+
+
+def to_rgb_batch(pictures: Any) -> Tensor:
+    """A batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one.
+
+    Raises:
+        ValueError: as :func:`to_rgb_tensor`, and if listed pictures differ in size.
+    """
+    if is_picture(pictures):
+        return to_rgb_tensor(pictures)[None]
+    if isinstance(pictures, Sequence):
+        return stacked([to_rgb_tensor(picture) for picture in pictures])
+    image = _as_tensor(pictures)
+    if image.ndim != 4:
+        raise ValueError(f"a batch is (B, 3, H, W), (B, H, W, 3) or a list of pictures, got {_described(pictures)}")
+    return _rgb(image, pictures)
+
+
+def stacked(images: Sequence[Tensor]) -> Tensor:
+    """Pictures ``(3, H, W)`` to ``(B, 3, H, W)``; where only some are 8 bits, all become float32.
+
+    Raises:
+        ValueError: if their sizes differ, or there is none.
+    """
+    sizes = sorted({tuple(image.shape[-2:]) for image in images})
+    if len(sizes) != 1:
+        named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
+        raise ValueError(f"a batch has one size, got {named}; crop the pictures, as wrap(..., crop=256) does")
+    if len({image.dtype for image in images}) > 1:
+        images = [as_float(image) for image in images]
+    return torch.stack(list(images))
 
 
 def even_sided(image: Tensor) -> Tensor:
     """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2."""
     height, width = image.shape[-2:]
     return image[..., : height - height % 2, : width - width % 2]
+
+
+def is_picture(value: Any) -> bool:
+    """Whether ``value`` is one picture: a PIL picture, or a tensor or array with two or three axes."""
+    return value.ndim in (2, 3) if isinstance(value, (Tensor, np.ndarray)) else hasattr(value, "getbands")
+
+
+def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
+    """Where the picture (``batched``: the pictures) of a sample stands.
+
+    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first. A batch that is a list of
+    pictures is not taken apart.
+
+    Raises:
+        ValueError: if a mapping has no such key, or nothing could have it.
+    """
+    if isinstance(sample, Mapping):
+        if key not in sample:
+            names = ", ".join(map(str, sample))
+            raise ValueError(f"samples are mappings with the keys {names}; name the picture's with key=, got {key!r}")
+        return key
+    if isinstance(sample, (tuple, list)) and sample:
+        if batched and key is None and is_picture(sample[0]):
+            return None
+        where = key or 0
+        if not isinstance(where, int) or where >= len(sample):
+            raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
+        return where
+    if key is not None:
+        raise ValueError(
+            f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; leave key out"
+        )
+    return None
+
+
+def picked(sample: Any, where: Where) -> Any:
+    """What stands there."""
+    return sample if where is None else sample[where]
+
+
+def replaced(sample: Any, where: Where, value: Any) -> Any:
+    """The sample with ``value`` there, all else as it was; mappings become dicts."""
+    if where is None:
+        return value
+    if isinstance(sample, Mapping):
+        return {**sample, where: value}
+    fields = [value if index == where else field for index, field in enumerate(sample)]
+    if isinstance(sample, tuple):
+        return type(sample)(*fields) if hasattr(sample, "_fields") else tuple(fields)
+    return fields
+
+
+def _as_tensor(picture: Any) -> Tensor:
+    """Values as they are, in the type that PyTorch has for them."""
+    if isinstance(picture, Tensor):
+        return picture.as_subclass(Tensor)
+    if hasattr(picture, "getbands"):
+        if picture.mode not in _PIL_AS_RGB + _PIL_AS_IS:
+            raise ValueError(f"a PIL picture of mode {picture.mode!r} is not sRGB; convert it to RGB first")
+        picture = picture.convert("RGB") if picture.mode in _PIL_AS_RGB else picture
+    array = np.array(picture)
+    if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
+        raise ValueError(f"a picture is a tensor, a NumPy array or a PIL picture of numbers, got {_described(picture)}")
+    return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
+
+
+def _rgb(image: Tensor, original: Any) -> Tensor:
+    """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
+    first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
+    if not (first or last):
+        raise ValueError(f"a picture is (3, H, W), (H, W, 3), grey or RGBA, got {_described(original)}")
+    if last and not (first and isinstance(original, Tensor)):
+        image = image.movedim(-1, -3)
+    image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
+    if image.dtype == torch.uint8:
+        return image
+    if image.dtype == torch.uint16:
+        return image.float() / 65535.0
+    if not image.is_floating_point():
+        raise ValueError(f"a picture is uint8, uint16 or float in [0, 1], got {image.dtype}; convert it first")
+    _require_display_range(image)
+    return image.float()
+
+
+def _require_display_range(image: Tensor) -> None:
+    if image.device.type != "cpu" or not image.numel():
+        return
+    low, high = (float(value) for value in torch.aminmax(image))
+    if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
+        raise ValueError(
+            f"a float picture is in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
+        )
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, (Tensor, np.ndarray)):
+        return f"{type(value).__name__} of shape {tuple(value.shape)}, {value.dtype}"
+    return type(value).__name__

@@ -21,14 +21,26 @@ _XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [
 
 
 def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
-    """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1."""
+    """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1.
+
+    Raises:
+        ValueError: if X has no such M.
+    """
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ _XYZ_FROM_SRGB
+    if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
+        raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is no matrix from XYZ to a camera")
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
 
 
 def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
-    """Multipliers of R, G, B, green being 1."""
+    """Multipliers of R, G, B, green being 1.
+
+    Raises:
+        ValueError: if the neutral is not three positive numbers.
+    """
     red, green, blue = (float(value) for value in np.ravel(as_shot_neutral))
+    if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
+        raise ValueError(f"AsShotNeutral {red:g}, {green:g}, {blue:g} is not positive")
     return green / red, 1.0, green / blue
 
 

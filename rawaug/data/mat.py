@@ -16,6 +16,10 @@ import numpy as np
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
+_DAMAGE = (
+    *(ArithmeticError, AttributeError, LookupError, MemoryError, NameError, OSError, RuntimeError),
+    *(TypeError, ValueError),
+)
 
 
 def mat_version(path: str | Path) -> str:
@@ -97,7 +101,7 @@ def _damage_told(path: Path) -> Iterator[None]:
         yield
     except _Missing:
         raise
-    except (OSError, MatReadError, zlib.error, ValueError, TypeError, KeyError, RuntimeError, MemoryError) as error:
+    except (*_DAMAGE, MatReadError, zlib.error) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise OSError(f"{path}: cannot be read as a MATLAB file ({reason}); copy it again") from error
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.data.captured_noise import measured_levels
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,13 @@ class Pair:
             raise ValueError(f"pair {self.name}: color_matrix is (3, 3), got {tuple(self.color_matrix.shape)}")
         if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
             raise ValueError(f"pair {self.name}: shot_var and read_var come together, and with a noisy mosaic")
+
+    def with_levels(self) -> Pair:
+        """This pair; the levels of a noisy capture that came without are measured against ``raw``."""
+        if self.noisy is None or self.shot_var is not None:
+            return self
+        shot_var, read_var = measured_levels(self.raw, self.noisy)
+        return replace(self, shot_var=shot_var, read_var=read_var)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])

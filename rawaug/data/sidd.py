@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import turn_back
-from rawaug.data.captured_noise import captured_noise
+from rawaug.data.captured_noise import measured_levels
 from rawaug.data.colour import color_matrix, rendered, white_balance
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array, read_value
@@ -32,7 +32,6 @@ from rawaug.io import read_picture
 from rawaug.io.pictures import view_of_orientation
 
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
-_MEASURED_SITES = 2**20
 
 
 class SiddFrames(LazyPairs):
@@ -83,7 +82,7 @@ class SiddFrames(LazyPairs):
             srgb = _even(turn_back(read_picture(files["GT_SRGB"]), view))
         else:
             srgb = rendered(clean, scene.cfa, gains, matrix)
-        shot_var, read_var = self.levels.get(scene.name) or _measured(clean, noisy)
+        shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
         return Pair(
             name=self.names[index],
             srgb=srgb.contiguous(),
@@ -110,7 +109,7 @@ def mosaic_of(file: Path) -> Tensor:
 
 def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
     """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
-    if values.ndim != axes or values.dtype.kind != "f":
+    if values.ndim != axes or values.dtype.kind != "f" or not values.size:
         raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floating point, {axes} axes")
     low, high = float(values.min()), float(values.max())
     if not (low > -1 and high <= 1):
@@ -176,13 +175,8 @@ def colour_of(file: Path) -> Colour:
     try:
         gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
         return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
-    except (KeyError, TypeError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{file}: tells no AsShotNeutral and ColorMatrix2 ({error}); get the file again") from error
-
-
-def _measured(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
-    step = max(1, clean.numel() // _MEASURED_SITES) | 1  # odd, so that all four sites of the cell take part
-    return captured_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
 
 
 def _even(image: Tensor) -> Tensor:

@@ -1,14 +1,15 @@
 """PSNR and SSIM of an ISP or a denoiser, image by image.
 
 An ISP's PSNR_r is the mean over non-overlapping 256 x 256 mosaic patches of reconstruction against RAW. A denoiser's
-PSNR_d and SSIM are taken on the whole mosaic, on frozen noise: the captured one, or one keyed by (seed, name).
+PSNR_d and SSIM are taken on the whole mosaic, on frozen noise: the captured one, or one keyed by (seed, name); and once
+more on sRGB, after one fixed development (:func:`rawaug.experiment.report.developed`) of result and clean frame alike.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,32 +21,41 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 import denoisers
+from denoisers.classical import Classical, Stabilised
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Pair
+from rawaug.experiment.reconstruction import psnr_r
+from rawaug.experiment.report import METRICS, developed, exposure_of
 from rawaug.experiment.stream import Sample, aligned
 from rawaug.isp.model import DictionaryISP, find_weights
-from rawaug.isp.samples import block_averages
-from rawaug.metrics import patch_psnr, psnr, ssim, worst_and_best_quarter
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.metrics import psnr, ssim, worst_and_best_quarter
+from rawaug.noise import NoiseModel, noise_model, stabilise
 from rawaug.seeding import keyed_generator
 
 TILE = 256
 """Side in packed pixels of the pieces in which large frames are denoised."""
 
+Method = Callable[[Pair, Sample], Tensor]
+"""Denoises the packed RAW of a sample; what it may know of the pair are the levels of the noise."""
+
 
 @dataclass(frozen=True)
 class Score:
-    """Of one image."""
+    """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input."""
 
     name: str
     psnr: float
     ssim: float | None = None
+    psnr_srgb: float | None = None
+    ssim_srgb: float | None = None
     psnr_noisy: float | None = None
     ssim_noisy: float | None = None
+    psnr_srgb_noisy: float | None = None
+    ssim_srgb_noisy: float | None = None
 
 
 def read_header(path: str | Path) -> dict[str, str]:
@@ -68,6 +78,7 @@ def read_header(path: str | Path) -> dict[str, str]:
 
 def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
     """The frame as a test case ``(1, 4, h, w)``: its own captured noise, or noise keyed by (seed, name)."""
+    pair = pair.with_levels()
     clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
     if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
         noisy = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa)
@@ -79,57 +90,55 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
 
 @torch.no_grad()
 def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised, in tiles where it is large, as the mean of eight views on request."""
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, maybe as a mean of views.
+
+    Returns:
+        The same shape, on the CPU.
+    """
     run: Any = model
     if max(sample.noisy.shape[-2:]) > TILE + 64:
         run = partial(denoisers.tiled, model, tile=TILE, overlap=32)
     if self_ensemble:
         run = denoisers.SelfEnsemble(run, cfa, views=8)
-    denoised: Tensor = run(sample.noisy, sample.variance)
-    return denoised
+    device = next(model.parameters()).device
+    denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
+    return denoised.cpu()
+
+
+def score_method(
+    method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
+) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
+    """Scores of every frame, with what was compared; one frame in memory at a time."""
+    for pair in tqdm(pairs, desc=label, unit="image", leave=False):
+        sample = frozen_sample(pair, noise, cfa, seed)
+        denoised = method(pair, sample)
+        values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
+        yield Score(pair.name, *values), pair, sample, denoised
 
 
 def score_denoiser(
     model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, self_ensemble: bool, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
-    """Scores of every frame, with what was compared; one frame in memory at a time."""
-    for pair in tqdm(pairs, desc=label, unit="image", leave=False):
-        sample = frozen_sample(pair, noise, cfa, seed)
-        denoised = denoise(model, sample, cfa, self_ensemble)
-        clean, noisy, restored = (bayer.unpack(x, cfa) for x in (sample.clean, sample.noisy, denoised))
-        values = (psnr(restored, clean), ssim(restored, clean), psnr(noisy, clean), ssim(noisy, clean))
-        yield Score(pair.name, *(value.item() for value in values)), pair, sample, denoised
+    """:func:`score_method` of a network."""
+    return score_method(lambda _, sample: denoise(model, sample, cfa, self_ensemble), pairs, noise, cfa, seed, label)
 
 
-@torch.no_grad()
-def score_isp(isp: DictionaryISP, pair: Pair, white_balance: bool = False) -> Score:
-    """PSNR_r of one frame; of an unregistered pair at the resolution of block averages."""
-    given = pair.white_balance if white_balance else None
-    if pair.registered:
-        raw = isp_mosaic(isp, pair, given)
-        return Score(pair.name, patch_psnr(raw, pair.raw[None]).item())
-    low_srgb, low_raw, clipped = block_averages(pair.srgb, pair.raw, pair.cfa)
-    params = isp.condition(isp.choose(low_srgb[None]), given, None)
-    error = (isp.reverse_pixels(low_srgb[None], params)[0] - low_raw) ** 2
-    return Score(pair.name, -10.0 * error[:, ~clipped].mean().log10().item())
-
-
-def isp_mosaic(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> Tensor:
-    """The reconstructed mosaic ``(1, 1, H, W)`` in the pattern of the pair, strip by strip to bound memory."""
-    from rawaug.isp.stages import place_in_frame
-
-    params = isp.condition(isp.choose(pair.srgb[None]), white_balance, None)
-    height, width = pair.raw.shape[-2:]
-    strips = []
-    for top in range(0, height, 256):
-        strip = pair.srgb[None, :, top : top + 256].float() / 255.0
-        place = place_in_frame(strip.shape[-2], width, (top, 0), (height, width))
-        strips.append(bayer.mosaic(isp.reverse_pixels(strip, params, place), pair.cfa))
-    return torch.cat(strips, dim=-2)
+def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float, float, float, float]:
+    """PSNR and SSIM on the mosaic and on sRGB of packed RAW ``(1, 4, h, w)`` against the clean one."""
+    exposure = exposure_of(clean, pair)
+    raw = [bayer.unpack(x, cfa) for x in (packed, clean)]
+    srgb = [developed(x, cfa, pair, exposure)[None] for x in (packed, clean)]
+    return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
 def evaluate(
-    weights: str | Path, data: str, self_ensemble: bool = False, noise: str | None = None, seed: int = 0
+    weights: str | Path,
+    data: str,
+    self_ensemble: bool = False,
+    noise: str | None = None,
+    seed: int = 0,
+    classical: Sequence[str] = (),
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
@@ -139,36 +148,96 @@ def evaluate(
         self_ensemble: average a denoiser over eight views.
         noise: preset for frames without a noisy capture; by default the one that the denoiser was trained with.
         seed: of that noise.
+        classical: classical denoisers to score beside it on the same noise, see :data:`CLASSICAL`.
+        device: where the denoiser runs.
     """
+    require_classical(classical)
     weights = find_weights(weights)
     kind = read_header(weights)["kind"]
     result: dict[str, Any] = {"kind": kind, "data": data}
     pairs = open_pairs(data, split="test")
     if kind == "isp":
         isp = DictionaryISP.from_pretrained(weights)
-        scores = [score_isp(isp, pair) for pair in tqdm(pairs, desc="evaluate", unit="image", leave=False)]
+        scores = [
+            Score(pair.name, psnr_r(isp, pair)) for pair in tqdm(pairs, desc="evaluate", unit="image", leave=False)
+        ]
     else:
         model, info = denoisers.load(weights)
         levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
         cfa = CFA(info.get("cfa", "RGGB"))
-        scored = score_denoiser(model, pairs, levels, cfa, seed, self_ensemble, "evaluate")
+        scored = score_denoiser(model.to(device), pairs, levels, cfa, seed, self_ensemble, "evaluate")
         scores = [score for score, *_ in scored]
         result |= {"self_ensemble": self_ensemble, "seed": seed}
+        if classical:
+            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
     return {**result, **summary(scores), "weights_sha256": digest, "version": __version__}
 
 
+CLASSICAL: dict[str, Callable[[], Classical]] = {
+    "NonLocalMeans": denoisers.NonLocalMeans,
+    "Wavelet": denoisers.Wavelet,
+    "TotalVariation": denoisers.TotalVariation,
+    "BM3D": denoisers.BM3D,
+}
+"""By name; BM3D needs a wheel of its own."""
+
+
+def require_classical(names: Sequence[str]) -> None:
+    """Refuse a name that is no classical denoiser's.
+
+    Raises:
+        ValueError: naming those there are.
+    """
+    for name in names:
+        if name not in CLASSICAL:
+            raise ValueError(f"classical: {name} is unknown; there are {', '.join(CLASSICAL)}")
+
+
+def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
+    """A classical denoiser as something to score; shot noise is stabilised before and after."""
+    require_classical([name])
+    denoiser = CLASSICAL[name]()
+
+    def method(pair: Pair, sample: Sample) -> Tensor:
+        levels = frozen_levels(pair, noise, seed)
+        if levels is None or not levels[0] > 0:
+            return denoiser(sample.noisy, sample.variance)
+        shot_var, read_var = (torch.tensor([level]) for level in levels)
+        return Stabilised(denoiser, stabilise)(sample.noisy, shot_var=shot_var, read_var=read_var)
+
+    return method
+
+
+def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, float] | None:
+    """(shot_var, read_var) of what :func:`frozen_sample` gives; None if the noise is of another kind."""
+    pair = pair.with_levels()
+    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
+        return pair.shot_var, pair.read_var
+    params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
+    return (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+
+
+def score_classical(
+    names: Sequence[str], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
+) -> dict[str, dict[str, Any]]:
+    """The summary of each classical denoiser, by name."""
+    methods = {name: classical_method(name, noise, seed) for name in names}
+    return {
+        name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
+        for name, method in methods.items()
+    }
+
+
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
-    """Per image and mean; what does not apply is left out."""
-    values = [score.psnr for score in scores]
-    worst, best = worst_and_best_quarter(values)
-    images = [{k: v for k, v in vars(s).items() if v is not None and not k.endswith("noisy")} for s in scores]
-    result: dict[str, Any] = {"images": images, "psnr": sum(values) / len(values)}
-    result |= {"psnr_worst25": worst, "psnr_best25": best}
-    for key in ("ssim", "psnr_noisy", "ssim_noisy"):
-        known = [getattr(s, key) for s in scores if getattr(s, key) is not None]
+    """Per image, mean, worst and best 25%; what does not apply is left out."""
+    images = [{key: value for key, value in vars(score).items() if value is not None} for score in scores]
+    result: dict[str, Any] = {"images": images}
+    for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
+        known = [value for score in scores if (value := getattr(score, key)) is not None]
         if known:
             result[key] = sum(known) / len(known)
+            result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
     return result
 
 

@@ -10,9 +10,12 @@ from typing import Any, Literal
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.pairs import Pair
 from rawaug.experiment.camera_noise import as_info, measure_camera_noise
+from rawaug.experiment.reconstruction import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import plot_noise
+
+WATCHED_PATCHES = 4
 
 
 def fit(
@@ -21,17 +24,24 @@ def fit(
     noise: Literal["auto", "on", "off"] = "auto",
     dark: str | Path | None = None,
     noise_figure: str | Path | None = None,
+    camera_jpeg: bool = True,
+    held_out: str | Path | Sequence[Pair] | None = None,
+    state: str | Path | None = None,
     **settings: Any,
 ) -> DictionaryISP:
     """Fit a camera of one's own.
 
     Args:
-        source: a RAW file, a folder of them, a list of files, ``kind:path`` of a known dataset, or pairs.
+        source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
         noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" goes on
             without where the frames do not show them, and says why in ``isp.info["noise_not_measured"]``.
         dark: folder of dark frames, which then tell the read variance.
         noise_figure: where to draw the measured points and the line.
+        camera_jpeg: take the camera's JPEG of the same stem for the sRGB; False takes LibRaw's rendering always.
+        held_out: frames that the fit does not see; their PSNR_r while it runs goes to the progress bar and into
+            ``isp.info["held_out"]``.
+        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Raises:
@@ -42,9 +52,13 @@ def fit(
         >>> isp.info["frames"][0]
         'train_00_astronaut'
     """
-    pairs = _pairs(source)
     start = time.perf_counter()
-    isp = fit_isp(pairs, FitConfig(**settings), progress)
+    pairs = _pairs(source, camera_jpeg)
+    watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
+    isp = fit_isp(pairs, FitConfig(**settings), progress, state, watch)
+    if watch is not None:
+        watch(isp)
+        isp.info["held_out"] = watch.scores
     if noise != "off":
         try:
             estimate = measure_camera_noise(pairs, dark)
@@ -60,9 +74,33 @@ def fit(
     return isp
 
 
-def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair]) -> Sequence[Pair]:
+class _Watch:
+    """PSNR_r of frames that the fit does not see, on a few patches of each."""
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = list(pairs)
+        self.scores: list[dict[str, float]] = []
+
+    def __call__(self, isp: DictionaryISP) -> str:
+        blind, given = (
+            sum(psnr_r(isp, pair, white_balance, WATCHED_PATCHES) for pair in self.pairs) / len(self.pairs)
+            for white_balance in (False, True)
+        )
+        self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
+        return f"held out {blind:.2f} dB, {given:.2f} with its gains"
+
+
+def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
-        return open_pairs(str(source), split="train")
+        source = [source]
     if len(source) and isinstance(source[0], Pair):
         return list(source)  # type: ignore[arg-type]
-    return RawFolder(source)  # type: ignore[arg-type]
+    opened = [open_pairs(str(item), split="train") for item in source]
+    if len(opened) == 1 and not isinstance(opened[0], RawFolder):
+        return opened[0]
+    files: list[Path] = []
+    for item, pairs in zip(source, opened, strict=True):
+        if not isinstance(pairs, RawFolder):
+            raise ValueError(f"{item}: a known dataset is fitted alone; name it without other files")
+        files += pairs.files
+    return RawFolder(files, camera_jpeg=camera_jpeg)

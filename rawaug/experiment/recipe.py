@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -15,18 +15,21 @@ class DataConfig:
     """Where pictures come from.
 
     Args:
-        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``.
+        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null if there are none.
         count: how many of them are used; all if null.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
-        validation: pairs on which training is watched.
+        validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
+            watches it on RAW made from the pictures.
         test: pairs on which the result is measured; no stage sees them before.
+        test_count: how many of them are used; all if null.
     """
 
-    pairs: str = "demo:train"
+    pairs: str | None = "demo:train"
     count: int | None = None
     pictures: str = "demo:"
-    validation: str = "demo:validation"
+    validation: str | None = "demo:validation"
     test: str = "demo:test"
+    test_count: int | None = None
 
 
 @dataclass
@@ -87,11 +90,20 @@ class ArmConfig:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
         sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
         strength: of ``perturb``.
+        estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
+            :mod:`rawaug.experiment.estimators`.
+        alpha: of noisier and r2r: strength of the extra noise.
+        correct: of noisier: extrapolate the result, which takes its bias away.
+        gamma: of neighbor2neighbor: weight of its second term.
     """
 
     augmented: float = 0.0
     sampling: Literal["convex", "perturb", "chosen"] = "convex"
     strength: float = 0.1
+    estimator: Literal["supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"] = "supervised"
+    alpha: float = 1.0
+    correct: bool = False
+    gamma: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
@@ -106,11 +118,15 @@ class Recipe:
         name: of the folder in ``out`` that it writes.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        noise: preset of what is added to clean RAW, in training and where a test frame has no noisy capture.
+        camera: an ISP that is taken as it is, the name of a shipped one or a file; null fits one to ``data.pairs``.
+        noise: preset of what is added to clean RAW, in training and where a test frame has no noisy capture; "camera":
+            the levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
         train: the loop.
-        arms: by name, what is compared.
+        arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
+        classical: classical denoisers to compare with, such as Wavelet; see :mod:`denoisers.classical`.
         seed: of the first run.
+        steps: optimiser steps, in place of ``train.steps``.
         seeds: how many runs, with seeds ``seed``, ``seed + 1``, ...; more than one gives mean and spread.
         device: auto, cpu, cuda, ...: Fabric's accelerator.
         devices: how many of them.
@@ -120,10 +136,13 @@ class Recipe:
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
+    camera: str | None = None
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
+    classical: list[str] = field(default_factory=list)
+    steps: int | None = None
     seed: int = 0
     seeds: int = 1
     device: str = "auto"
@@ -135,6 +154,43 @@ class Recipe:
             raise ValueError("arms: a recipe compares at least one way of training")
         if self.seeds < 1:
             raise ValueError(f"seeds is at least 1, got {self.seeds}")
+        if self.steps is not None:
+            self.train = replace(self.train, steps=self.steps)
+        if self.data.pairs is None and self.camera is None:
+            raise ValueError("data.pairs: an ISP is fitted to pairs; give some, or camera: universal")
+        if self.data.pairs is None and any(arm.augmented < 1.0 for arm in self.arms.values()):
+            raise ValueError("data.pairs: without real pairs every arm has augmented: 1")
+        supervised = [arm.estimator == "supervised" for arm in self.arms.values()]
+        if any(supervised) and not all(supervised):
+            raise ValueError("arms: supervised and self-supervised do not mix, since these must see no clean frame")
+
+    @property
+    def self_supervised(self) -> bool:
+        """Whether noisy frames are all that may be seen."""
+        return all(arm.estimator != "supervised" for arm in self.arms.values())
+
+
+def smoke(recipe: Recipe) -> Recipe:
+    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
+    tiny = {"UNet": {"width": 4, "scales": 2}, "DHDN": {"width": 4}, "DnCNN": {"width": 8, "depth": 3}}
+    name = recipe.denoiser.name
+    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
+    return replace(
+        recipe,
+        name=f"{Path(recipe.name).name}-smoke",
+        data=replace(
+            DataConfig(count=1, test_count=1),
+            pairs=recipe.data.pairs and "demo:train",
+            validation=recipe.data.validation and "demo:validation",
+        ),
+        isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
+        denoiser=DenoiserConfig(name, tiny.get(name, {})),
+        train=replace(few, loss=recipe.train.loss),
+        steps=None,
+        seeds=1,
+        device="cpu",
+        devices=1,
+    )
 
 
 def find_recipe(name: str) -> Path:
@@ -142,14 +198,18 @@ def find_recipe(name: str) -> Path:
 
     Raises:
         FileNotFoundError: naming those there are.
+
+    Example:
+        >>> find_recipe("sidd/fewshot").name
+        'fewshot.yaml'
     """
     path = Path(name)
     if path.is_file():
         return path
     shipped = Path(str(resources.files("rawaug"))) / "recipes"
     folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
-    candidate = folder / f"{path.stem}.yaml"
-    if path.parent == Path() and candidate.is_file():
-        return candidate
-    known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-    raise FileNotFoundError(f"{name}: no such recipe file, and none of the shipped recipes ({known})")
+    known = {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
+    wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
+    if wanted in known:
+        return known[wanted]
+    raise FileNotFoundError(f"{name}: no such recipe file, and none of the shipped recipes ({', '.join(known)})")

@@ -39,6 +39,10 @@ def exposure_of(packed: Tensor, pair: Pair) -> float:
     return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
 
 
+METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
+"""Of an image: on the mosaic, and developed."""
+
+
 @dataclass
 class Row:
     """One frame of the picture: packed panels by title, the clean one last, with their captions."""
@@ -80,28 +84,62 @@ def mean_and_spread(values: Sequence[float], digits: int) -> str:
     return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
 
-def print_table(results: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> None:
-    """Arms x (PSNR, SSIM), plain and self-ensemble; one entry a seed in every arm's list."""
+COLUMNS = {
+    "PSNR (dB)": ("plain", "psnr"),
+    "SSIM": ("plain", "ssim"),
+    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
+    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
+    "PSNR, sRGB": ("plain", "psnr_srgb"),
+    "SSIM, sRGB": ("plain", "ssim_srgb"),
+}
+"""Of the table: which summary and which figure stand in each column."""
+
+QUARTERS = {
+    f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")
+    for figure, key in (
+        ("PSNR (dB)", "psnr"),
+        ("SSIM", "ssim"),
+        ("PSNR, sRGB", "psnr_srgb"),
+        ("SSIM, sRGB", "ssim_srgb"),
+    )
+    for part in ("worst 25%", "best 25%")
+}
+"""Of the second table of the page."""
+
+Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+
+
+def table_rows(
+    results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Mapping[str, tuple[str, str]]
+) -> dict[str, list[str]]:
+    """Cells by method: the noisy input, classical denoisers, the arms; empty where a figure does not apply."""
+    plain = next(iter(results.values()))[0]["plain"]
+    noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
+    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": noisy}]}
+    methods |= {name: [{"plain": scores}] for name, scores in (classical or {}).items()}
+    methods |= results
+    rows = {}
+    for method, runs in methods.items():
+        cells = []
+        for kind, key in columns.values():
+            values = [run[kind][key] for run in runs if key in run.get(kind, {})]
+            cells.append(mean_and_spread(values, 2 if "psnr" in key else 4) if values else "")
+        rows[method] = cells
+    return rows
+
+
+def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=title)
-    for column in ("arm", "PSNR (dB)", "SSIM", "PSNR, self-ensemble", "SSIM, self-ensemble"):
-        table.add_column(column, justify="left" if column == "arm" else "right")
-    first = next(iter(results.values()))
-    noisy = [mean_and_spread([r["plain"][key] for r in first], digits) for key, digits in _NOISY]
-    table.add_row("noisy input", *noisy, "", "")
-    for arm, runs in results.items():
-        cells = [
-            mean_and_spread([run[kind][key] for run in runs], digits)
-            for kind in ("plain", "self_ensemble")
-            for key, digits in (("psnr", 2), ("ssim", 4))
-        ]
-        table.add_row(arm, *cells)
-    Console(width=100).print(table)
-
-
-_NOISY = (("psnr_noisy", 2), ("ssim_noisy", 4))
+    table.add_column("arm")
+    for column in COLUMNS:
+        table.add_column(column, justify="right")
+    for method, cells in table_rows(results, classical, COLUMNS).items():
+        table.add_row(method, *cells)
+    Console(width=110).print(table)
 
 
 def print_scores(result: Mapping[str, Any]) -> None:
@@ -113,17 +151,21 @@ def print_scores(result: Mapping[str, Any]) -> None:
     table = Table(title=f"{title}: {result['data']}")
     table.add_column("image")
     table.add_column("PSNR (dB)", justify="right")
-    table.add_column("SSIM", justify="right")
+    for column in ("SSIM", "PSNR, sRGB", "SSIM, sRGB") if result["kind"] == "denoiser" else ():
+        table.add_column(column, justify="right")
+    metrics = METRICS[: len(table.columns) - 1]
     for image in result["images"]:
-        table.add_row(image["name"], f"{image['psnr']:.2f}", f"{image['ssim']:.4f}" if "ssim" in image else "")
+        table.add_row(image["name"], *_cells(image, "{}", metrics))
     table.add_section()
-    for label, key in (
-        ("mean", "psnr"),
-        ("worst 25%", "psnr_worst25"),
-        ("best 25%", "psnr_best25"),
-        ("noisy", "psnr_noisy"),
-    ):
-        if key in result:
-            similarity = {"psnr": "ssim", "psnr_noisy": "ssim_noisy"}.get(key, "")
-            table.add_row(label, f"{result[key]:.2f}", f"{result[similarity]:.4f}" if similarity in result else "")
+    shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
+    for label, key in shown.items():
+        if key.format("psnr") in result:
+            table.add_row(label, *_cells(result, key, metrics))
+    for name, scores in result.get("classical", {}).items():
+        table.add_row(name, *_cells(scores, "{}", metrics))
     Console(width=100).print(table)
+
+
+def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:
+    found = [(metric, result.get(key.format(metric))) for metric in metrics]
+    return ["" if value is None else f"{value:.{2 if 'psnr' in metric else 4}f}" for metric, value in found]

@@ -13,27 +13,41 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 import denoisers
 from denoisers.network import Denoiser
-from rawaug.augment import RawAugment, RawPairs, noise_for
+from rawaug.augment import noise_for
+from rawaug.bayer import CFA
 from rawaug.data import RawFolder, open_pairs, open_pictures
+from rawaug.data.lazy import LazyPairs
 from rawaug.data.pairs import Pair
-from rawaug.experiment.evaluate import frozen_sample, score_denoiser, summary, write_json
+from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
+from rawaug.experiment.evaluate import require_classical, score_classical, score_denoiser, summary, write_json
 from rawaug.experiment.fitting import fit
+from rawaug.experiment.noisy_frames import noisy_only
+from rawaug.experiment.page import Page, draw_curves
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.report import Row, draw, print_table
-from rawaug.experiment.stream import RealCrops, TrainingStream
 from rawaug.experiment.train import train
-from rawaug.isp.model import DictionaryISP
+from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.noise import NoiseModel
-from rawaug.seeding import derived_seed
 
 SHOWN = 3
 """Test frames in the picture."""
 
+ON_PAGE = 12
+"""Test frames on the page at most."""
 
-def run(recipe: Recipe) -> dict[str, list[dict[str, Any]]]:
-    """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``."""
+Results = dict[str, list[dict[str, Any]]]
+"""By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
+
+
+def run(recipe: Recipe) -> Results:
+    """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``.
+
+    Of several processes (``devices``) the first one writes; the others return empty lists.
+    """
     return _Run(recipe).all_stages()
 
 
@@ -43,38 +57,44 @@ class _Run:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.data = recipe, recipe.data
         self.folder = Path(recipe.out) / recipe.name
-        self.test = open_pairs(self.data.test)
-        self.validation = open_pairs(self.data.validation, split="validation")
-        source = open_pairs(self.data.pairs, split="train")
+        require_classical(recipe.classical)
+        self.test = _first(open_pairs(self.data.test), self.data.test_count)
+        source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
+        self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
         _require_unseen(self.test, {"pairs": source, "validation": self.validation})
-        self.pictures = open_pictures(self.data.pictures)
+        self.pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
         self.pairs = list(source[: self.data.count])
-        self.cfa = self.pairs[0].cfa
+        if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+            self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
 
-    def all_stages(self) -> dict[str, list[dict[str, Any]]]:
+    def all_stages(self) -> Results:
         recipe = self.recipe
-        results: dict[str, list[dict[str, Any]]] = {arm: [] for arm in recipe.arms}
+        results: Results = {arm: [] for arm in recipe.arms}
         models: dict[str, Denoiser] = {}
         for seed in range(recipe.seed, recipe.seed + recipe.seeds):
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
             for arm in recipe.arms:
                 models[arm] = self.trained(arm, isp, noise, seed)
-                results[arm].append(self.evaluated(arm, models[arm], noise, seed))
-        table = self.folder / "results.json"
-        write_json({"recipe": asdict(recipe), "results": results}, table)
-        picture = draw(self.rows(models, noise), self.cfa, self.folder / "picture.png")
-        settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
-        print_table(results, f"{recipe.name}: {settings}, tested on {self.data.test}")
-        print(f"table: {table}\npicture: {picture}")
+                if _leads():
+                    results[arm].append(self.evaluated(arm, models[arm], noise, isp.cfa, seed))
+        if not _leads():
+            return results
+        classical = score_classical(recipe.classical, self.test, noise, isp.cfa, seed=0)
+        self.reported(results, classical, models, noise, isp.cfa)
         return results
 
     def fitted_isp(self, seed: int) -> DictionaryISP:
-        """The ISP of the few pairs."""
+        """The ISP of the few pairs, or the recipe's own."""
+        if self.recipe.camera is not None:
+            weights = find_weights(self.recipe.camera)
+            isp = DictionaryISP.from_pretrained(weights)
+            isp.info["key"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
         settings = {**asdict(self.recipe.isp), "seed": seed}
         measure = self.recipe.noise == "camera"
-        key = _key("isp", settings, [pair.name for pair in self.pairs], measure)
+        key = fingerprint("isp", settings, [pair.name for pair in self.pairs], measure, self.recipe.self_supervised)
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
@@ -90,60 +110,105 @@ class _Run:
         recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
         path = place / "denoiser.safetensors"
         config, network = recipe.train, recipe.denoiser
-        key = _key(
-            isp.info["key"], asdict(recipe.arms[arm]), asdict(config), asdict(network), recipe.noise, asdict(self.data)
-        )
+        parts = (recipe.arms[arm], config, network, self.data)
+        key = fingerprint(isp.info["key"], recipe.noise, *(asdict(part) for part in parts))
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
                 print(f"trained already: {path}")
                 return model
         _discard_other_checkpoint(place, key)
-        validation = [frozen_sample(pair, noise, self.cfa, seed=0) for pair in self.validation]
-        stream, label = self.stream(arm, isp, noise, seed), f"seed {seed}, {arm}"
-        model = train(stream, validation, network, config, place, seed, recipe.device, recipe.devices, label)
+        stream = training_stream(recipe, recipe.arms[arm], self.pairs, self.pictures, isp, noise, seed)
+        validation = validation_samples(recipe, self.validation, self.pictures, isp, noise)
+        label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
+        model = train(stream, validation, network, config, place, seed, recipe.device, recipe.devices, label, estimator)
+        if not _leads():
+            return model
         levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
-        info = {"key": key, "cfa": str(self.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
         denoisers.save(model, path, info)
         (place / "last.pt").unlink(missing_ok=True)
         return model
 
-    def stream(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> TrainingStream:
-        """The training samples of one arm."""
-        config, settings = self.recipe.train, self.recipe.arms[arm]
-        real = RealCrops(self.pairs, noise, config.crop, self.cfa)
-        augmented = None
-        if settings.augmented:
-            augment = RawAugment(isp, noise, settings.sampling, settings.strength)
-            augmented = RawPairs(self.pictures, augment, config.crop)
-        return TrainingStream(real, augmented, config.batch, settings.augmented, derived_seed(seed, "stream"))
-
-    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, seed: int) -> dict[str, Any]:
+    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
+        place = self.folder / f"seed{seed}" / arm
+        digest = hashlib.sha256((place / "denoiser.safetensors").read_bytes()).hexdigest()
+        key = fingerprint(digest, self.data.test, sorted(_identities(self.test)))
+        path = place / "evaluation.json"
+        if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
+            print(f"evaluated already: {path}")
+            return {kind: known[kind] for kind in ("plain", "self_ensemble")}
         result: dict[str, Any] = {}
+        model.to(_device(self.recipe.device))
         for kind in ("plain", "self_ensemble"):
             label, ensemble = f"evaluate {arm}, {kind}", kind == "self_ensemble"
-            scored = score_denoiser(model, self.test, noise, self.cfa, 0, ensemble, label)
+            scored = score_denoiser(model, self.test, noise, cfa, 0, ensemble, label)
             result[kind] = summary([score for score, *_ in scored])
-        write_json(result, self.folder / f"seed{seed}" / arm / "evaluation.json")
+        write_json({"key": key, **result}, path)
         return result
 
-    def rows(self, models: dict[str, Denoiser], noise: NoiseModel) -> list[Row]:
-        """Panels of the first test frames with the last seed's models."""
-        rows: list[Row] = []
-        for pair in list(self.test[:SHOWN]):
-            row = Row(pair, {}, {})
-            for arm, model in models.items():
-                scored = score_denoiser(model, [pair], noise, self.cfa, 0, False, f"picture, {arm}")
-                score, _, sample, denoised = next(scored)
-                row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
-                row.panels[arm] = denoised
-                row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", arm: f"{score.psnr:.2f} dB"}
-            row.panels["clean"] = sample.clean
-            row.captions["clean"] = pair.name
-            rows.append(row)
-        return rows
+    def reported(
+        self,
+        results: Results,
+        classical: dict[str, dict[str, Any]],
+        models: dict[str, Denoiser],
+        noise: NoiseModel,
+        cfa: CFA,
+    ) -> None:
+        """``results.json``, the table, the picture, and the page with all of it."""
+        recipe = self.recipe
+        everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
+        write_json(everything, self.folder / "results.json")
+        settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
+        title = f"{recipe.name}: {settings}, tested on {self.data.test}"
+        page, shown = Page(title, results, classical), []
+        seeds = range(recipe.seed, recipe.seed + recipe.seeds)
+        page.add_curves(
+            draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
+        )
+        for model in models.values():
+            model.to(_device(recipe.device))
+        count = min(ON_PAGE, len(self.test))
+        for k in range(count):
+            row = self.row(self.test[k * len(self.test) // count], models, noise, cfa)
+            page.add_frame(row, cfa)
+            shown += [row] if k < SHOWN else []
+        picture = draw(shown, cfa, self.folder / "picture.png")
+        written = page.write(self.folder / "report.html", asdict(recipe))
+        print_table(results, title, classical)
+        print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
+
+    def row(self, pair: Pair, models: dict[str, Denoiser], noise: NoiseModel, cfa: CFA) -> Row:
+        """Panels of a test frame with the last seed's models."""
+        row = Row(pair, {}, {})
+        for arm, model in models.items():
+            score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, 0, False, f"picture, {arm}"))
+            row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
+            row.panels[arm] = denoised
+            row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", arm: f"{score.psnr:.2f} dB"}
+        row.panels["clean"] = sample.clean
+        row.captions["clean"] = pair.name
+        return row
+
+
+def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
+    return pairs if count is None else pairs[:count]
+
+
+def _leads() -> bool:
+    """Whether this is the one of several training processes that writes and evaluates."""
+    from lightning_fabric.utilities.rank_zero import rank_zero_only
+
+    return getattr(rank_zero_only, "rank", 0) == 0
+
+
+def _device(accelerator: str) -> torch.device:
+    """Where Fabric would put a network."""
+    from lightning_fabric import Fabric
+
+    return Fabric(accelerator=accelerator, devices=1).device
 
 
 def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:
@@ -159,10 +224,12 @@ def _identities(pairs: Sequence[Pair]) -> set[str]:
     """What tells frames apart without reading them: the path of a file, else the name."""
     if isinstance(pairs, RawFolder):
         return {str(file.resolve()) for file in pairs.files}
+    if isinstance(pairs, LazyPairs):
+        return set(pairs.names)
     return {pair.name for pair in pairs}
 
 
-def _key(*settings: Any) -> str:
+def fingerprint(*settings: Any) -> str:
     """A fingerprint of settings: equal if and only if the stage would do the same."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
 

@@ -1,6 +1,6 @@
 """The training loop: one denoiser, one stream of samples, one page.
 
-``theta <- Adam(grad loss(net(noisy, variance; theta), clean))`` with a warm-up, a cosine and a running average of the
+``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
 weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or several processes (``torchrun``).
 """
 
@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
+from rawaug.experiment.estimators import Supervised
 from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
 from rawaug.experiment.stream import Sample, StepSampler, TrainingStream
 from rawaug.metrics import psnr
@@ -43,78 +44,76 @@ def train(
     device: str = "auto",
     devices: int = 1,
     label: str = "train",
+    estimator: Supervised | None = None,
 ) -> Denoiser:
     """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
 
     Args:
         stream: keyed samples.
-        validation: frozen noisy-clean crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
+        validation: frozen crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
         network, config: what is trained, and how.
         folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
         seed: of the network's start.
         device, devices: Fabric's accelerator and number of devices.
         label: heads the progress bar.
+        estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
 
     Returns:
         The network with the averaged weights of the best validation, in eval mode, on the CPU.
     """
     from lightning_fabric import Fabric
-    from torch.utils.tensorboard.writer import SummaryWriter
 
+    estimator = estimator or Supervised()
     fabric = Fabric(accelerator=device, devices=devices, precision=config.precision)
     fabric.launch()
     folder.mkdir(parents=True, exist_ok=True)
-    settings = {"seed": derived_seed(seed, "network") % 2**31, **network.settings}
-    net = denoisers.build(network.name, **settings)
-    average = torch.optim.swa_utils.AveragedModel(
-        net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
-    )
+    net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
+    ema = torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
+    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=ema)
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
     start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
 
-    memory_format = torch.channels_last if config.channels_last else torch.contiguous_format
-    model, optimiser = fabric.setup(net.to(memory_format=memory_format), optimiser)  # type: ignore[call-overload]
-    step_model = torch.compile(model) if config.compile else model
-    average.to(fabric.device)
+    layout = torch.channels_last if config.channels_last else torch.contiguous_format
+    model, optimiser = fabric.setup(net.to(memory_format=layout), optimiser)  # type: ignore[call-overload]
+    step_model: Any = torch.compile(model) if config.compile else model
+    trained: Any = average.to(fabric.device).module
     sampler = StepSampler(start, config.steps, stream.batch, fabric.global_rank, fabric.world_size)
-    loader = DataLoader(
-        stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=fabric.device.type == "cuda"
-    )
-    loss_function = LOSSES[config.loss]
-    writer = SummaryWriter(str(folder)) if fabric.is_global_zero else None
+    pinned = fabric.device.type == "cuda"
+    loader = DataLoader(stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=pinned)
+    journal = Journal(folder, start) if fabric.is_global_zero else None
     began = time.perf_counter()
 
-    bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=not fabric.is_global_zero)
+    bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=journal is None)
     for step, batch in enumerate(bar, start=start + 1):
-        noisy, clean, variance = (x.to(fabric.device, memory_format=memory_format) for x in batch)
-        loss = loss_function(step_model(noisy, variance), clean)
+        sample = type(batch)(*(x.to(fabric.device, memory_format=layout) for x in batch))
+        loss = estimator.loss(step_model, sample, LOSSES[config.loss], step / config.steps)
         optimiser.zero_grad(set_to_none=True)
         fabric.backward(loss)
         if config.clip_norm:
             fabric.clip_gradients(model, optimiser, max_norm=config.clip_norm)
         optimiser.step()
         schedule.step()
-        average.update_parameters(net) if config.ema else average.module.load_state_dict(net.state_dict())
+        average.update_parameters(net) if config.ema else trained.load_state_dict(net.state_dict())
 
         if step % config.validate_every == 0 or step == config.steps:
-            score = validate(average.module, validation, fabric.device)
+            score = validate(estimator.corrected(trained), validation, fabric.device)
             if score > best["psnr"]:
-                best = {"psnr": score, "step": step, "net": copy.deepcopy(average.module.state_dict())}
-            if writer is not None:
+                best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
+            mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
+            if journal is not None:
                 rate = (step - start) * stream.batch / (time.perf_counter() - began)
-                log(folder / "log.csv", writer, step, loss=loss.item(), psnr=score, samples_per_second=rate)
-        if fabric.is_global_zero and (step % config.checkpoint_every == 0 or step == config.steps):
-            state = {"net": net.state_dict(), "average": average.state_dict(), "optimiser": optimiser.state_dict()}
-            write_atomically(
-                {**state, "schedule": schedule.state_dict(), "step": step, "best": best}, folder / "last.pt"
-            )
+                journal.log(step, loss=mean_loss, psnr=score, samples_per_second=rate)
+        if journal is not None and (step % config.checkpoint_every == 0 or step == config.steps):
+            parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
+            state = {key: part.state_dict() for key, part in parts.items()}
+            write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
         bar.set_postfix_str(f"loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}", refresh=False)
-    if writer is not None:
-        writer.close()
-    average.module.load_state_dict(best["net"])
-    trained = average.module.cpu().to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    return trained.eval()
+    if journal is not None:
+        journal.close()
+    trained.load_state_dict(best["net"])
+    trained.cpu().to(memory_format=torch.contiguous_format)
+    return estimator.corrected(trained).eval()
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
@@ -151,13 +150,30 @@ def write_atomically(state: dict[str, Any], path: Path) -> None:
     partial.replace(path)
 
 
-def log(path: Path, writer: Any, step: int, **values: float) -> None:
-    """One row in the CSV file and one point in each TensorBoard curve."""
-    new = not path.is_file()
-    with path.open("a", newline="") as file:
-        rows = csv.writer(file)
-        if new:
-            rows.writerow(["step", *values])
-        rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
-    for name, value in values.items():
-        writer.add_scalar(name, value, step)
+class Journal:
+    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: what a killed run told beyond it is dropped."""
+
+    def __init__(self, folder: Path, start: int) -> None:
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        self.path = folder / "log.csv"
+        if self.path.is_file():
+            head, *rows = self.path.read_text().splitlines(keepends=True)
+            kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
+            self.path.write_text("".join([head, *kept]) if kept else "")
+        self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
+
+    def log(self, step: int, **values: float) -> None:
+        """One row in the CSV file and one point in each TensorBoard curve."""
+        new = not self.path.is_file() or self.path.stat().st_size == 0
+        with self.path.open("a", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            if new:
+                rows.writerow(["step", *values])
+            rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
+        for name, value in values.items():
+            self.writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self.writer.close()

@@ -13,7 +13,7 @@ from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages
+from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_told
 
 _DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
@@ -79,11 +79,14 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
 
     A DNG gives all tags of its first directory and of the mosaic's; another TIFF (NEF, CR2, ARW, ...), whose private
     tags mean something else, its description, author, XMP, EXIF and GPS.
+
+    Raises:
+        OSError: if the tags are damaged.
     """
     import tifffile
 
     try:
-        with tifffile.TiffFile(path) as tiff, path.open("rb") as file:
+        with damage_told(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
             dng = any(_DNG_VERSION in page.tags for page in pages)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from rawaug.bayer import CFA
 from rawaug.io.carried_tags import CarriedTags, Entry, Tag, append_directory, read_carried_tags
 from rawaug.io.gain_map import opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
+from rawaug.io.tiff_tags import damage_told
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
+_LARGEST = 2.0**31 - 2
 _CFA_PHOTOMETRIC = 32803
 _DNG_VERSION, _UNIQUE_CAMERA_MODEL = 50706, 50708
 _D65 = 21
@@ -46,6 +49,7 @@ def write_dng(
     Raises:
         ValueError: if a digital number or a level does not fit 16 bits, or the mosaic's sides are not even.
         FileNotFoundError: if the source or the folder does not exist.
+        OSError: if tags of the source are damaged.
 
     Example:
         >>> frame = read_raw("shot.cr2")  # doctest: +SKIP
@@ -62,7 +66,8 @@ def write_dng(
     tags = own | carried.tags | _tags_of_the_pixels(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
     partial = path.with_name(f"{path.name}.partial")
-    _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
+    with damage_told(Path(source)) if source is not None else nullcontext():
+        _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
     for name, entries in directories.items():
         append_directory(partial, name, entries)
     partial.replace(path)
@@ -107,8 +112,9 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
 
 def _camera(frame: RawFrame) -> dict[int, Tag]:
     make, _, model = frame.camera.partition(" ")
-    tags: list[Tag] = [(271, ASCII, 0, make, True), (272, ASCII, 0, model or make, True)]
-    return _by_code([*tags, (_UNIQUE_CAMERA_MODEL, ASCII, 0, frame.camera, True)])
+    names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
+    # tifffile takes text of 7 bits; DNG has UTF-8 in its place
+    return {code: (code, ASCII, 0, name if name.isascii() else name.encode(), True) for code, name in names.items()}
 
 
 def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
@@ -176,4 +182,11 @@ def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
 
 
 def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, ...]:
-    return tuple(number for value in values for number in (round(value * denominator), denominator))
+    """Numerators and denominators of 32 bits: what is large has a smaller denominator."""
+    numbers = []
+    for value in values:
+        if not abs(value) <= _LARGEST:
+            raise ValueError(f"{value:g} does not fit a DNG; check the frame's gains, matrix and exposure")
+        fits = min(denominator, int(_LARGEST / max(abs(value), 1)))
+        numbers += [round(value * fits), fits]
+    return tuple(numbers)

@@ -53,7 +53,7 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
     """The gain maps of an opcode list; its other opcodes are passed over.
 
     Raises:
-        ValueError: if the list ends in the middle of an opcode, or a grid is empty.
+        ValueError: if the list ends in the middle of an opcode, or a grid is empty or makes no sense.
     """
     maps = []
     try:
@@ -76,6 +76,9 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     if size == 0 or min(rows, columns) == 0 or len(body) < _GRID.size + 4 * size:
         raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is not whole")
     gains = np.frombuffer(body, ">f4", size, _GRID.size).reshape(points_v, points_h, map_planes)
+    spaced = all(spacing > 0 for spacing, points in zip(grid[:2], (points_v, points_h), strict=True) if points > 1)
+    if not (spaced and np.isfinite(grid).all() and np.isfinite(gains).all() and gains.min() > 0):
+        raise ValueError(f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and least gain {gains.min():g} is no map")
     return GainMap(
         area=(top, left, bottom, right),
         pitch=(rows, columns),

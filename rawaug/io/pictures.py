@@ -12,7 +12,8 @@ applied (see :mod:`rawaug.io.icc`); without one, a picture is taken to be sRGB w
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,8 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    pixels, orientation = _read(Path(path), max_pixels)
+    with _text_damage_told(Path(path)):
+        pixels, orientation = _read(Path(path), max_pixels)
     return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
 
 
@@ -78,7 +80,8 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         FileNotFoundError, OSError: as :func:`read_picture`.
         ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
     """
-    pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
+    with _text_damage_told(Path(path)):
+        pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
         raise ValueError(f"{path}: holds {pixels.dtype} in channels {names}; a mosaic is one channel of 8 or 16 bits")
@@ -106,6 +109,15 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
     if not (output.close() and written):
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_first_line(output.geterror())})")
+
+
+@contextmanager
+def _text_damage_told(path: Path) -> Iterator[None]:
+    """Texts of a damaged header that are no UTF-8 fail in OpenImageIO's binding."""
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
 
 
 def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:

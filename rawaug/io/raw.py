@@ -17,7 +17,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +26,14 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.io.gain_map import GainMap, gains_at_sites
+from rawaug.io.shot import UNKNOWN, Exposure, camera_of, exposure_of
 from rawaug.io.tiff_tags import TiffTags, read_tiff_tags
 
 XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
-_EXIF_MAKE, _EXIF_MODEL = 271, 272
 
 _developed_in: int | None = None
 """The process that last used LibRaw's OpenMP threads: they do not survive a fork."""
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """How a shot was taken; None where the file does not tell."""
-
-    seconds: float | None = None
-    f_number: float | None = None
-    focal_length: float | None = None
-    date: str | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +73,7 @@ class RawFrame:
     name: str
     color_known: bool = True
     gain_maps: tuple[GainMap, ...] = ()
-    exposure: Exposure = Exposure()
+    exposure: Exposure = UNKNOWN
 
     @property
     def shading_gains(self) -> Tensor:
@@ -176,6 +165,10 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
         raise OSError(
             f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and of a known camera"
         ) from error
+    except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
+        raise ValueError(f"{path}: holds no Bayer mosaic ({error}); only Bayer RAW can be used") from error
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
 
 
 def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
@@ -184,35 +177,27 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     black, white = _black(raw, cell, tags), float(raw.white_level)
     if white <= black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
-    matrix, color_known = _color_matrix(raw)
+    with np.errstate(all="raise"):
+        matrix, color_known = _color_matrix(raw)
+    white_balance = _white_balance(raw)
     other = getattr(raw, "other", None)  # rawpy tells since 0.27
     return RawFrame(
         mosaic=_normalised(raw.raw_image_visible, black, white),
         cfa=cfa,
         black=tuple(float(black[site]) for site in cfa.sites),  # type: ignore[arg-type]
         white=white,
-        white_balance=_white_balance(raw),
-        daylight=_green_is_1(raw.daylight_whitebalance if color_known else _white_balance(raw)),
+        white_balance=white_balance,
+        daylight=_green_is_1(raw.daylight_whitebalance if color_known else white_balance),
         color_matrix=torch.from_numpy(matrix).float(),
-        camera=_camera(raw, tags),
+        camera=camera_of(raw, tags),
         iso=float(getattr(other, "iso_speed", 0)) or None,
         noise_profile=tags.noise_profile,
         orientation=int(raw.sizes.flip),
         name=path.stem,
         color_known=color_known,
         gain_maps=tags.gain_maps,
-        exposure=_exposure(other),
+        exposure=exposure_of(raw),
     )
-
-
-def _exposure(other: Any) -> Exposure:
-    """LibRaw says 0 where it does not know, and 1970 of a date."""
-    seconds, f_number, focal_length = (
-        float(getattr(other, name, 0)) or None for name in ("shutter_speed", "aperture", "focal_length")
-    )
-    taken = getattr(other, "timestamp", None)
-    date = f"{taken:%Y:%m:%d %H:%M:%S}" if taken is not None and taken.year > 1970 else None
-    return Exposure(seconds, f_number, focal_length, date)
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
@@ -262,6 +247,8 @@ def _white_balance(raw: Any) -> tuple[float, float, float]:
 
 
 def _green_is_1(gains: Sequence[float]) -> tuple[float, float, float]:
+    if not all(0 < gain < np.inf for gain in gains[:3]):
+        raise ArithmeticError(f"multipliers {', '.join(f'{gain:g}' for gain in gains[:3])}")
     return float(gains[0] / gains[1]), 1.0, float(gains[2] / gains[1])
 
 
@@ -274,26 +261,3 @@ def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
     if not camera.any():
         return _TYPICAL_COLOR_MATRIX, False
     return np.linalg.inv(camera / camera.sum(axis=1, keepdims=True)), True
-
-
-def _camera(raw: Any, tags: TiffTags) -> str:
-    """Make and model, from the file's tags or from its thumbnail's EXIF."""
-    make, model = tags.make, tags.model
-    if not model:
-        make, model = _thumbnail_camera(raw)
-    make, model = (str(name or "").strip() for name in (make, model))
-    return (model if model.startswith(make) else f"{make} {model}") or "unknown"
-
-
-def _thumbnail_camera(raw: Any) -> tuple[str | None, str | None]:
-    import rawpy
-    from PIL import Image
-
-    try:
-        thumbnail = raw.extract_thumb()
-    except rawpy.LibRawError:
-        return None, None
-    if thumbnail.format != rawpy.ThumbFormat.JPEG:
-        return None, None
-    exif = Image.open(BytesIO(thumbnail.data)).getexif()
-    return exif.get(_EXIF_MAKE), exif.get(_EXIF_MODEL)

@@ -6,7 +6,9 @@ plane, with noise variance S y + O for a signal y whose black is 0 and white 1: 
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,10 @@ _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50715, 50716)
 _OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC = 32803
 _RATIONAL = 5
+_DAMAGE = (
+    *(ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError),
+    struct.error,
+)
 
 
 @dataclass(frozen=True)
@@ -47,21 +53,35 @@ def read_tiff_tags(path: Path) -> TiffTags:
     """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise.
 
     Raises:
-        ValueError: if an opcode list of a DNG is cut short.
+        OSError: if the tags are damaged.
     """
     import tifffile
 
     try:
-        with tifffile.TiffFile(path) as tiff:
+        with damage_told(path), tifffile.TiffFile(path) as tiff:
             pages = list(all_pages(tiff.pages))
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
                 return TiffTags(make, model)
             mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
-            black, maps = (_black(mosaics[0]), _gain_maps(mosaics[0], path)) if mosaics else (None, ())
+            black, maps = (_black(mosaics[0]), _gain_maps(mosaics[0])) if mosaics else (None, ())
             return TiffTags(make, model, _noise_profile(pages), _mosaic_end(mosaics), black, maps)
     except tifffile.TiffFileError:
         return TiffTags()
+
+
+@contextmanager
+def damage_told(path: Path) -> Iterator[None]:
+    """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
+    import tifffile
+
+    try:
+        yield
+    except (tifffile.TiffFileError, OSError):
+        raise
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{path}: its TIFF tags are damaged ({reason}); copy it again") from error
 
 
 def all_pages(pages: Any) -> Iterator[Any]:
@@ -75,8 +95,10 @@ def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
     for page in pages:
         values = page.tags.valueof(_NOISE_PROFILE)
         if values:
-            planes = len(values) // 2
-            return sum(values[0::2]) / planes, sum(values[1::2]) / planes
+            shot_var, read_var = (sum(values[k::2]) / (len(values) // 2) for k in (0, 1))
+            if not (0 <= shot_var <= 1 and 0 <= read_var <= 1):
+                raise ValueError(f"NoiseProfile {shot_var:g}, {read_var:g}")
+            return shot_var, read_var
     return None
 
 
@@ -93,7 +115,8 @@ def _black(mosaic: Any) -> tuple[float, float, float, float] | None:
         return None
     levels = np.ravel(tag.value).astype(np.float64)
     if tag.dtype == _RATIONAL:
-        levels = levels[0::2] / levels[1::2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            levels = levels[0::2] / levels[1::2]
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
     if len(levels) != rows * columns or 2 % rows or 2 % columns:
         return None
@@ -101,12 +124,12 @@ def _black(mosaic: Any) -> tuple[float, float, float, float] | None:
     return a, b, c, d
 
 
-def _gain_maps(mosaic: Any, path: Path) -> tuple[GainMap, ...]:
+def _gain_maps(mosaic: Any) -> tuple[GainMap, ...]:
     found: tuple[GainMap, ...] = ()
     for code in (_OPCODE_LIST_2, _OPCODE_LIST_3):
         opcodes = mosaic.tags.valueof(code)
         try:
             found += parse_gain_maps(opcodes, code == _OPCODE_LIST_2) if opcodes else ()
         except ValueError as error:
-            raise ValueError(f"{path}: OpcodeList{2 if code == _OPCODE_LIST_2 else 3}: {error}") from None
+            raise ValueError(f"OpcodeList{2 if code == _OPCODE_LIST_2 else 3}: {error}") from None
     return found

@@ -1,4 +1,4 @@
-r"""Dictionaries of camera parameters: atoms, the encoders that weigh them, and augmentation in their convex hull.
+r"""Dictionaries of camera parameters: atoms, and augmentation in their convex hull.
 
 ``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (non-negative, sum 1).
 
@@ -21,11 +21,28 @@ def l1_normalised(matrices: Tensor) -> Tensor:
 
 
 class ColourDictionary(nn.Module):
-    """N colour correction matrices, sRGB to camera, rows l1-normalised."""
+    """N colour correction matrices, sRGB to camera, rows l1-normalised.
+
+    Each atom remembers the light that it was seen in, so that a known white balance can choose among them, as a DNG's
+    two illuminants do.
+
+    Attributes:
+        matrices: ``(N, 3, 3)``, normalised on use.
+        light: ``(N, 2)`` log of the as-shot red and blue multipliers over green.
+        neutral: ``(N, 3)`` log of what the channels' gains are beyond as-shot balance and matrix: the digital gain.
+        spread: width of the kernel in ``light``; infinite where the light tells nothing.
+    """
+
+    light: Tensor
+    neutral: Tensor
+    spread: Tensor
 
     def __init__(self, atoms: int) -> None:
         super().__init__()
         self.matrices = nn.Parameter(torch.eye(3).repeat(atoms, 1, 1))
+        self.register_buffer("light", torch.zeros(atoms, 2))
+        self.register_buffer("neutral", torch.zeros(atoms, 3))
+        self.register_buffer("spread", torch.tensor(torch.inf))
 
     def atoms(self) -> Tensor:
         """``(N, 3, 3)``, rows of l1 norm 1."""
@@ -34,6 +51,20 @@ class ColourDictionary(nn.Module):
     def combine(self, weights: Tensor) -> Tensor:
         """Weights ``(B, N)`` to matrices ``(B, 3, 3)``."""
         return torch.einsum("bn,nij->bij", weights, self.atoms())
+
+    def weights_for(self, white_balance: Tensor) -> Tensor:
+        """Weights ``(B, N)`` of the atoms seen in such light, given as-shot multipliers ``(B, 3)``."""
+        distance = (log_light(white_balance)[:, None] - self.light) ** 2
+        return torch.softmax(-distance.sum(2) / (2.0 * self.spread**2), dim=1)
+
+    def gains_for(self, white_balance: Tensor, weights: Tensor) -> Tensor:
+        """Channel gains ``(B, 3)`` under which grey becomes ``1 / white_balance``, times the digital gain."""
+        return white_balance * (weights @ self.neutral).exp() * self.combine(weights).sum(2)
+
+
+def log_light(white_balance: Tensor) -> Tensor:
+    """Log of the red and blue multipliers over green, ``(B, 3)`` to ``(B, 2)``."""
+    return (white_balance[:, 0::2] / white_balance[:, 1:2]).log()
 
 
 class GainDictionary(nn.Module):
@@ -58,39 +89,6 @@ class GainDictionary(nn.Module):
     def combine(self, weights: Tensor) -> Tensor:
         """Weights ``(B, M)`` to channel gains ``(B, 3)``."""
         return 1.0 / (weights @ (1.0 / self.channel_gains()))
-
-
-class Encoder(nn.Module):
-    """Chooses the weights of N atoms from the N images that the atoms make of one picture.
-
-    A learned constant plus three strided convolutions on a thumbnail, averaged, to N logits, softmax. With
-    ``enabled=False`` the picture is not looked at and the constant decides alone.
-    """
-
-    def __init__(self, atoms: int, widths: tuple[int, int, int]) -> None:
-        super().__init__()
-        self.enabled = False
-        self.prior = nn.Parameter(torch.zeros(atoms))
-        channels = (3 * atoms, *widths)
-        layers: list[nn.Module] = []
-        for i in range(3):
-            layers += [nn.Conv2d(channels[i], channels[i + 1], 3, stride=2, padding=1), nn.ReLU()]
-        head = nn.Linear(widths[-1], atoms)
-        nn.init.zeros_(head.weight)
-        nn.init.zeros_(head.bias)
-        self.layers = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), head)
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Images ``(B, N, 3, h, w)`` to weights ``(B, N)`` on the simplex."""
-        logits = self.prior.expand(len(images), -1)
-        if self.enabled:
-            logits = logits + self.layers(images.flatten(1, 2))
-        return logits.softmax(dim=1)
-
-    @torch.no_grad()
-    def set_prior(self, weights: Tensor) -> None:
-        """Make the constant ``weights`` ``(N,)`` (zeros become 1e-6)."""
-        self.prior.copy_(weights.clamp_min(1e-6).log())
 
 
 def project_to_simplex(weights: Tensor) -> Tensor:

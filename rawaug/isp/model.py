@@ -9,24 +9,21 @@ Source: Conde et al., "Model-Based Image Signal Processors via Learnable Diction
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp import stages
-from rawaug.isp.dictionary import ColourDictionary, Encoder, GainDictionary
+from rawaug.isp import conditioning, stages
+from rawaug.isp.dictionary import ColourDictionary, GainDictionary
+from rawaug.isp.encoder import Encoder, thumbnail
 from rawaug.isp.params import POINTWISE_STAGES, ISPConfig, ISPParams, Pass
-
-THUMBNAIL = 64
-"""Longest side of what an encoder looks at."""
 
 WEIGHTS_DIR = Path(__file__).parents[1] / "weights"
 
@@ -63,17 +60,20 @@ class DictionaryISP(nn.Module):
         self.reverse_networks = DirectionNetworks(self.config)
         self.forward_networks = DirectionNetworks(self.config)
         self.use_encoders(self.config.encoders)
-        self.neutral_gains: Tensor
-        self.register_buffer("neutral_gains", torch.ones(3))
-        """Channel gains of a shot whose as-shot white balance is (1, 1, 1): the digital gain, channel by channel."""
 
     @property
     def cfa(self) -> CFA:
         """The pattern of the RAW that this ISP makes."""
         return CFA(self.config.cfa)
 
+    @property
+    def encoders_in_use(self) -> bool:
+        """Whether the encoders look at the picture."""
+        return self.reverse_networks.colour_encoder.enabled
+
     def use_encoders(self, enabled: bool) -> None:
-        """Let the encoders look at the picture, or use their learned constants."""
+        """Let the encoders look at the picture, or use their learned constants; goes into the file."""
+        self.config = replace(self.config, encoders=enabled)
         for networks in (self.reverse_networks, self.forward_networks):
             networks.colour_encoder.enabled = networks.gain_encoder.enabled = enabled
 
@@ -87,7 +87,7 @@ class DictionaryISP(nn.Module):
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
         networks = self.reverse_networks
-        x2 = self._linear(thumbnail(as_float(srgb)))
+        x2 = self._linear(thumbnail(stages.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
         colour_weights = networks.colour_encoder(candidates)
         x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
@@ -104,25 +104,6 @@ class DictionaryISP(nn.Module):
         x3 = stages.apply_gains(small, self.gain.combine(gain_weights))
         candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
         return self.params_from_weights(networks.colour_encoder(candidates), gain_weights)
-
-    def condition(
-        self, params: ISPParams, white_balance: Tensor | tuple[float, ...] | None, digital_gain: Tensor | float | None
-    ) -> ISPParams:
-        """Put the camera's own gains in place of the chosen ones.
-
-        Args:
-            params: chosen parameters.
-            white_balance: as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``, as the file tells them.
-            digital_gain: a further factor on all channels, scalar or ``(B,)``; the fit's own by default.
-        """
-        gains = params.gains
-        if white_balance is not None:
-            balance = torch.as_tensor(white_balance, dtype=gains.dtype, device=gains.device)
-            gains = (balance * self.neutral_gains).expand_as(gains)
-        if digital_gain is not None:
-            digital = torch.as_tensor(digital_gain, dtype=gains.dtype, device=gains.device).reshape(-1, 1)
-            gains = gains / gains[:, 1:2] * digital
-        return params._replace(gains=gains)
 
     # -- passes -----------------------------------------------------------------------------------------------------
 
@@ -142,8 +123,10 @@ class DictionaryISP(nn.Module):
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: camera setting; chosen by the encoders (or their constants) if not given.
-            white_balance, digital_gain: the camera's own gains, see :meth:`condition`.
-            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings.
+            white_balance: the camera's as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``; they choose the colour atoms of such light as well.
+            digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
+            raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
+                (:func:`rawaug.isp.conditioning.on_samples`).
             place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
                 (:func:`rawaug.isp.stages.place_in_frame`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
@@ -156,10 +139,10 @@ class DictionaryISP(nn.Module):
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3:
             raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
-        x = as_float(srgb)
-        params = self.condition(params or self.choose(x), white_balance, digital_gain)
+        x = stages.as_float(srgb)
+        params = conditioning.on_gains(self, params or self.choose(x), white_balance, digital_gain)
         if raw_samples is not None:
-            params = self.solve_gains(x, params, raw_samples, place)
+            params = conditioning.on_samples(self, x, params, raw_samples, self.place(x, place))
         seen: dict[str, Tensor] = {}
         x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
         return Pass(bayer.mosaic(x5, self.cfa), params, seen)
@@ -179,7 +162,7 @@ class DictionaryISP(nn.Module):
             elif name == "gains":
                 x = stages.inverse_gains(x, params.gains, self.config.knee)
             else:
-                x = x * self.shading(self._place(x, place))
+                x = x * self.shading(self.place(x, place))
                 x = x * networks.attention(x) if self.config.attention else x
             if seen is not None:
                 seen[f"x{POINTWISE_STAGES.index(name) + 1}"] = x
@@ -199,7 +182,7 @@ class DictionaryISP(nn.Module):
         if params is None:
             x4 = self._correct_shading(x5, place) if "shading" in self.config.stages else x5
             params = self.choose_forward(x4)
-        params = self.condition(params, white_balance, None)
+        params = conditioning.on_gains(self, params, white_balance, None)
         seen: dict[str, Tensor] = {"x5": x5}
         srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
         return Pass(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
@@ -225,33 +208,17 @@ class DictionaryISP(nn.Module):
                 seen[f"x{number}"] = x
         return x
 
-    def solve_gains(self, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor | None = None) -> ISPParams:
-        """Least-squares gains from a few RAW readings ``(B, K, 3)`` of (row, column, value), channel by channel.
-
-        Readings at or above 0.98 (clipped) are left out; a channel without any reading keeps its chosen gain.
-        """
-        rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
-        value = raw_samples[..., 2]
-        batch = torch.arange(len(x), device=x.device)[:, None]
-        unit = params._replace(gains=torch.ones_like(params.gains))
-        where = self._place(x, place).expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
-        x5 = self.reverse_pixels(x[batch, :, rows, columns].transpose(1, 2)[:, :, None], unit, where)[:, :, 0]
-        channel = torch.tensor(self.cfa.channels, device=x.device)[rows % 2, columns % 2]
-        own = F.one_hot(channel, 3).transpose(1, 2) * (value < 0.98)[:, None]
-        numerator, denominator = (own * x5 * x5).sum(2), (own * x5 * value[:, None]).sum(2)
-        solved = numerator / denominator.clamp_min(stages.EPS)
-        return params._replace(gains=torch.where(denominator > stages.EPS, solved, params.gains))
-
     def _linear(self, x: Tensor) -> Tensor:
         if "tone" in self.config.stages:
             x = self.reverse_networks.tone(x)
         return stages.gamma_expand(x, self.reverse_networks.gamma) if "gamma" in self.config.stages else x
 
     def _correct_shading(self, x5: Tensor, place: Tensor | None) -> Tensor:
-        x = x5 / self.shading(self._place(x5, place))
+        x = x5 / self.shading(self.place(x5, place))
         return x * self.forward_networks.attention(x) if self.config.attention else x
 
-    def _place(self, x: Tensor, place: Tensor | None) -> Tensor:
+    def place(self, x: Tensor, place: Tensor | None = None) -> Tensor:
+        """``place``, or that of a full frame, in the type of ``x``."""
         return (stages.place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
 
     # -- files ------------------------------------------------------------------------------------------------------
@@ -283,11 +250,22 @@ class DictionaryISP(nn.Module):
             raise ValueError(f"{path}: not a readable safetensors file ({error}); fit or copy it again") from error
         if header.get("kind") != "isp":
             raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
-        settings: dict[str, Any] = json.loads(header["config"])
-        settings = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
-        isp = cls(ISPConfig(**settings))
+        try:
+            settings: dict[str, Any] = json.loads(header["config"])
+            settings = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
+            config = ISPConfig(**settings)
+            info = dict(json.loads(header.get("info", "{}")))
+            with torch.device("meta"):  # takes no memory before the tensors are known to fit
+                expected = cls(config).state_dict()
+        except (AttributeError, LookupError, OverflowError, RuntimeError, TypeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{path}: its configuration is damaged ({reason}); fit or copy it again") from error
+        shapes, needed = ({key: value.shape for key, value in tensors.items()} for tensors in (state, expected))
+        if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
+            raise ValueError(f"{path}: tensor {wrong[0]} does not fit its configuration; fit or copy it again")
+        isp = cls(config)
         isp.load_state_dict(state)
-        isp.info = json.loads(header.get("info", "{}"))
+        isp.info = info
         return isp.eval()
 
 
@@ -302,15 +280,3 @@ def find_weights(name: str | Path) -> Path:
         shipped = ", ".join(sorted(p.stem for p in WEIGHTS_DIR.glob("*.safetensors")))
         raise FileNotFoundError(f"{name}: no such weights; give a .safetensors file or a shipped ISP ({shipped})")
     return path
-
-
-def as_float(srgb: Tensor) -> Tensor:
-    """uint8 to float32 in [0, 1]; floats pass."""
-    return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
-
-
-def thumbnail(image: Tensor) -> Tensor:
-    """``(B, 3, H, W)`` averaged down to at most :data:`THUMBNAIL` a side."""
-    height, width = image.shape[-2:]
-    scale = THUMBNAIL / max(height, width, THUMBNAIL)
-    return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))

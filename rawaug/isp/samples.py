@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.stages import place_in_frame
+from rawaug.isp.encoder import thumbnail
+from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.seeding import keyed_generator
 
 CLIPPED_SRGB = 0.98
@@ -42,7 +43,25 @@ class FramePair(Protocol):
     @property
     def white_balance(self) -> tuple[float, float, float]: ...
     @property
+    def camera(self) -> str: ...
+    @property
     def registered(self) -> bool: ...
+
+
+class Shot(NamedTuple):
+    """What is kept of a frame besides its pixels.
+
+    Args:
+        srgb, raw: thumbnails ``(1, 3, h, w)``, the longer side :data:`rawaug.isp.encoder.THUMBNAIL` at most; the RAW is
+            not white-balanced.
+    """
+
+    name: str
+    camera: str
+    cfa: CFA
+    white_balance: tuple[float, float, float]
+    srgb: Tensor
+    raw: Tensor
 
 
 class PixelSamples(NamedTuple):
@@ -50,7 +69,8 @@ class PixelSamples(NamedTuple):
 
     Args:
         srgb: ``(F, 3, 1, P)`` in [0, 1].
-        target: ``(F, 3, 1, P)`` RAW readings where ``known``.
+        target: ``(F, 3, 1, P)`` RAW readings, 0 where the mosaic has another colour.
+        site: ``(F, 3, 1, P)`` 1 where there is a reading.
         known: ``(F, 3, 1, P)`` 1 where the reading is there and neither it nor the sRGB pixel is clipped, else 0.
         place: ``(F, 2, 1, P)`` coordinates in the full frame.
         cell_srgb, cell_raw: ``(F, 3, 1, P)`` averages over the cell.
@@ -59,41 +79,47 @@ class PixelSamples(NamedTuple):
 
     srgb: Tensor
     target: Tensor
+    site: Tensor
     known: Tensor
     place: Tensor
     cell_srgb: Tensor
     cell_raw: Tensor
     cell_weight: Tensor
 
-    def pick(self, index: Tensor) -> PixelSamples:
-        """The pixels ``index`` of every frame."""
-        return PixelSamples(*(value[..., index] for value in self))
+    def pick(self, index: Tensor, frames: Tensor | slice = slice(None)) -> PixelSamples:
+        """The pixels ``index`` of every frame, or of some."""
+        return PixelSamples(*(value[frames].index_select(-1, index) for value in self))
 
 
-def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> PixelSamples:
-    """Draw ``pixels`` a frame, keyed by ``seed`` and the frame's name.
+def sample_pixels(
+    pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False
+) -> tuple[PixelSamples, list[Shot]]:
+    """Draw ``pixels`` a frame, keyed by ``seed`` and the frame's name, and note what else the fit needs of the frames.
 
     Args:
-        pairs: frames; read one at a time.
+        pairs: frames; read one at a time, once.
         pixels: P; drawn with replacement.
         noisy: take the captured noisy RAW (and never the clean one).
 
     Raises:
         ValueError: if there is no pair, or a noisy RAW is asked for and absent.
     """
-    frames = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
-    if not frames:
+    drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
+    if not drawn:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
-    return PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True)))
+    frames, shots = zip(*drawn, strict=True)
+    return PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True))), list(shots)
 
 
-def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> PixelSamples:
+def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
     generator = keyed_generator(seed, "pixels", pair.name)
     draw = _sites if pair.registered else _blocks
-    return draw(pair.srgb, raw, pair.cfa, pixels, generator)
+    small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
+    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw)
+    return draw(pair.srgb, raw, pair.cfa, pixels, generator), shot
 
 
 def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
@@ -115,30 +141,75 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     unclipped = (corners.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
     weight = unclipped / (1.0 + (spread * 32.0) ** 2)
     place = place_in_frame(height, width)[0, :, row, column]
-    return _samples(pixel, reading * own, own * inside, place, corners.mean(0), cell_raw, weight)
+    return _samples(pixel, reading * own, own, own * inside, place, corners.mean(0), cell_raw, weight)
 
 
 def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
     """Averages over blocks, linear light: tolerant to a shift of a few pixels."""
-    low_srgb, low_raw, clipped = block_averages(srgb, raw, cfa)
-    height, width = low_raw.shape[-2:]
-    index = torch.randint(height * width, (pixels,), generator=generator)
-    pixel, reading = low_srgb.flatten(1)[:, index], low_raw.flatten(1)[:, index]
-    inside = ~clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
-    place = place_in_frame(height, width)[0].flatten(1)[:, index]
+    blocks = block_averages(srgb, raw, cfa)
+    index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
+    pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
+    inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
+    place = blocks.place[0].flatten(1)[:, index]
     known = inside.expand(3, -1).float()
-    return _samples(pixel, reading, known, place, pixel, reading, inside.float())
+    return _samples(pixel, reading, torch.ones_like(known), known, place, pixel, reading, inside.float())
 
 
-def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA, block: int = BLOCK) -> tuple[Tensor, Tensor, Tensor]:
-    """Average a pair over blocks: sRGB ``(3, h, w)`` (in linear light), RAW ``(3, h, w)``, any clipped ``(h, w)``."""
-    scale = 255.0 if srgb.dtype == torch.uint8 else 1.0
-    x = srgb.float() / scale
+class Blocks(NamedTuple):
+    """An unregistered pair, averaged over blocks.
+
+    Args:
+        srgb: ``(3, h, w)``, averaged in linear light.
+        raw: ``(3, h, w)``.
+        clipped: ``(h, w)`` whether any site of the block is.
+        place: ``(1, 2, h, w)`` in the full frame.
+    """
+
+    srgb: Tensor
+    raw: Tensor
+    clipped: Tensor
+    place: Tensor
+
+
+def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA, block: int = BLOCK) -> Blocks:
+    """Average a pair over blocks of the RAW and the blocks of the sRGB that show the same, their shift removed.
+
+    Args:
+        srgb, raw: ``(3, H, W)`` and ``(1, H, W)``.
+        cfa: of ``raw``.
+        block: side, even.
+    """
+    height, width = raw.shape[-2:]
+    dy, dx = find_shift(srgb, raw, cfa)
+    top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
+    rows, columns = (height - top - max(dy, 0)) // block * block, (width - left - max(dx, 0)) // block * block
+    window = raw[:, top : top + rows, left : left + columns]
+    x = as_float(srgb[:, top + dy : top + dy + rows, left + dx : left + dx + columns])
     low_srgb = F.avg_pool2d(x[None] ** 2.2, block)[0] ** (1 / 2.2)
-    planes = F.avg_pool2d(bayer.pack(raw, cfa)[None], block // 2)[0]
-    low_raw = torch.stack([planes[0], (planes[1] + planes[2]) / 2, planes[3]])
-    clipped = F.max_pool2d((raw >= CLIPPED_RAW).float()[None], block)[0, 0] > 0
-    return low_srgb, low_raw, clipped
+    low_raw = F.avg_pool2d(_colours(window, cfa)[None], block // 2)[0]
+    clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], block)[0, 0] > 0
+    place = place_in_frame(rows, columns, (top, left), (height, width))
+    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(place, block))
+
+
+def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
+    """How far, in pixels down and right, the sRGB of an unregistered pair lies from its RAW.
+
+    By phase correlation of the green, at half the resolution; the nearest integer to a quarter of a pixel there.
+    """
+    from skimage.registration import phase_cross_correlation
+
+    green = _colours(raw, cfa)[1].clamp_min(0.0).sqrt()
+    height, width = green.shape
+    picture = F.avg_pool2d(as_float(srgb[1:2, : 2 * height, : 2 * width])[None], 2)[0, 0]
+    shift, _, _ = phase_cross_correlation(picture.numpy(), green.numpy(), upsample_factor=4)
+    return round(2 * float(shift[0])), round(2 * float(shift[1]))
+
+
+def _colours(raw: Tensor, cfa: CFA) -> Tensor:
+    """Mosaic ``(1, H, W)`` to its cells' colours ``(3, H/2, W/2)``."""
+    planes = bayer.pack(raw, cfa)
+    return torch.stack([planes[0], (planes[1] + planes[2]) / 2, planes[3]])
 
 
 def _samples(*values: Tensor) -> PixelSamples:

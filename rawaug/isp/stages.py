@@ -30,6 +30,11 @@ HIGHLIGHT_KNEE = 0.9
 """Mean linear value above which Brooks' inverse gains bend towards 1."""
 
 
+def as_float(srgb: Tensor) -> Tensor:
+    """uint8 to float32 in [0, 1]; floats pass."""
+    return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
+
+
 class ToneNetwork(nn.Module):
     """f1: a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU, piecewise linear in colour.
 
@@ -48,6 +53,22 @@ class ToneNetwork(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
+
+    @torch.no_grad()
+    def start_from(self, toe: float) -> None:
+        """Start as ``x1 = x + toe (1 - x)``: with the gamma stage that is the curve of sRGB and of BT.709.
+
+        Three hidden features pass x through (it is not negative, so ReLU lets it), and the last layer adds the rest.
+        """
+        *hidden, last = (layer for layer in self.layers if isinstance(layer, nn.Conv2d))
+        through = torch.eye(3)[..., None, None]
+        for layer in hidden:
+            layer.weight[:3] = 0.0
+            layer.weight[:3, :3] = through
+            layer.get_parameter("bias")[:3] = 0.0
+        last.weight.zero_()
+        last.weight[:, :3] = -toe * through
+        last.get_parameter("bias").fill_(toe)
 
 
 def gamma_expand(x: Tensor, gamma: Tensor | float) -> Tensor:

@@ -8,7 +8,8 @@ white noise has the same variance in every coefficient and texture is strongest 
 whether a block is flat, high ones how noisy it is (Ponomarenko et al., "An automatic approach to lossy compression of
 AVIRIS images", 2007): as they are independent, the choice does not bias the measure. The first row and column are not
 used, so that banding does not count. Where the noise is not white, a codec has smoothed it or texture has entered, and
-the level is left out.
+the level is left out. A codec that quantises wavelet coefficients as coarsely as the noise itself can leave noise that
+is white and yet not the sensor's: ``read_var``, a small remainder in the shadows, is not to be trusted on such files.
 
 Signals are black-subtracted, white = 1. The variance that rounding to the sensor's grid adds (a twelfth of a squared
 step) is part of ``read_var``.

@@ -1,4 +1,4 @@
-"""The plugin: pairs that replay, keyed Datasets, wrapped loaders."""
+"""The augmentation: pairs that replay, and batches in the forms that people have."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset, TensorDataset
+from torch.utils.data import DataLoader, Dataset
 
-from rawaug.augment import RawAugment, RawPair, RawPairs, wrap
+from rawaug.augment import RawAugment
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPConfig
+from rawaug.params import AugmentParams, RawPair
 
 
 @pytest.fixture(scope="module")
@@ -31,27 +32,15 @@ def srgb() -> Tensor:
     return torch.randint(256, (3, 3, 16, 20), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
 
-class Pictures(Dataset[Tensor]):
-    """Six pictures of different sizes, some sides odd."""
-
-    def __len__(self) -> int:
-        return 6
-
-    def __getitem__(self, index: int) -> Tensor:
-        generator = torch.Generator().manual_seed(index)
-        return torch.randint(256, (3, 21 + index, 30 - index), generator=generator, dtype=torch.uint8)
-
-
 def assert_same(a: Any, b: Any) -> None:
-    if isinstance(a, Tensor):
-        assert torch.equal(a, b)
-    elif isinstance(a, dict):
-        assert a.keys() == b.keys()
-        for key in a:
-            assert_same(a[key], b[key])
+    if isinstance(a, RawPair):
+        assert all(torch.equal(x, y) for x, y in zip(a[:3], b[:3], strict=True))
+        assert_same(a.params, b.params)
     else:
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
+        assert isinstance(a, AugmentParams)
+        first, second = a.tensors(), b.tensors()
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[name], second[name]) for name in first)
 
 
 @pytest.mark.parametrize("sampling", ["convex", "perturb", "chosen"])
@@ -78,11 +67,7 @@ def test_draws_differ_but_a_seed_repeats_them(isp: DictionaryISP, srgb: Tensor) 
 
 def test_a_picture_does_not_depend_on_its_batch(augment: RawAugment, srgb: Tensor) -> None:
     pair = augment(srgb)
-    alone = pair.params._replace(
-        isp=type(pair.params.isp)(*(v[1:2] for v in pair.params.isp)),
-        noise={key: value[1:2] for key, value in pair.params.noise.items()},
-        place=pair.params.place[1:2],
-    )
+    alone = pair.params.map(lambda t: t[1:2])
     torch.testing.assert_close(augment.apply(srgb[1:2], alone).noisy, pair.noisy[1:2])
 
 
@@ -91,86 +76,85 @@ def test_unknown_sampling_is_refused(isp: DictionaryISP) -> None:
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
 
 
+def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
+    with pytest.raises(ValueError, match="3 pictures, the batch has 2"):
+        augment.apply(srgb[:2], augment.sample(srgb))
+
+
 def test_module_apply_still_visits_modules(augment: RawAugment) -> None:
     seen: list[nn.Module] = []
     nn.Sequential(augment).apply(seen.append)
     assert augment.isp in seen
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("batch", [1, 3])
-def test_pairs_are_keyed_by_seed_epoch_and_index(augment: RawAugment, workers: int, batch: int) -> None:
-    pairs = RawPairs(Pictures(), augment, crop=16, seed=7)
-    expected = [pairs[i].noisy for i in range(6)]
-    loader = DataLoader(pairs, batch_size=batch, num_workers=workers)
-    got = torch.cat([item.noisy for item in loader])
-    assert torch.equal(got, torch.stack(expected))
-
-
-def test_another_epoch_or_seed_is_another_draw(augment: RawAugment) -> None:
-    pairs = RawPairs(Pictures(), augment, crop=16, seed=7)
-    first = pairs[0].clean
-    pairs.set_epoch(1)
-    assert not torch.equal(pairs[0].clean, first)
-    pairs.set_epoch(0)
-    assert torch.equal(pairs[0].clean, first)
-    assert not torch.equal(RawPairs(Pictures(), augment, crop=16, seed=8)[0].clean, first)
-
-
-def test_persistent_workers_see_the_epoch(augment: RawAugment) -> None:
-    pairs = RawPairs(Pictures(), augment, crop=16)
-    loader = DataLoader(pairs, num_workers=1, persistent_workers=True)
-    first = next(iter(loader)).clean
-    pairs.set_epoch(1)
-    again = next(iter(loader)).clean
-    assert not torch.equal(first, again)
-    assert torch.equal(again[0], pairs[0].clean)
-
-
-@pytest.mark.parametrize("form", ["numpy", "pil", "grey", "rgba", "chw"])
-def test_what_datasets_yield_is_understood(augment: RawAugment, form: str) -> None:
-    array = np.random.default_rng(0).integers(256, size=(18, 24, 3), dtype=np.uint8)
+@pytest.mark.parametrize("form", ["nhwc", "numpy", "list", "pil list"])
+def test_a_batch_of_any_form_is_the_same(augment: RawAugment, srgb: Tensor, form: str) -> None:
+    nhwc = srgb.permute(0, 2, 3, 1)
     forms: dict[str, Any] = {
-        "numpy": array,
-        "pil": Image.fromarray(array),
-        "grey": array[..., 0],
-        "rgba": np.concatenate([array, np.full((18, 24, 1), 255, np.uint8)], axis=2),
-        "chw": torch.from_numpy(array).permute(2, 0, 1),
+        "nhwc": nhwc,
+        "numpy": nhwc.numpy(),
+        "list": list(srgb),
+        "pil list": [Image.fromarray(picture.numpy()) for picture in nhwc],
     }
-    clean = RawPairs([forms[form]], augment, crop=16)[0].clean
-    if form == "grey":
-        array = np.repeat(array[..., :1], 3, axis=2)
-    assert torch.equal(clean, RawPairs([array], augment, crop=16)[0].clean)
+    generator = torch.Generator()
+    expected = augment(srgb, generator.manual_seed(1))
+    assert_same(augment(forms[form], generator.manual_seed(1)), expected)
 
 
-def test_labels_and_fields_pass_through(augment: RawAugment) -> None:
-    picture = np.zeros((16, 16, 3), np.uint8)
-    pair, label = RawPairs([(picture, 3)], augment, crop=16)[0]
-    assert isinstance(pair, RawPair) and label == 3
-    sample = RawPairs([{"image": picture, "id": "x"}], augment, crop=16, key="image")[0]
-    assert isinstance(sample["image"], RawPair) and sample["id"] == "x"
-    with pytest.raises(ValueError, match="image, id"):
-        RawPairs([{"image": picture, "id": "x"}], augment, crop=16)[0]
+def test_fields_pass_and_keys_name_the_pictures(augment: RawAugment, srgb: Tensor) -> None:
+    pair, labels = augment([srgb, torch.arange(3)])
+    assert isinstance(pair, RawPair) and labels.tolist() == [0, 1, 2]
+    batch = augment({"image": srgb, "id": ["a", "b", "c"]}, key="image")
+    assert isinstance(batch["image"], RawPair) and batch["id"] == ["a", "b", "c"]
+    assert augment((labels, srgb), key=1)[1].noisy.shape == (3, 4, 8, 10)
 
 
-def test_small_pictures_and_odd_crops_are_refused(augment: RawAugment) -> None:
-    with pytest.raises(ValueError, match="picture 0 is 20 x 30"):
-        RawPairs(Pictures(), augment, crop=64)[0]
-    with pytest.raises(ValueError, match="even"):
-        RawPairs(Pictures(), augment, crop=15)
+def test_a_single_picture_makes_a_single_pair_that_replays(augment: RawAugment) -> None:
+    picture = Image.fromarray(np.random.default_rng(0).integers(256, size=(17, 21, 3), dtype=np.uint8))
+    pair = augment(picture)
+    assert pair.noisy.shape == (4, 8, 10) and pair.params.place.tolist() == [0, 0, 16, 20, 0]
+    assert_same(augment.apply(picture, pair.params), pair)
+    assert augment.sample(picture).place.shape == (5,)
 
 
-def test_whole_pictures_lose_their_odd_line(augment: RawAugment) -> None:
-    assert RawPairs(Pictures(), augment, crop=None)[0].noisy.shape == (4, 10, 15)
+@pytest.mark.parametrize("sampling", ["convex", "perturb"])
+def test_raw_stays_float32_in_mixed_precision(isp: DictionaryISP, srgb: Tensor, sampling: Any) -> None:
+    augment, generator = RawAugment(isp, sampling=sampling), torch.Generator()
+    expected = augment(srgb, generator.manual_seed(0))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_same(augment(srgb, generator.manual_seed(0)), expected)
 
 
-def test_wrapping_a_loader_is_one_line(augment: RawAugment, srgb: Tensor) -> None:
-    loader = DataLoader(TensorDataset(srgb, torch.arange(3)), batch_size=2)
-    wrapped = wrap(loader, augment)
-    batches = list(wrapped)
-    assert len(wrapped) == len(batches) == 2 and wrapped.batch_size == 2
-    pair, labels = batches[0]
-    assert pair.noisy.shape == (2, 4, 8, 10) and labels.tolist() == [0, 1]
+class Transformed(Dataset[Tensor]):
+    """One picture over and over, augmented in the worker by the module's own generator."""
+
+    def __init__(self, augment: RawAugment) -> None:
+        self.augment = augment
+
+    def __len__(self) -> int:
+        return 8
+
+    def __getitem__(self, index: int) -> Tensor:
+        pair: RawPair = self.augment(torch.full((3, 4, 4), 0.5))
+        return pair.noisy
+
+
+def test_workers_do_not_repeat_each_other_nor_the_last_epoch(augment: RawAugment) -> None:
+    loader = DataLoader(Transformed(augment), num_workers=2, generator=torch.Generator().manual_seed(0))
+    drawn = [noisy.flatten().tolist() for _ in range(2) for noisy in loader]
+    assert len({tuple(values) for values in drawn}) == 16
+
+
+@pytest.mark.parametrize("place", ["before", "inside"])
+def test_kornia_before_it_and_around_it(augment: RawAugment, srgb: Tensor, place: str) -> None:
+    from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
+
+    flip = RandomHorizontalFlip(p=1.0)
+    before = nn.Sequential(AugmentationSequential(flip, data_keys=["input"]), augment)
+    pipeline = before if place == "before" else AugmentationSequential(flip, augment, data_keys=["input"])
+    pair = pipeline(srgb / 255.0)
+    assert isinstance(pair, RawPair)
+    assert_same(augment.apply((srgb / 255.0).flip(-1), pair.params), pair)
 
 
 def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:

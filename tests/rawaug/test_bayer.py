@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rawaug import bayer
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, View
 
 cfas = st.sampled_from(list(CFA))
 views = st.integers(0, bayer.N_VIEWS - 1)
@@ -65,6 +65,87 @@ def test_turn_back_inverts_turn(view: int) -> None:
 def test_the_eight_views_differ() -> None:
     image = torch.arange(16.0).reshape(1, 4, 4)
     assert len({tuple(bayer.turn(image, view).flatten().tolist()) for view in range(bayer.N_VIEWS)}) == bayer.N_VIEWS
+
+
+@given(cfas, views, sides, sides)
+def test_packed_planes_turn_as_their_mosaic(cfa: CFA, view: int, height: int, width: int) -> None:
+    mosaic = torch.rand(1, height, width, generator=torch.Generator().manual_seed(view))
+    turned = bayer.turn_packed(bayer.pack(mosaic, cfa), view)
+    assert torch.equal(bayer.unpack(turned, cfa.turned(view)), bayer.turn(mosaic, view))
+
+
+def test_views_are_what_their_names_say() -> None:
+    image = torch.arange(24.0).reshape(1, 4, 6)
+    expected = {
+        View.IDENTITY: image,
+        View.MIRROR: image.flip(-1),
+        View.FLIP: image.flip(-2),
+        View.HALF_TURN: torch.rot90(image, 2, (-2, -1)),
+        View.TRANSPOSE: image.mT,
+        View.LEFT: torch.rot90(image, 1, (-2, -1)),
+        View.RIGHT: torch.rot90(image, -1, (-2, -1)),
+        View.ANTITRANSPOSE: torch.rot90(image.mT, 2, (-2, -1)),
+    }
+    for view in View:
+        assert torch.equal(bayer.turn(image, view), expected[view])
+
+
+seeds = st.integers(0, 2**32)
+
+
+@given(cfas, seeds, sides, sides, sides)
+def test_a_random_crop_keeps_the_pattern_and_replays(cfa: CFA, seed: int, size: int, more: int, width: int) -> None:
+    height = size + more
+    width = max(width, size)
+    noise = torch.rand(1, height, width, generator=torch.Generator().manual_seed(seed))
+    mosaic = torch.cat([colour_map(cfa, height, width), noise])
+    transform = bayer.RandomCrop(size)
+    params = transform.sample(height, width, torch.Generator().manual_seed(seed))
+    cropped = transform.apply(mosaic, params)
+    assert torch.equal(cropped[:1], colour_map(cfa, size, size))
+    top, left = params.tolist()
+    assert torch.equal(cropped[1:], mosaic[1:, top : top + size, left : left + size])  # all in the tensor alike
+    assert torch.equal(transform(mosaic, torch.Generator().manual_seed(seed)), cropped)
+
+
+@given(cfas, seeds, sides, sides, st.booleans(), st.booleans())
+def test_a_random_turn_keeps_the_pattern_unless_asked(
+    cfa: CFA, seed: int, height: int, width: int, keep: bool, quarter: bool
+) -> None:
+    transform = bayer.RandomTurn(cfa, keep_cfa=keep, quarter=quarter)
+    view = transform.sample(torch.Generator().manual_seed(seed))
+    assert quarter or view < 4
+    turned = transform.apply(colour_map(cfa, height, width), view)
+    assert torch.equal(turned, colour_map(cfa if keep else cfa.turned(int(view)), *turned.shape[-2:]))
+    assert torch.equal(transform(colour_map(cfa, height, width), torch.Generator().manual_seed(seed)), turned)
+
+
+@given(cfas, sides, sides)
+def test_packing_modules_are_the_functions(cfa: CFA, height: int, width: int) -> None:
+    mosaic = torch.rand(2, 1, height, width, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(bayer.Pack(cfa)(mosaic), bayer.pack(mosaic, cfa))
+    assert torch.equal(bayer.Unpack(cfa)(bayer.Pack(cfa)(mosaic)), mosaic)
+
+
+def test_random_crops_reach_every_place_and_turns_every_view() -> None:
+    generator = torch.Generator().manual_seed(0)
+    crop, turn = bayer.RandomCrop((2, 4)), bayer.RandomTurn("RGGB")
+    places = {tuple(crop.sample(6, 8, generator).tolist()) for _ in range(200)}
+    assert places == {(top, left) for top in (0, 2, 4) for left in (0, 2, 4)}
+    assert {int(turn.sample(generator)) for _ in range(200)} == set(range(bayer.N_VIEWS))
+
+
+def test_crops_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match="even"):
+        bayer.RandomCrop(5)
+    with pytest.raises(ValueError, match="6 x 8 is smaller than the crop 8 x 8"):
+        bayer.RandomCrop(8).sample(6, 8, torch.Generator())
+
+
+def test_transforms_are_modules_among_modules() -> None:
+    seen: list[torch.nn.Module] = []
+    torch.nn.Sequential(bayer.RandomTurn("RGGB"), bayer.Pack("RGGB")).apply(seen.append)
+    assert len(seen) == 3
 
 
 @given(cfas, cfas)

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.model import as_float
 from rawaug.isp.samples import FramePair
+from rawaug.isp.stages import as_float
 from rawaug.metrics import PATCH
 from rawaug.seeding import derived_seed
 

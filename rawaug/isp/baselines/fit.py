@@ -20,8 +20,8 @@ from tqdm.auto import tqdm
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, ReverseISP
 from rawaug.isp.baselines.upi_tuned import TunedUPI
-from rawaug.isp.model import as_float
 from rawaug.isp.samples import FramePair
+from rawaug.isp.stages import as_float
 from rawaug.seeding import keyed_generator
 
 Model = TypeVar("Model", bound=ReverseISP)

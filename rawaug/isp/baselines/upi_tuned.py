@@ -63,7 +63,7 @@ class TunedUPI(SmoothstepISP):
             ValueError: if there is no pair, a frame has too few pixels below the highlights, or what fits best turns
                 white black.
         """
-        moments = Moments.of(sample_pixels(pairs, PIXELS, seed))
+        moments = Moments.of(sample_pixels(pairs, PIXELS, seed)[0])
         if self.criterion == "mean":
             own = moments.solve_each()
             scale = own.sum(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,16 @@ import torch
 
 import denoisers
 from rawaug.data import demo_pairs
-from rawaug.experiment.evaluate import evaluate, frozen_sample, isp_mosaic, score_isp, write_json
+from rawaug.experiment.evaluate import (
+    classical_method,
+    compared,
+    evaluate,
+    frozen_levels,
+    frozen_sample,
+    score_method,
+    write_json,
+)
+from rawaug.experiment.report import print_scores
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPConfig
 from rawaug.noise import noise_model
@@ -30,7 +40,10 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> Non
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
-    assert set(result["images"][0]) == {"name", "psnr", "ssim"}
+    figures = {"psnr", "ssim", "psnr_srgb", "ssim_srgb"}
+    assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
+    assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
+    assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
     again = evaluate(identity, "demo:test", self_ensemble=True)
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
@@ -45,17 +58,6 @@ def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "new" / "isp.json").read_text()) == result
 
 
-def test_strips_give_the_whole_mosaic() -> None:
-    pair = demo_pairs("validation", count=1)[0]
-    isp = DictionaryISP(ISPConfig(cfa="GRBG"))
-    isp.shading.set(torch.zeros(2), torch.eye(2))
-    assert pair.raw.shape[-2] >= 256
-    tall = type(pair)(**{**vars(pair), **{k: torch.cat([getattr(pair, k)] * 2, 1) for k in ("srgb", "raw", "noisy")}})
-    with torch.no_grad():
-        torch.testing.assert_close(isp_mosaic(isp, tall), isp.reverse(tall.srgb[None]).raw)
-    assert score_isp(isp, tall).psnr > 5.0
-
-
 def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
     pair = demo_pairs("test", count=1)[0]
     bare = type(pair)(**{**vars(pair), "noisy": None, "shot_var": None, "read_var": None})
@@ -63,3 +65,44 @@ def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
     first = frozen_sample(bare, noise, pair.cfa, seed=0)
     assert torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=0).noisy)
     assert not torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=1).noisy)
+
+
+def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured() -> None:
+    pair = demo_pairs("test", count=1)[0]
+    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
+    bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
+    told, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
+    assert torch.equal(measured.noisy, told.noisy)
+    assert (measured.variance / told.variance).mean() == pytest.approx(1.0, abs=0.1)
+    levels = frozen_levels(bare, noise, seed=0)
+    assert levels is not None
+    y = pair.raw.mean().item()
+    assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
+
+
+def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rawaug.experiment.evaluate.open_pairs", lambda data, split: demo_pairs("test", count=2))
+    result = evaluate(identity, "demo:test", classical=["Wavelet", "TotalVariation"])
+    for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
+        scores = result["classical"][name]
+        assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
+        assert len(scores["images"]) == 2
+    print_scores(result)
+    with pytest.raises(ValueError, match="classical: Median is unknown; there are NonLocalMeans"):
+        evaluate(identity, "demo:test", classical=["Median"])
+
+
+def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
+    pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    noise = noise_model((0.0, 1e-3))
+    (scored,) = score_method(classical_method("Wavelet", noise, 0), [pair], noise, pair.cfa, 0, "Wavelet")
+    assert scored[0].psnr > (scored[0].psnr_noisy or 99.0) + 3.0
+
+
+def test_the_development_is_the_same_for_both(identity: Path) -> None:
+    """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
+    pair = demo_pairs("test", count=1)[0]
+    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
+    whole = compared(sample.noisy, sample.clean, pair.cfa, pair)
+    half = compared(sample.noisy / 2, sample.clean / 2, pair.cfa, pair)
+    assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.augment import RawAugment, RawPairs
+from rawaug.augment import RawAugment
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
 from rawaug.experiment.stream import RealCrops, StepSampler, TrainingStream, aligned
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
+from rawaug.pairs import RawPairs
 
 
 def colour_pair(cfa: CFA) -> Pair:
@@ -32,11 +35,13 @@ def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
         assert torch.equal(sample.noisy, expected)
 
 
-def test_a_captures_noise_is_never_renewed() -> None:
+@pytest.mark.parametrize("levels", [True, False])
+def test_a_captures_noise_is_never_renewed(levels: bool) -> None:
     pair = demo_pairs("train", count=1)[0]
     assert pair.noisy is not None
-    crops = RealCrops([pair], noise_model("cycleisp_sidd"), crop=32, cfa=pair.cfa)
     known = set(pair.noisy.flatten().tolist())
+    pair = pair if levels else replace(pair, shot_var=None, read_var=None)
+    crops = RealCrops([pair], noise_model("cycleisp_sidd"), crop=32, cfa=pair.cfa)
     for seed in range(4):
         assert set(crops.draw(torch.Generator().manual_seed(seed)).noisy.flatten().tolist()) <= known
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug import bayer
+from rawaug import bayer, compiled
 from rawaug.isp.baked import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import POINTWISE_STAGES, ISPConfig
@@ -24,6 +24,13 @@ def curved_isp(**settings: object) -> DictionaryISP:
     return isp
 
 
+@pytest.fixture(params=["compiled", "pytorch"])
+def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without compiled loops."""
+    monkeypatch.setattr(compiled, "available", lambda: request.param == "compiled")
+
+
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("attention", [False, True])
 def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
     isp = curved_isp(attention=attention)
@@ -34,6 +41,7 @@ def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
     assert psnr(BakedISP(isp)(srgb, params), unbaked).min().item() > 75.0
 
 
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("left_out", POINTWISE_STAGES)
 def test_any_stage_may_be_left_out(left_out: str) -> None:
     isp = curved_isp(stages=tuple(stage for stage in POINTWISE_STAGES if stage != left_out))
@@ -41,6 +49,61 @@ def test_any_stage_may_be_left_out(left_out: str) -> None:
     params = isp.choose(srgb)
     unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
     assert psnr(BakedISP(isp)(srgb, params), unbaked).item() > 75.0
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("view", bayer.View)
+def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: bayer.View) -> None:
+    isp = curved_isp()
+    frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
+    params = isp.choose(frame)
+    x5 = isp.reverse_pixels(frame, params)
+    crop, expected = (bayer.turn(x[..., 6:26, 34:50], view) for x in (frame, x5))
+    raw = BakedISP(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
+    assert psnr(raw, bayer.pack_rgb(expected, isp.cfa)).item() > 75.0
+
+
+@pytest.mark.usefixtures("either_way")
+def test_white_is_where_the_sensor_saturates() -> None:
+    isp, srgb = curved_isp(), torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    params, baked = isp.choose(srgb), BakedISP(isp)
+    assert torch.equal(baked(srgb, params, white=0.1), baked(srgb, params).clamp(max=0.1))
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("looks", [False, True])
+def test_choice_is_that_of_the_isp(looks: bool) -> None:
+    generator = torch.Generator().manual_seed(2)
+    isp = curved_isp(encoders=looks)
+    with torch.no_grad():
+        for encoder in (isp.reverse_networks.colour_encoder, isp.reverse_networks.gain_encoder):
+            list(encoder.parameters())[-2].normal_(std=5.0, generator=generator)
+    srgb = torch.randint(256, (3, 3, 150, 200), generator=generator, dtype=torch.uint8)
+    chosen, expected = BakedISP(isp).choose(srgb), isp.choose(srgb)
+    assert (expected.colour_weights.std(0) > 1e-3).any() == looks
+    for a, b in zip(chosen, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
+
+
+def test_later_changes_of_the_isp_do_not_reach_it() -> None:
+    isp, srgb = curved_isp(), torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    params, baked = isp.choose(srgb), BakedISP(isp)
+    before = baked(srgb, params)
+    with torch.no_grad():
+        for value in isp.parameters():
+            value.add_(0.1)
+    assert torch.equal(baked(srgb, params), before)
+
+
+def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
+    isp = curved_isp()
+    baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
+    with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
+        baked(torch.zeros(2, 3, 8, 7), params)
+    with pytest.raises(ValueError, match="matrix is for 2 pictures, the batch has 3"):
+        baked(torch.zeros(3, 3, 8, 8), params)
+    with pytest.raises(ValueError, match="place is for 1 pictures"):
+        baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))
 
 
 def test_bytes_and_floats_agree() -> None:

@@ -6,14 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rawaug.isp.dictionary import (
-    ColourDictionary,
-    Encoder,
-    GainDictionary,
-    convex_weights,
-    perturb,
-    project_to_simplex,
-)  # fmt: skip
+from rawaug.isp.dictionary import ColourDictionary, GainDictionary, convex_weights, perturb, project_to_simplex
 
 
 def test_colour_atoms_have_rows_of_l1_norm_one() -> None:
@@ -41,6 +34,25 @@ def test_combining_parameters_equals_combining_images() -> None:
     images = torch.stack([x / g[:, None] for g in gain.channel_gains()])
     expected = torch.einsum("n,nip->ip", weights[0], images)
     torch.testing.assert_close(x / gain.combine(weights)[0][:, None], expected)
+
+
+def test_a_known_light_chooses_the_atoms_that_were_seen_in_it() -> None:
+    colour, balance = ColourDictionary(3), torch.tensor([[2.0, 1.0, 1.5], [3.0, 2.0, 4.0]])
+    torch.testing.assert_close(colour.weights_for(balance), torch.full((2, 3), 1 / 3))  # where light tells nothing
+    colour.light.copy_(torch.tensor([[2.0, 1.5], [1.5, 2.0], [1.0, 1.0]]).log())
+    colour.spread.fill_(0.05)
+    torch.testing.assert_close(colour.weights_for(balance), torch.eye(3)[:2], atol=1e-4, rtol=0)
+
+
+def test_known_gains_make_grey_the_inverse_of_the_white_balance() -> None:
+    generator = torch.Generator().manual_seed(0)
+    colour, balance = ColourDictionary(2), torch.tensor([[2.0, 1.0, 1.5]])
+    with torch.no_grad():
+        colour.matrices.copy_(torch.randn(2, 3, 3, generator=generator) * 0.1 + torch.eye(3))
+    colour.neutral.copy_(torch.tensor([[0.8], [1.25]]).log().expand(2, 3))
+    weights = torch.tensor([[0.5, 0.5]])
+    grey = colour.combine(weights) @ torch.ones(3) / colour.gains_for(balance, weights)
+    torch.testing.assert_close(grey, 1 / balance)  # the two digital gains are each other's inverse
 
 
 @given(st.lists(st.floats(-2, 2), min_size=1, max_size=9))
@@ -73,10 +85,3 @@ def test_convex_weights_are_uniform_on_the_simplex() -> None:
     # a flat Dirichlet of three has mean 1/3 and variance 1/18
     torch.testing.assert_close(weights.mean(0), torch.full((3,), 1 / 3), atol=0.006, rtol=0)
     torch.testing.assert_close(weights.var(0), torch.full((3,), 1 / 18), atol=0.002, rtol=0)
-
-
-def test_a_disabled_encoder_gives_its_constant() -> None:
-    encoder = Encoder(3, (4, 4, 4))
-    encoder.set_prior(torch.tensor([0.2, 0.3, 0.5]))
-    weights = encoder(torch.rand(2, 3, 3, 16, 16))
-    torch.testing.assert_close(weights, torch.tensor([[0.2, 0.3, 0.5]] * 2))

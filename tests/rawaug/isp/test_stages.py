@@ -19,6 +19,15 @@ def test_untrained_networks_are_the_identity(x: torch.Tensor) -> None:
     assert torch.equal(stages.GaussianMask()(stages.place_in_frame(6, 8)), torch.ones(1, 1, 6, 8))
 
 
+def test_a_tone_network_starts_from_exactly_the_curve(x: torch.Tensor) -> None:
+    torch.manual_seed(0)
+    tone, toe = stages.ToneNetwork(), 0.055 / 1.055
+    tone.start_from(toe)
+    torch.testing.assert_close(tone(x), (x + 0.055) / 1.055, atol=1e-6, rtol=0)
+    tone.start_from(0.0)
+    assert torch.equal(tone(x), x)
+
+
 def test_gamma_inverts(x: torch.Tensor) -> None:
     grey = 0.05 + 0.95 * x
     torch.testing.assert_close(stages.gamma_compress(stages.gamma_expand(grey, 2.2), 2.2), grey)

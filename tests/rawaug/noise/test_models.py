@@ -183,6 +183,38 @@ def test_non_contiguous_pictures_and_double_precision() -> None:
     assert model.apply(clean.double(), params).dtype == torch.float64
 
 
+@pytest.mark.parametrize("name", ["gaussian", "poisson", "full sensor"])
+def test_noise_and_variance_at_once_are_the_two_apart(name: str) -> None:
+    model = EVERY[name]()
+    clean = torch.rand(2, 4, 30, 530, generator=generator(0)) * 1.2 - 0.1
+    params = model.sample(2, generator(1))
+    noisy, variance = model.apply_with_variance(clean, params)
+    assert torch.equal(noisy, model.apply(clean, params))
+    torch.testing.assert_close(variance, model.variance(noisy, params), atol=0.0, rtol=1e-6)
+
+
+def test_pytorch_makes_the_same_noise_where_nothing_can_be_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = ShotReadNoise(STRONG)
+    clean, params = torch.rand(2, 4, 7, 530, generator=generator(0)), model.sample(2, generator(1))
+    expected = model.apply_with_variance(clean, params)
+    double = model.apply(clean.double(), params)
+    monkeypatch.setattr("rawaug.compiled.available", lambda: False)
+    for a, b in zip(model.apply_with_variance(clean, params), expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(double.float(), expected[0], atol=1e-6, rtol=0.0)
+
+
+def test_same_bits_on_any_number_of_threads() -> None:
+    model = ShotReadNoise(STRONG)
+    clean, params = torch.rand(3, 4, 90, 300, generator=generator(0)), model.sample(3, generator(1))
+    before, results = torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        results.append(model.apply(clean, params))
+    torch.set_num_threads(before)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
 def test_bad_input_is_refused_in_one_line() -> None:
     model = ShotReadNoise(STRONG)
     params = model.sample(2, generator(0))
@@ -198,8 +230,8 @@ def test_bad_input_is_refused_in_one_line() -> None:
         Compose([ShotReadNoise(STRONG), PoissonGaussianNoise(STRONG)])
 
 
-def test_noise_costs_little_more_than_its_random_numbers() -> None:
-    """The benchmark says 1.2 to 1.3 on a quiet machine; the bound here leaves room for a busy one."""
+def test_noise_costs_less_than_its_random_numbers_from_pytorch() -> None:
+    """The benchmark says 0.4 on a quiet machine; the bound here leaves room for a busy one."""
     clean = torch.rand(8, 4, 128, 128, generator=generator(0))
     model = ShotReadNoise(STRONG)
     params = model.sample(8, generator(1))
@@ -215,7 +247,7 @@ def test_noise_costs_little_more_than_its_random_numbers() -> None:
         return time.perf_counter() - start
 
     times = [(fastest(alone), fastest(lambda: model.apply(clean, params))) for _ in range(30)]
-    assert min(t for _, t in times) < 2 * min(t for t, _ in times)
+    assert min(t for _, t in times) < 1.3 * min(t for t, _ in times)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

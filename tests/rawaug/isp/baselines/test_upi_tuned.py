@@ -58,7 +58,7 @@ def test_of_three_frames_the_logarithm_follows_the_two_that_agree_and_mse_the_br
 
 
 def test_no_round_raises_the_sum_of_logarithms() -> None:
-    moments = Moments.of(sample_pixels([shot(k, 0.8 + 0.2 * k) for k in range(4)], 4096, 0))
+    moments = Moments.of(sample_pixels([shot(k, 0.8 + 0.2 * k) for k in range(4)], 4096, 0)[0])
     product, losses = moments.solve(torch.ones(4).double()), []
     for _ in range(20):
         error = moments.error(product) + LOG_MSE_EPS
@@ -69,7 +69,7 @@ def test_no_round_raises_the_sum_of_logarithms() -> None:
 
 
 def test_the_moments_tell_the_error() -> None:
-    samples = sample_pixels([shot(0)], 4096, 0)
+    samples, _ = sample_pixels([shot(0)], 4096, 0)
     moments = Moments.of(samples)
     product = torch.diag(1.0 / (1.3 * GAINS)) @ MATRIX
     predicted = Known(1.3 * GAINS).unprocess(samples.srgb)

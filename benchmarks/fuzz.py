@@ -1,0 +1,295 @@
+"""What the readers make of damaged files: each is read, or refused in one line that names it; nothing else.
+
+    python -m benchmarks.fuzz [--count 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
+
+Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
+repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
+repeats pieces, as (seed, kind, number) tells. A worker process reads one after the other, and is started anew when a
+decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
+line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
+more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
+last three.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.damage import make_originals, mutated
+from rawaug.seeding import derived_seed
+
+SECONDS, MEBIBYTES = 10.0, 2048.0
+START_SECONDS = 120.0
+DECODERS = {
+    "raw": "LibRaw",
+    "dng": "LibRaw",
+    "jpeg": "OpenImageIO",
+    "picture": "OpenImageIO",
+    "mat5": "SciPy",
+    "mat73": "HDF5",
+    "safetensors": "safetensors",
+}
+"""What reads each kind for us."""
+
+OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
+FORBIDDEN = OUTCOMES[3:]
+
+
+def readers(kind: str, path: Path) -> list[Callable[[], object]]:
+    """Everything in the package that reads such a file."""
+    import torch
+
+    import denoisers
+    from rawaug import DictionaryISP
+    from rawaug.data.mat import read_value
+    from rawaug.data.sidd import colour_of, mosaic_of
+    from rawaug.experiment.info import describe
+    from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
+    from rawaug.params import load_params
+
+    def frame_of() -> RawFrame:
+        frame = read_raw(path)
+        numbers = [*frame.white_balance, *frame.daylight, *(frame.noise_profile or ()), frame.white, *frame.black]
+        for tensor in (frame.mosaic, frame.color_matrix, frame.shading_gains, torch.tensor(numbers)):
+            if not tensor.isfinite().all():
+                raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
+        return frame
+
+    def rewritten() -> None:
+        frame = frame_of()
+        write_dng(path.with_name(f"{path.stem}.out.dng"), frame, source=path)
+
+    if kind == "raw":
+        return [frame_of]
+    if kind == "dng":
+        return [lambda: read_raw_and_develop(path), rewritten]
+    if kind in ("jpeg", "picture"):
+        return [lambda: read_picture(path)]
+    if kind != "safetensors":
+        values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
+        return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
+    load = {"isp": DictionaryISP.from_pretrained, "denoiser": denoisers.load, "params": load_params}
+    kept = path.stem.split("-")[0]
+    return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
+
+
+def attempt(kind: str, path: Path) -> tuple[str, str]:
+    """``read``, ``refused`` or ``fault``, and why."""
+    outcome = "read", ""
+    for read in readers(kind, path):
+        try:
+            read()
+        except (ValueError, OSError) as error:
+            text = str(error)
+            if "\n" in text or path.stem not in text:
+                return "fault", f"{type(error).__name__} without name, or of many lines: {text!r}"
+            outcome = "refused", text
+        except Exception as error:
+            import traceback
+
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            return "fault", f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
+    return outcome
+
+
+def work() -> None:
+    """Read what standard input names, and answer each with a line of JSON; the first answer says that all is there."""
+    import faulthandler
+    import warnings
+
+    faulthandler.enable()
+    warnings.simplefilter("ignore")
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what decoders print must not come between the answers
+    attempt("dng", Path("none"))
+    print("[]", file=answers, flush=True)
+    for line in sys.stdin:
+        kind, name = json.loads(line)
+        outcome, why = attempt(kind, Path(name))
+        print(json.dumps([outcome, why]), file=answers, flush=True)
+
+
+class Worker:
+    """A process that reads files, started anew when it has died or is not to be trusted any more."""
+
+    def __init__(self, folder: Path) -> None:
+        self.log = folder / "stderr.txt"
+        self.process: subprocess.Popen[str] | None = None
+
+    def read(self, kind: str, path: Path) -> tuple[str, str]:
+        """What became of a file: one of OUTCOMES, and why."""
+        process = self.process or self._start()
+        assert process.stdin is not None and process.stdout is not None
+        _forget_peak(process.pid)
+        process.stdin.write(json.dumps([kind, str(path)]) + "\n")
+        process.stdin.flush()
+        end = time.monotonic() + SECONDS
+        answered = False
+        while not answered and time.monotonic() < end and _peak_mebibytes(process.pid) < MEBIBYTES:
+            answered = bool(select.select([process.stdout], [], [], 0.05)[0])
+        line = process.stdout.readline() if answered else ""
+        peak = _peak_mebibytes(process.pid)
+        if peak < MEBIBYTES and line:
+            outcome, why = json.loads(line)
+            return outcome, why
+        self.stop()
+        if peak >= MEBIBYTES:
+            return "memory", f"{peak:.0f} MiB"
+        if not answered:
+            return "hung", f"more than {SECONDS:g} s"
+        name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
+        return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
+
+    def _start(self) -> subprocess.Popen[str]:
+        with self.log.open("w") as log:
+            command, pipe = [sys.executable, "-m", "benchmarks.fuzz", "--worker"], subprocess.PIPE
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True)
+        assert process.stdout is not None
+        ready = select.select([process.stdout], [], [], START_SECONDS)[0] and process.stdout.readline()
+        if not ready:
+            process.kill()
+            raise OSError(f"the reading process does not start: {self.log.read_text()[-500:]}")
+        self.process = process
+        return process
+
+    def stop(self) -> None:
+        """End the process, if there is one."""
+        if self.process is not None:
+            if self.process.stdin is not None:
+                self.process.stdin.close()
+            if self.process.poll() is None and not _ends(self.process):
+                self.process.kill()
+            self.process.wait()
+            if self.process.stdout is not None:
+                self.process.stdout.close()
+            self.process = None
+
+
+def _ends(process: subprocess.Popen[str]) -> bool:
+    try:
+        process.wait(1)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
+
+
+def _forget_peak(process: int) -> None:
+    peak = Path(f"/proc/{process}/clear_refs")
+    if peak.exists():
+        peak.write_text("5")
+
+
+def _peak_mebibytes(process: int) -> float:
+    """Peak of resident memory since :func:`_forget_peak`; 0 where the system does not tell."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return 0.0
+    return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")), 0.0)
+
+
+def _innermost(log: Path) -> str:
+    """Where Python was when a decoder crashed, as faulthandler tells it."""
+    lines = (line.strip() for line in log.read_text(errors="replace").splitlines())
+    return next((line for line in lines if line.startswith("File ")), "no place known")
+
+
+# -- the run ----------------------------------------------------------------------------------------------------------
+
+
+def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str, Any]:
+    """By kind: how often each outcome, the slowest file in seconds, and why, of all but the first two outcomes."""
+    results: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        originals, worker = make_originals(folder), Worker(folder)
+        wanted = [kind for kind in kinds if originals[kind]]
+        shares = np.diff(np.linspace(0, count, len(wanted) + 1).round().astype(int)).tolist()
+        try:
+            for kind, share in zip(wanted, shares, strict=True):
+                results[kind] = _fuzz_kind(kind, originals[kind], share, seed, worker, folder / kind, keep)
+        finally:
+            worker.stop()
+    return results
+
+
+def _fuzz_kind(
+    kind: str, originals: list[Path], count: int, seed: int, worker: Worker, folder: Path, keep: Path | None
+) -> dict[str, Any]:
+    folder.mkdir()
+    for original in originals:
+        copy = folder / f"{original.stem.split('.')[0]}-whole{original.suffix}"
+        copy.write_bytes(original.read_bytes())
+        if (told := worker.read(kind, copy))[0] != "read":
+            raise ValueError(f"{original}: is {told[0]} although it is whole ({told[1]})")
+    outcomes, reasons, slowest = Counter[str](), [], 0.0
+    for number in range(count):
+        rng = np.random.default_rng(derived_seed(seed, kind, number))
+        original = originals[number % len(originals)]
+        path = folder / f"{original.stem.split('.')[0]}-{number}{original.suffix}"
+        path.write_bytes(mutated(original.read_bytes(), rng))
+        start = time.perf_counter()
+        outcome, why = worker.read(kind, path)
+        slowest = max(slowest, time.perf_counter() - start)
+        outcomes[outcome] += 1
+        if outcome not in ("read", "refused"):
+            reasons.append(f"{path.name}: {outcome}: {why}")
+            if keep is not None:
+                keep.mkdir(parents=True, exist_ok=True)
+                path.replace(keep / f"{kind}-{path.name}")
+        for file in folder.iterdir():
+            file.unlink()
+    return {"mutated": count, **{o: outcomes[o] for o in OUTCOMES}, "slowest_s": round(slowest, 2), "reasons": reasons}
+
+
+def print_table(results: dict[str, Any]) -> None:
+    columns = ("mutated", *OUTCOMES, "slowest_s")
+    print("kind         decoder      " + "".join(name.rjust(10) for name in columns))
+    for kind, row in results.items():
+        print(f"{kind:13}{DECODERS[kind]:13}" + "".join(str(row[name]).rjust(10) for name in columns))
+    for kind, row in results.items():
+        for reason in row["reasons"]:
+            print(f"{kind}: {reason}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=5000, help="files of all kinds together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", nargs="+", choices=DECODERS, default=list(DECODERS))
+    parser.add_argument("--quick", action="store_true", help="100 files")
+    parser.add_argument("--keep", type=Path, help="keep the files that did not end as they should in this folder")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        work()
+        return 0
+    start = time.perf_counter()
+    results = fuzz(args.kinds, 100 if args.quick else args.count, args.seed, args.keep)
+    print_table(results)
+    absent = [kind for kind in args.kinds if kind not in results]
+    print(
+        f"{time.perf_counter() - start:.0f} s" + (f"; no files of kind {', '.join(absent)} at hand" if absent else "")
+    )
+    if args.json:
+        args.json.write_text(json.dumps({"seed": args.seed, "kinds": results}, indent=1) + "\n", encoding="utf-8")
+    return int(any(row[outcome] for row in results.values() for outcome in FORBIDDEN))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

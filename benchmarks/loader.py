@@ -1,0 +1,167 @@
+"""What rawaug costs a training: a whole DataLoader, and a training step, with it and without, as ratios.
+
+    python benchmarks/loader.py [PICTURES] [--json FILE] [--workers N] [--device cpu|cuda]
+    python benchmarks/loader.py [PICTURES] --memory [--epochs 10]
+
+The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
+The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first. All are timed
+in turn, and the fastest run of each counts. ``--memory`` prints the resident memory of the process and its persistent
+workers after each epoch. Pictures are those of PICTURES, or the built-in ones written to a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import platform
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+import rawaug
+from denoisers import UNet
+from rawaug.bayer import RandomCrop
+from rawaug.data import PictureFolder, demo_pictures
+from rawaug.io import write_picture
+from rawaug.seeding import keyed_generator
+
+
+class Crops(Dataset[Tensor]):
+    """What a loader does without rawaug: read, crop."""
+
+    def __init__(self, pictures: PictureFolder, crop: int) -> None:
+        self.pictures, self.crop = pictures, RandomCrop(crop)
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, index: int) -> Tensor:
+        cropped: Tensor = self.crop(self.pictures[index], keyed_generator("crops", index)).clone()
+        return cropped
+
+
+def fastest(runs: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
+    """The least seconds of each, timed in turn."""
+    best = dict.fromkeys(runs, float("inf"))
+    for _ in range(repeats):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            best[name] = min(best[name], time.perf_counter() - start)
+    return best
+
+
+def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
+    """Seconds of an epoch, workers kept."""
+    pictures, augment = PictureFolder(folder), rawaug.RawAugment.from_pretrained("universal")
+    settings: dict[str, Any] = {"batch_size": args.batch, "num_workers": args.workers}
+    settings["persistent_workers"] = args.workers > 0
+    crops = DataLoader(Crops(pictures, args.crop), **settings)
+    pairs = DataLoader(rawaug.RawPairs(pictures, augment, crop=args.crop), **settings)
+    on_device = rawaug.RawAugment.from_pretrained("universal")
+    wrapped = rawaug.wrap(DataLoader(Crops(pictures, args.crop), **settings), on_device, device=args.device)
+    runs = {
+        "without": lambda: [batch.to(args.device) for batch in crops],
+        "RawPairs": lambda: [pair.noisy.to(args.device) for pair in pairs],
+        "wrap": lambda: [pair.noisy for pair in wrapped],
+    }
+    return fastest(runs, args.repeats, args.device)
+
+
+def time_steps(args: argparse.Namespace) -> dict[str, float]:
+    """Seconds of a training step on a batch."""
+    augment = rawaug.RawAugment.from_pretrained("universal").to(args.device)
+    shape = (args.batch, 3, args.crop, args.crop)
+    srgb = torch.randint(256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8).to(args.device)
+    network = UNet(width=args.width).to(args.device)
+    optimizer = torch.optim.Adam(network.parameters())
+
+    def step(pair: rawaug.RawPair) -> None:
+        optimizer.zero_grad()
+        torch.nn.functional.l1_loss(network(pair.noisy, pair.variance), pair.clean).backward()
+        optimizer.step()
+
+    ready = augment(srgb)
+    return fastest(
+        {"without": lambda: step(ready), "RawAugment": lambda: step(augment(srgb))}, args.repeats, args.device
+    )
+
+
+def resident_mib() -> float:
+    """Resident memory of this process and its children, as the kernel counts it (Linux)."""
+    pids = ["self", *(str(child.pid) for child in multiprocessing.active_children())]
+    status = [Path(f"/proc/{pid}/status").read_text(encoding="utf-8") for pid in pids]
+    return sum(int(text.split("VmRSS:")[1].split()[0]) for text in status) / 1024
+
+
+def measure_memory(folder: Path, args: argparse.Namespace) -> list[float]:
+    """MiB after each epoch with persistent workers, before they are given back."""
+    pairs = rawaug.RawPairs(PictureFolder(folder), rawaug.RawAugment.from_pretrained("universal"), crop=args.crop)
+    workers = max(1, args.workers)
+    loader = DataLoader(pairs, args.batch, shuffle=True, num_workers=workers, persistent_workers=True)
+    memory = []
+    for epoch in range(args.epochs):
+        pairs.set_epoch(epoch)
+        for _ in loader:
+            pass
+        memory.append(resident_mib())
+        print(f"  epoch {epoch + 1}: {memory[-1]:.0f} MiB")
+    return memory
+
+
+def ratios(seconds: dict[str, float]) -> dict[str, float]:
+    return {name: value / seconds["without"] for name, value in seconds.items() if name != "without"}
+
+
+def measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """All that is asked for, printed and returned."""
+    if args.memory:
+        memory = measure_memory(folder, args)
+        growth = memory[-1] / memory[min(1, len(memory) - 1)] - 1
+        print(f"  from epoch 2 to {len(memory)}: {growth:+.1%}")
+        return {"memory_mib": memory, "growth": growth}
+    loaders, steps = time_loaders(folder, args), time_steps(args)
+    for what, seconds in (("loader", loaders), (f"step of UNet({args.width})", steps)):
+        shown = "  ".join(f"{name} {value:.2f}" for name, value in ratios(seconds).items())
+        print(f"  {what:20s} without {1e3 * seconds['without']:.0f} ms;  ratios: {shown}")
+    return {"loader": ratios(loaders), "step": ratios(steps), "seconds": {"loader": loaders, "step": steps}}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pictures", type=Path, nargs="?", help="a folder; the built-in pictures by default")
+    parser.add_argument("--memory", action="store_true", help="resident memory over epochs instead of times")
+    parser.add_argument("--epochs", type=int, default=10, help="of --memory")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--workers", type=int, default=4)
+    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--crop", type=int, default=128)
+    parser.add_argument("--width", type=int, default=32, help="of the U-Net")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    args = parser.parse_args()
+    name = torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else platform.processor()
+    machine = f"{name or platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
+    print(f"{args.workers} workers, batches of {args.batch} x {args.crop} x {args.crop} ({machine})")
+    with tempfile.TemporaryDirectory() as written:
+        if args.pictures is None:
+            for i, picture in enumerate(demo_pictures()):
+                write_picture(Path(written) / f"{i:02d}.png", picture)
+        results = measure(args.pictures or Path(written), args)
+    if args.json:
+        settings = {"workers": args.workers, "batch": args.batch, "crop": args.crop, "width": args.width}
+        report = {"machine": machine, "settings": settings, **results}
+        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

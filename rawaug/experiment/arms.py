@@ -1,0 +1,96 @@
+"""What an arm of a recipe is trained on: its estimator, its stream of samples, and the samples it is watched on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rawaug.augment import RawAugment
+from rawaug.data.pairs import Pair
+from rawaug.experiment.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
+from rawaug.experiment.evaluate import frozen_sample
+from rawaug.experiment.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.experiment.stream import PictureCrops, RealCrops, Sample, Source, TrainingStream
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseModel
+from rawaug.pairs import RawPairs
+from rawaug.seeding import derived_seed, keyed_generator
+
+WATCHED = 16
+"""Samples made from pictures on which a training without validation pairs is watched."""
+
+
+def estimator_of(arm: ArmConfig) -> Supervised:
+    """The estimator that the arm names.
+
+    Example:
+        >>> estimator_of(ArmConfig(estimator="r2r", alpha=0.5)).alpha
+        0.5
+    """
+    if arm.estimator == "noisier":
+        return Noisier(arm.alpha, arm.correct)
+    if arm.estimator == "noise2noise":
+        return Noise2Noise()
+    if arm.estimator == "r2r":
+        return R2R(arm.alpha)
+    if arm.estimator == "neighbor2neighbor":
+        return Neighbor2Neighbor(arm.gamma)
+    return Supervised()
+
+
+def training_stream(
+    recipe: Recipe,
+    arm: ArmConfig,
+    pairs: Sequence[Pair],
+    pictures: Any,
+    isp: DictionaryISP,
+    noise: NoiseModel,
+    seed: int,
+) -> TrainingStream:
+    """The training samples of one arm.
+
+    Args:
+        pairs: the real frames, as :func:`rawaug.experiment.noisy_frames.noisy_only` leaves them if the arm is
+            self-supervised.
+        pictures: the sRGB pictures.
+        isp, noise: make RAW of them.
+        seed: of the run.
+    """
+    config, seed = recipe.train, derived_seed(seed, "stream")
+    augment = RawAugment(isp, noise, arm.sampling, arm.strength)
+    estimator = estimator_of(arm)
+    real: Source | None = None
+    synthetic: Source | None = None
+    if isinstance(estimator, SelfSupervised):
+        if pairs and arm.augmented < 1.0:
+            frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+            real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
+        if arm.augmented:
+            frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
+            synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
+    else:
+        if pairs:
+            real = RealCrops(pairs, noise, config.crop, isp.cfa)
+        if arm.augmented:
+            synthetic = PictureCrops(RawPairs(pictures, augment, config.crop))
+    return TrainingStream(real, synthetic, config.batch, arm.augmented, seed)
+
+
+def validation_samples(
+    recipe: Recipe, pairs: Sequence[Pair], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+) -> list[Sample]:
+    """The frozen samples by which weights are chosen, the same in every arm and run.
+
+    Args:
+        pairs: of validation, none for samples made from ``pictures``; noisy alone if the arms are self-supervised.
+    """
+    augment = RawAugment(isp, noise)
+    if recipe.self_supervised:
+        frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+        return held_out(frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED], isp.cfa)
+    if pairs:
+        return [frozen_sample(pair, noise, isp.cfa, seed=0) for pair in pairs]
+    crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
+    drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
+    return [Sample(*(x[None] for x in sample)) for sample in drawn]

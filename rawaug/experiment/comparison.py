@@ -1,0 +1,230 @@
+"""The reconstruction table: every method fitted on the same pairs, measured on frames left out.
+
+PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. PSNR_d is that of a
+denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
+fit's figures go into a file of their own, so that a stopped run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from rawaug.bayer import CFA
+from rawaug.conform import even_sided
+from rawaug.data import open_pairs, open_pictures
+from rawaug.experiment.contenders import (
+    FAMILIES,
+    ROWS,
+    cycle_psnr,
+    fit_family,
+    mosaic_only_psnr,
+    score_rows,
+)
+from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.evaluate import write_json
+from rawaug.experiment.report import mean_and_spread
+from rawaug.experiment.run import fingerprint
+from rawaug.isp.fit import FitConfig
+from rawaug.metrics import worst_and_best_quarter
+
+
+@dataclass
+class Comparison:
+    """A table of methods.
+
+    Args:
+        experiment: "reconstruction".
+        name: of the folder in ``out`` that it writes.
+        data: the pairs, registered, of one CFA.
+        methods: families to fit: dictionary, dictionary-encoders and the baselines.
+        seconds: budget of methods that learn by descent, reading not counted.
+        longer: a second budget for them, as a factor; 0 leaves it out.
+        longer_frames: left-out frames on which the longer budget is tried (first seed).
+        patches: random patches of each left-out frame that are scored; null scores all.
+        pictures: sRGB pictures for the cycle and for PSNR_d.
+        fit: of the dictionary ISP.
+        downstream: PSNR_d; null leaves it out.
+        seed: of the first run.
+        seeds: how many runs.
+        out: folder of all runs.
+    """
+
+    experiment: str = "reconstruction"
+    name: str = "reconstruction"
+    data: str = "demo:train"
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
+    seconds: float = 20.0
+    longer: float = 0.0
+    longer_frames: int = 2
+    patches: int | None = 8
+    pictures: str = "demo:"
+    fit: FitConfig = field(default_factory=FitConfig)
+    downstream: DownstreamConfig | None = None
+    seed: int = 0
+    seeds: int = 3
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        unknown = [method for method in self.methods if method not in FAMILIES]
+        if unknown or not self.methods:
+            raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
+        if self.seeds < 1:
+            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+
+
+def smoke_comparison(comparison: Comparison) -> Comparison:
+    """The comparison in seconds, on the demo camera."""
+    downstream = comparison.downstream and comparison.downstream.smoke()
+    tiny = replace(comparison.fit, steps=2, pixels=512, batch=128)
+    methods = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
+    return replace(
+        comparison,
+        name=f"{comparison.name}-smoke",
+        data="demo:validation",
+        pictures="demo:",
+        methods=methods,
+        longer=0.0,
+        patches=1,
+        seeds=1,
+        fit=tiny,
+        downstream=downstream,
+    )
+
+
+def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
+    """Run a comparison; the rows as they stand in ``table.json``."""
+    return _Comparison(comparison).table()
+
+
+class _Comparison:
+    def __init__(self, settings: Comparison) -> None:
+        self.settings, self.folder = settings, Path(settings.out) / settings.name
+        self.pairs = list(open_pairs(settings.data, split="train"))
+        if len(self.pairs) < 2:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leaving one out needs two or more")
+        odd = [pair.name for pair in self.pairs if not pair.registered or pair.cfa != self.pairs[0].cfa]
+        if odd:
+            raise ValueError(f"data: {odd[0]} is not registered or of another CFA; a table needs pixel-exact pairs")
+        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures))]
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """All rows; printed, and written with every single figure."""
+        rows: dict[str, dict[str, Any]] = {}
+        for family, scale in self._families():
+            rows |= self._rows(family, scale)
+        ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
+        write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
+        _print(rows, self.settings, ceiling)
+        return rows
+
+    def _families(self) -> Iterator[tuple[str, float]]:
+        for family in self.settings.methods:
+            yield family, 1.0
+            if self.settings.longer and family in ("unet", "cycleisp", "invisp", "invgrey"):
+                yield family, self.settings.longer
+
+    def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
+        settings, longer = self.settings, scale != 1.0
+        seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
+        frames = range(settings.longer_frames if longer else len(self.pairs))
+        bar = tqdm([(s, k) for s in seeds for k in frames], desc=f"{family} x{scale:g}", unit="fit", leave=False)
+        folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
+        whole = {} if longer else self._whole(family)
+        rows = {}
+        for row in folds[0][2]["rows"]:
+            by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+            quarters = [worst_and_best_quarter(values) for values in by_seed]
+            name = family if row == "blind" else f"{family}, {ROWS[row]}"
+            rows[f"{name}, {scale:g} times as long" if longer else name] = {
+                "psnr_r": [statistics.fmean(values) for values in by_seed],
+                "frames": {self.pairs[k].name: [values[k] for values in by_seed] for k in frames},
+                "worst25": [worst for worst, _ in quarters],
+                "best25": [best for _, best in quarters],
+                "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
+                "mpix_s": statistics.median(fold["mpix_s"] for *_, fold in folds),
+                "parameters": folds[0][2]["parameters"],
+                **(whole if row == "blind" else {}),
+            }
+        return rows
+
+    def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
+        """Fitted without one frame, scored on it."""
+        settings, left_out = self.settings, self.pairs[frame]
+        seconds = settings.seconds * scale
+        key = fingerprint(family, seconds, seed, settings.patches, asdict(settings.fit), [p.name for p in self.pairs])
+        path = self._path(f"{family}-x{scale:g}-without-{left_out.name}-seed{seed}")
+        if (known := _read(path, key)) is not None:
+            return known
+        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], settings.fit, seconds, seed)
+        result = score_rows(fitted, left_out, settings.patches)
+        result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters}
+        write_json(result, path)
+        return result
+
+    def _whole(self, family: str) -> dict[str, Any]:
+        """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
+        settings = self.settings
+        downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
+        seeds = range(settings.seed, settings.seed + settings.seeds)
+        parts = (asdict(settings.fit), downstream and asdict(downstream), [p.name for p in self.pairs])
+        key = fingerprint(family, settings.seconds, list(seeds), settings.pictures, *parts)
+        path = self._path(f"{family}-all-frames")
+        if (known := _read(path, key)) is not None:
+            return known
+        fitted = fit_family(family, self.pairs, settings.fit, settings.seconds, settings.seed)
+        result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
+        if downstream:
+            place = self.folder / f"{family}-denoisers"
+            result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
+        write_json(result, path)
+        return result
+
+    def _path(self, stem: str) -> Path:
+        return self.folder / f"{stem}.json"
+
+
+def _each(pictures: Any) -> Iterator[Tensor]:
+    for index in range(len(pictures)):
+        yield pictures[index]
+
+
+def _read(path: Path, key: str) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    known: dict[str, Any] = json.loads(path.read_text())
+    return known if known.get("key") == key else None
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    def figures(name: str) -> str:
+        value = row.get(name)
+        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
+
+    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "psnr_d")]
+    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", f"{row['mpix_s']:.3g}"]
+
+
+def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    frames = len(next(iter(rows.values()))["frames"])
+    table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
+    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "PSNR_d", "M parameters", "s to fit", "Mpix/s")
+    for k, head in enumerate(("method", *heads)):
+        table.add_column(head, justify="right" if k else "left")
+    for name, row in rows.items():
+        table.add_row(name, *_cells(row))
+    console = Console()
+    (console if console.is_terminal else Console(width=140)).print(table)
+    threads = torch.get_num_threads()
+    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

@@ -1,0 +1,132 @@
+"""PSNR_d: how well a denoiser does on real RAW that was trained on the RAW that a method makes of sRGB pictures.
+
+Pictures, network, steps and noise are the same for every method; what differs is the way from sRGB to RAW. The
+dictionary ISP draws camera settings from its hull, UPI from its published distributions; a network has one answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.augment import RawAugment
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs
+from rawaug.data.pairs import Pair
+from rawaug.experiment.evaluate import score_denoiser
+from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
+from rawaug.experiment.stream import PictureCrops, Sample, Source, TrainingStream
+from rawaug.experiment.train import train
+from rawaug.isp.baselines import UPI, ReverseISP
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import as_float
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.pairs import RawPairs
+from rawaug.seeding import derived_seed, keyed_generator
+
+WATCHED = 16
+"""Samples made from the pictures on which training is watched."""
+
+
+@dataclass
+class DownstreamConfig:
+    """The denoising experiment.
+
+    Args:
+        methods: families that are tried.
+        test: RAW frames of cameras that no method has seen; folders, or ``kind:path``.
+        test_crop: side of the piece at each test frame's centre that is scored; null scores all of it.
+        noise: preset, in training and on the test frames.
+        denoiser: the network.
+        train: the loop.
+    """
+
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
+    test: list[str] = field(default_factory=lambda: ["demo:test"])
+    test_crop: int | None = 1024
+    noise: str = "cycleisp_sidd"
+    denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def smoke(self) -> DownstreamConfig:
+        """In seconds, on the demo camera."""
+        few = TrainConfig(steps=2, batch=2, crop=32, warmup=1, validate_every=2, checkpoint_every=2)
+        return replace(
+            self, test=["demo:validation"], denoiser=DenoiserConfig("UNet", {"width": 4, "scales": 2}), train=few
+        )
+
+
+def psnr_d(
+    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int
+) -> float:
+    """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
+    noise, cfa = noise_model(config.noise), CFA(model.cfa)
+    crops = _crops(model, pictures, noise, config.train.crop)
+    stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
+    watched = [Sample(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
+    net = train(
+        stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
+    )
+    frames = [_centre(pair, config.test_crop) for spec in config.test for pair in open_pairs(spec, split="test")]
+    scores = [score.psnr for score, *_ in score_denoiser(net, frames, noise, cfa, 0, False, "PSNR_d")]
+    return sum(scores) / len(scores)
+
+
+def _crops(model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, crop: int) -> Source:
+    if isinstance(model, DictionaryISP):
+        return PictureCrops(RawPairs(pictures, RawAugment(model, noise), crop))
+    if isinstance(model, UPI):
+        return MadeCrops(pictures, lambda x, g: model.apply(x, model.sample(1, g)), model.cfa, noise, crop)
+    return MadeCrops(pictures, lambda x, g: model.reverse(x), model.cfa, noise, crop)
+
+
+class MadeCrops:
+    """Crops of pictures, turned at random, made RAW by any function.
+
+    Args:
+        pictures: ``(3, H, W)`` uint8.
+        make: sRGB ``(1, 3, h, w)`` in [0, 1] and a generator to the mosaic ``(1, 1, h, w)``.
+        cfa: of that mosaic.
+        noise: drawn anew for every crop.
+        crop: side, even.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[Tensor],
+        make: Callable[[Tensor, torch.Generator], Tensor],
+        cfa: CFA,
+        noise: NoiseModel,
+        crop: int,
+    ) -> None:
+        self.pictures, self.make, self.cfa, self.noise, self.crop = pictures, make, cfa, noise, crop
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator) -> Sample:
+        """One crop of a random picture."""
+        picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
+        height, width = picture.shape[-2:]
+        top = 2 * int(torch.randint((height - self.crop) // 2 + 1, (), generator=generator))
+        left = 2 * int(torch.randint((width - self.crop) // 2 + 1, (), generator=generator))
+        patch = bayer.crop(picture, top, left, self.crop, self.crop)
+        patch = bayer.turn(patch, int(torch.randint(bayer.N_VIEWS, (), generator=generator)))
+        clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)
+        params = self.noise.sample(1, generator)
+        noisy = self.noise.apply(clean, params)
+        return Sample(noisy[0], clean[0], self.noise.variance(noisy, params)[0])
+
+
+def _centre(pair: Pair, side: int | None) -> Pair:
+    """The piece at the centre of a frame, its pattern kept."""
+    height, width = pair.raw.shape[-2:]
+    if side is None or min(height, width) <= side:
+        return pair
+    top, left = (height - side) // 4 * 2, (width - side) // 4 * 2
+    window = (..., slice(top, top + side), slice(left, left + side))
+    noisy = None if pair.noisy is None else pair.noisy[window].contiguous()
+    return replace(pair, srgb=pair.srgb[window].contiguous(), raw=pair.raw[window].contiguous(), noisy=noisy)

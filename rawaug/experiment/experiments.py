@@ -1,0 +1,51 @@
+"""The kinds of experiment that the key ``experiment`` of a recipe names; without it denoisers are trained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
+from rawaug.experiment.comparison import Comparison, compare, smoke_comparison
+from rawaug.experiment.recipe import Recipe, smoke
+from rawaug.experiment.run import run
+
+
+class Kind(NamedTuple):
+    """One kind of experiment.
+
+    Args:
+        settings: dataclass of its keys.
+        run: does it.
+        smoke: its settings in a form of seconds.
+    """
+
+    settings: type[Any]
+    run: Callable[[Any], Any]
+    smoke: Callable[[Any], Any]
+
+
+KINDS = {
+    "training": Kind(Recipe, run, smoke),
+    "reconstruction": Kind(Comparison, compare, smoke_comparison),
+    "ablation": Kind(Ablation, ablate, smoke_ablation),
+}
+
+
+def kind_of(recipe: str | Path) -> str:
+    """The kind of experiment that a recipe's file names.
+
+    Raises:
+        ValueError: if the file cannot be read as YAML, or there is no such kind.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(recipe).read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{recipe}: not a YAML file ({error}); see the recipes in the package") from error
+    kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
+    if kind not in KINDS:
+        raise ValueError(f"{recipe}: experiment {kind!r} is none of {', '.join(KINDS)}")
+    return str(kind)

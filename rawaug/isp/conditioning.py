@@ -1,0 +1,118 @@
+r"""What the user knows of a shot, put in place of what the ISP would guess: the camera's gains, or a few RAW readings.
+
+Grey ``(1, 1, 1)`` becomes ``C 1 / g``, and the file says that it is ``1 / (wb d)``; hence ``g = wb d (C 1)``. Readings
+``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1,
+weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) against readings that lie on edges.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rawaug.isp.params import ISPParams
+
+if TYPE_CHECKING:
+    from rawaug.isp.model import DictionaryISP
+
+CLIPPED = 0.98
+SHADOW = 0.01
+"""Added to a reading where it stands for a variance: the read noise's share."""
+ROUNDS = 4
+
+
+def on_gains(
+    isp: DictionaryISP,
+    params: ISPParams,
+    white_balance: Tensor | tuple[float, ...] | None,
+    digital_gain: Tensor | float | None,
+) -> ISPParams:
+    """Put the camera's own gains, and the colour atoms of such light, in place of the chosen ones.
+
+    Args:
+        isp: whose dictionaries are used.
+        params: chosen parameters.
+        white_balance: as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``, as the file tells them.
+        digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
+
+    Raises:
+        ValueError: if a shape is another.
+    """
+    batch = len(params.gains)
+    if white_balance is not None:
+        balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
+        if balance.shape not in ((3,), (1, 3), (batch, 3)):
+            raise ValueError(f"white_balance is (3,) or ({batch}, 3), got {tuple(balance.shape)}")
+        params = _in_light(isp, params, balance.expand_as(params.gains))
+    if digital_gain is not None:
+        digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
+        if len(digital) not in (1, batch):
+            raise ValueError(f"digital_gain is one number or ({batch},), got {len(digital)}")
+        own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
+        params = params._replace(gains=params.gains / own * digital)
+    return params
+
+
+def _in_light(isp: DictionaryISP, params: ISPParams, balance: Tensor) -> ISPParams:
+    weights = isp.colour.weights_for(balance)
+    return params._replace(
+        colour_weights=weights, matrix=isp.colour.combine(weights), gains=isp.colour.gains_for(balance, weights)
+    )
+
+
+def on_samples(isp: DictionaryISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
+    """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
+
+    Readings at or above 0.98 are left out (clipped); a channel without any reading keeps its gain.
+
+    Args:
+        isp: whose reverse pass is used.
+        x: sRGB ``(B, 3, H, W)``, float.
+        params: chosen parameters.
+        raw_samples: ``(B, K, 3)`` of (row, column, value).
+        place: coordinates of the pixels, ``(1 or B, 2, H, W)``.
+
+    Raises:
+        ValueError: if ``raw_samples`` has another shape or a place outside the picture.
+    """
+    _require_places(raw_samples, x)
+    rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
+    batch = torch.arange(len(x), device=x.device)[:, None]
+    pixels = x[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+    where = place.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
+    channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
+    own = F.one_hot(channel, 3).transpose(1, 2).to(x)
+    params = _solve(isp, pixels, where, own, raw_samples[..., 2], params)
+    light = params.gains / params.matrix.sum(2) / (params.colour_weights @ isp.colour.neutral).exp()
+    weights = isp.colour.weights_for(light)
+    params = params._replace(colour_weights=weights, matrix=isp.colour.combine(weights))
+    return _solve(isp, pixels, where, own, raw_samples[..., 2], params)
+
+
+def _require_places(raw_samples: Tensor, x: Tensor) -> None:
+    if raw_samples.ndim != 3 or raw_samples.shape[0] != len(x) or raw_samples.shape[2] != 3:
+        raise ValueError(f"raw_samples is ({len(x)}, K, 3): row, column, value; got {tuple(raw_samples.shape)}")
+    sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
+    if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
+        raise ValueError(f"raw_samples: a row or column lies outside the picture, {x.shape[-2]} x {x.shape[-1]}")
+
+
+def _solve(
+    isp: DictionaryISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
+) -> ISPParams:
+    unit = params._replace(gains=torch.ones_like(params.gains))
+    x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
+    y = value[:, None].expand_as(x5)
+    usable = own * (y < CLIPPED)
+    weight = usable / (y.clamp_min(0.0) + SHADOW)
+    inverse = torch.ones_like(params.gains)
+    for _ in range(ROUNDS):
+        inverse = (weight * x5 * y).sum(2) / (weight * x5 * x5).sum(2).clamp_min(1e-12)
+        residual = (y - inverse[..., None] * x5).abs() / (y.clamp_min(0.0) + SHADOW).sqrt()
+        typical = residual.masked_fill(usable == 0, torch.nan).nanmedian(dim=2, keepdim=True).values.clamp_min(1e-6)
+        weight = usable / (y.clamp_min(0.0) + SHADOW) / (1.0 + (residual / (2.0 * typical)) ** 2)
+    known = (usable.sum(2) > 0) & (inverse > 0)
+    return params._replace(gains=torch.where(known, 1.0 / inverse.clamp_min(1e-6), params.gains))

@@ -1,0 +1,8 @@
+"""From RAW-sRGB pairs to a :class:`rawaug.isp.model.DictionaryISP`, in seconds, from one frame upwards."""
+
+from __future__ import annotations
+
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.fit import fit_isp
+
+__all__ = ["FitConfig", "fit_isp"]

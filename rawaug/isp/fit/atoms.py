@@ -1,0 +1,129 @@
+r"""From the frames' colours to the dictionaries and their constant weights.
+
+The constants minimise ``sum_f log(E_f(w) + eps)``, because the score averages decibels. ``E_f`` is the squared error
+beyond that of the frame's best gains, which is noise where the frames are noisy. It is quadratic in the inverse gains
+``u``: with second moments ``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from rawaug.isp.dictionary import log_light
+from rawaug.isp.fit.colour import FrameColour
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.samples import PixelSamples, Shot
+from rawaug.seeding import derived_seed
+
+LOG_MSE_EPS = 1e-5
+"""Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
+SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
+SPREAD_EPS = 1e-6
+"""Under the logarithm, as for the MSE: a frame that nothing predicts must not decide alone."""
+KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+PRIOR_STEPS = 400
+REACH_ATOMS = 8
+
+
+@torch.no_grad()
+def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[Shot], config: FitConfig) -> None:
+    """The frames' matrices and gains become the atoms; clusters of them where there are more frames than atoms."""
+    balance = torch.tensor([shot.white_balance for shot in shots])
+    params = colour.params()
+    light, neutral = log_light(balance), -colour.neutral(balance)[1]
+    count = isp.config.colour_atoms
+    groups = _groups(torch.cat([params.matrix.flatten(1), params.gains.log()], dim=1), count, config.seed)
+    isp.colour.matrices.copy_((groups @ params.matrix.flatten(1)).unflatten(1, (3, 3)))
+    isp.colour.light.copy_(groups @ light)
+    isp.colour.neutral.copy_(groups @ neutral)
+    isp.colour.spread.fill_(_spread(colour, balance))
+    red, green, blue = (groups @ params.gains.log()).unbind(1)
+    frames = torch.stack([green, red - green, blue - green], dim=1)
+    more = reach_atoms(isp.config.gain_atoms - count, config.reach)
+    isp.gain.log_gains.copy_(torch.cat([frames, frames.mean(0) + more]))
+
+
+def reach_atoms(count: int, reach: float) -> Tensor:
+    """``(count, 3)`` log offsets (digital, red, blue) from the frames' mean: corners of a box, tetrahedron first."""
+    corners = sorted(product((-1.0, 1.0), repeat=3), key=lambda corner: corner[0] * corner[1] * corner[2])
+    size = torch.tensor([0.25, 1.0, 1.0]) * torch.tensor(reach).log()
+    return torch.tensor(corners[:count]).reshape(-1, 3) * size
+
+
+def _groups(points: Tensor, count: int, seed: int) -> Tensor:
+    """``(count, F)`` averaging matrix: of the points themselves if there are as many, else of k-means clusters.
+
+    An empty cluster is the mean of all points.
+    """
+    if len(points) == count:
+        return torch.eye(count)
+    from scipy.cluster.vq import kmeans2
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an empty cluster, which frames that are all alike leave
+        _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derived_seed(seed, "atoms") % 2**32)
+    member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
+    used = member.sum(1, keepdim=True)
+    return torch.where(used > 0, member / used.clamp_min(1.0), torch.full_like(member, 1.0 / len(points)))
+
+
+def _spread(colour: FrameColour, balance: Tensor) -> float:
+    """The kernel width that best predicts each frame's colour from the others' in similar light."""
+    if len(balance) < 3:
+        return torch.inf
+    matrix, neutral = colour.neutral(balance)
+    values = torch.cat([matrix.flatten(1), neutral], dim=1)
+    distance = torch.cdist(log_light(balance), log_light(balance)) ** 2
+    distance.fill_diagonal_(torch.inf)
+    errors: dict[float, float] = {}
+    for width in SPREADS:
+        logits = -distance / (2.0 * width**2) if width < torch.inf else torch.where(distance.isinf(), -torch.inf, 0.0)
+        square = ((values - logits.softmax(1) @ values) ** 2).sum(1)
+        errors[width] = float((square + SPREAD_EPS).log().sum())
+    return min(errors, key=lambda width: errors[width])
+
+
+@torch.no_grad()
+def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
+    """Where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
+    errors: dict[float, float] = {}
+    for knee in KNEES:
+        isp.config = replace(isp.config, knee=knee)
+        predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.place).clamp(0.0, 1.0)
+        square = (predicted - samples.target) ** 2 * samples.site
+        errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
+    isp.config = replace(isp.config, knee=min(errors, key=lambda knee: errors[knee]))
+
+
+def set_priors(isp: DictionaryISP, samples: PixelSamples) -> None:
+    """The constant weights: all colour atoms alike, and the gains that serve the frames best."""
+    colour_weights = torch.full((isp.config.colour_atoms,), 1.0 / isp.config.colour_atoms)
+    with torch.no_grad():
+        plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
+        plain = plain._replace(gains=torch.ones(1, 3))
+        x = isp.reverse_pixels(samples.srgb, plain, samples.place)
+        a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
+    weights = best_constants(a, b, 1.0 / isp.gain.channel_gains().detach())
+    for networks in (isp.reverse_networks, isp.forward_networks):
+        networks.colour_encoder.set_prior(colour_weights)
+        networks.gain_encoder.set_prior(weights)
+
+
+def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor) -> Tensor:
+    """Weights ``(M,)`` of atoms of inverse gains ``(M, 3)`` for frames with moments ``a, b`` ``(F, 3)``."""
+    logits = torch.zeros(len(inverse_atoms), requires_grad=True)
+    optimiser = torch.optim.Adam([logits], lr=0.05)
+    for _ in range(PRIOR_STEPS):
+        u = logits.softmax(0) @ inverse_atoms
+        loss = (((u * a - b) ** 2 / a.clamp_min(1e-9)).sum(1) + LOG_MSE_EPS).log().sum()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    return logits.detach().softmax(0)

@@ -1,0 +1,160 @@
+"""Gradient descent that can be stopped and resumed: Adam with a cosine, a progress bar, a file of its state.
+
+A stage is a loss and its tensors. What a step draws is keyed by (seed, stage, step), so that a resumed stage ends with
+the same bits as one that was not stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from rawaug.seeding import keyed_generator
+
+SAVE_SECONDS = 10.0
+REPORT_STEPS = 50
+
+
+class Watched(NamedTuple):
+    """Score of a watched stage at its start, and the best one with its step."""
+
+    start: float
+    step: int
+    best: float
+
+
+class Descent:
+    """Runs the stages of a fit.
+
+    Args:
+        path: where the state is kept between runs; None keeps none.
+        key: what the state belongs to; a file with another key is not used.
+        seed: of what the steps draw.
+        progress: show progress bars.
+
+    Attributes:
+        watched: what the watched stages scored, by name.
+
+    Raises:
+        ValueError: if the file at ``path`` cannot be read.
+    """
+
+    def __init__(self, path: Path | None, key: str, seed: int, progress: bool) -> None:
+        self.path, self.key, self.seed, self.progress = path, key, seed, progress
+        self.watched: dict[str, Watched] = {}
+        self._steps: dict[str, int] = {}
+        self._tensors: dict[str, Tensor] = {}
+        if path is not None and path.is_file():
+            self._load(path)
+
+    def run(
+        self,
+        stage: str,
+        loss: Callable[[torch.Generator], Tensor],
+        tensors: Mapping[str, Tensor],
+        steps: int,
+        learning_rate: float,
+        report: Callable[[], str] | None = None,
+        watch: Callable[[], float] | None = None,
+    ) -> None:
+        """Minimise ``loss`` over ``tensors`` in place, from where a stopped run left off.
+
+        Args:
+            stage: its name, in the file and on the progress bar.
+            loss: of one step, given the step's generator.
+            tensors: what is optimised.
+            steps: of Adam.
+            learning_rate: at the start; falls to 0 by half a cosine.
+            report: called every 50 steps and after the last; its text goes to the progress bar.
+            watch: a score, taken at the start and as often; the tensors come back that had the highest.
+        """
+        optimiser = torch.optim.Adam(list(tensors.values()), lr=learning_rate)
+        start = self._restore(stage, tensors, optimiser)
+        if watch is not None and stage not in self.watched:
+            self._note(stage, 0, watch(), tensors)
+        for tensor in tensors.values():
+            tensor.requires_grad_()
+        bar = tqdm(range(start, steps), desc=stage, unit="step", leave=False, disable=None if self.progress else True)
+        saved = time.monotonic()
+        for step in bar:
+            optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+            value = loss(keyed_generator(self.seed, stage, step))
+            optimiser.zero_grad(set_to_none=True)
+            value.backward()
+            optimiser.step()
+            if (step + 1) % REPORT_STEPS == 0 or step + 1 == steps:
+                told = "" if report is None else report()
+                told += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
+                bar.set_postfix_str(f"loss {value.item():.2e} {told}")
+            if self.path is not None and time.monotonic() - saved > SAVE_SECONDS:
+                self._keep(stage, step + 1, tensors, optimiser)
+                saved = time.monotonic()
+        for tensor in tensors.values():
+            tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+        if self.path is not None and start < steps:
+            self._keep(stage, steps, tensors, optimiser)
+        if watch is not None:
+            for name, tensor in tensors.items():
+                tensor.data.copy_(self._tensors[f"{stage}, best/{name}"])
+
+    def finish(self) -> None:
+        """Remove the state: the fit is done."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+    def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
+        """Note a score, and the tensors if it is the best so far."""
+        before = self.watched.get(stage, Watched(score, step, -math.inf))
+        if stage not in self.watched or score > before.best:
+            self.watched[stage] = Watched(before.start, step, score)
+            self._tensors |= {f"{stage}, best/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
+        return f"left out {score:.2f} dB"
+
+    def _keep(self, stage: str, step: int, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> None:
+        assert self.path is not None
+        self._steps[stage] = step
+        moments = optimiser.state_dict()["state"]
+        for index, (name, tensor) in enumerate(tensors.items()):
+            self._tensors[f"{stage}/{name}"] = tensor.detach().clone()
+            for moment, value in moments.get(index, {}).items():
+                self._tensors[f"{stage}/{name}/{moment}"] = value.clone()
+        header = {"key": self.key, "steps": json.dumps(self._steps), "watched": json.dumps(self.watched)}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        partial = self.path.with_name(self.path.name + ".new")
+        partial.write_bytes(save({name: value.contiguous() for name, value in self._tensors.items()}, header))
+        partial.replace(self.path)
+
+    def _load(self, path: Path) -> None:
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                header = file.metadata() or {}
+                if header.get("key") == self.key:
+                    self._steps = json.loads(header["steps"])
+                    self.watched = {k: Watched(*values) for k, values in json.loads(header["watched"]).items()}
+                    self._tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        except SafetensorError as error:
+            raise ValueError(f"{path}: the state of a stopped fit cannot be read ({error}); delete it") from error
+
+    @torch.no_grad()
+    def _restore(self, stage: str, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> int:
+        step = self._steps.get(stage, 0)
+        if step:
+            state = {}
+            for index, (name, tensor) in enumerate(tensors.items()):
+                tensor.copy_(self._tensors[f"{stage}/{name}"])
+                prefix = f"{stage}/{name}/"
+                moments = {k[len(prefix) :]: v for k, v in self._tensors.items() if k.startswith(prefix)}
+                if moments:
+                    state[index] = moments
+            optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+        return step

@@ -1,0 +1,105 @@
+r"""Encoders, last, with tone and dictionaries frozen, and only where frames that were left out say that they help.
+
+``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``: the RAW that the weights of the reverse
+encoders make, the same for the forward encoders', and the consistency of the two (Conde et al., AAAI 2022, "Training").
+Trained together with the rest on few frames, encoders learn the frames by heart and take tone and matrices with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rawaug.isp.fit.atoms import LOG_MSE_EPS, set_priors
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.losses import apart, decibels, mean_square
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.samples import PixelSamples, Shot
+
+FEWEST_FRAMES = 12
+FOLDS = 4
+STEPS = 200
+FRAMES_A_STEP = 4
+PIXELS_A_STEP = 1024
+LEARNING_RATE = 1e-3
+CONSISTENCY = 1.0
+
+
+def train_encoders(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
+) -> None:
+    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` tells which."""
+    wanted = config.encoders
+    if wanted == "auto" and len(shots) >= FEWEST_FRAMES:
+        gain = _gain_on_frames_left_out(isp, samples, shots, descent)
+        isp.info["encoders_gain_db"] = round(gain, 2)
+        wanted = "on" if gain > 0 else "off"
+    if wanted == "on":
+        _train(isp, samples, shots, list(range(len(shots))), descent, "encoders")
+    isp.use_encoders(wanted == "on")
+
+
+def _train(
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[Shot],
+    frames: Sequence[int],
+    descent: Descent,
+    stage: str,
+) -> None:
+    isp.use_encoders(True)
+    tensors = {name: p for name, p in isp.named_parameters() if "_encoder.layers" in name}
+
+    def loss(generator: torch.Generator) -> Tensor:
+        chosen = torch.randint(len(frames), (FRAMES_A_STEP,), generator=generator).tolist()
+        pixels = torch.randint(samples.srgb.shape[-1], (PIXELS_A_STEP,), generator=generator)
+        each = [_frame_loss(isp, samples, shots, frames[k], pixels, generator) for k in chosen]
+        return torch.stack(each).mean()
+
+    descent.run(stage, loss, tensors, STEPS, LEARNING_RATE)
+
+
+def _frame_loss(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, g: torch.Generator
+) -> Tensor:
+    part = samples.pick(pixels, torch.tensor([frame]))
+    srgb, raw = _same_piece(shots[frame].srgb, shots[frame].raw, g)
+    ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
+    errors = (mean_square(isp, part, ours) + LOG_MSE_EPS).log() + (mean_square(isp, part, theirs) + LOG_MSE_EPS).log()
+    return errors.sum() + CONSISTENCY * apart(ours, theirs)
+
+
+def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """The same random piece of both thumbnails, flipped or not: the encoders must not learn the frames by heart."""
+    share = 0.5 + 0.5 * torch.rand(2, generator=generator)
+    start = torch.rand(2, generator=generator) * (1.0 - share)
+    flip = bool(torch.rand((), generator=generator) < 0.5)
+    pieces = []
+    for image in (srgb, raw):
+        sides = torch.tensor(image.shape[-2:])
+        top, left = (start * sides).long().tolist()
+        height, width = (share * sides).long().clamp_min(1).tolist()
+        piece = image[..., top : top + height, left : left + width]
+        pieces.append(piece.flip(-1) if flip else piece)
+    return pieces[0], pieces[1]
+
+
+def _gain_on_frames_left_out(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], descent: Descent
+) -> float:
+    """Mean dB by which encoders beat constants on frames that neither has seen; leaves the ISP as it was."""
+    start = {name: value.clone() for name, value in isp.state_dict().items()}
+    gain = 0.0
+    for fold in range(FOLDS):
+        out = list(range(fold, len(shots), FOLDS))
+        kept = [k for k in range(len(shots)) if k not in out]
+        set_priors(isp, samples.pick(torch.arange(samples.srgb.shape[-1]), torch.tensor(kept)))
+        _train(isp, samples, shots, kept, descent, f"encoders without part {fold + 1} of {FOLDS}")
+        for enabled, sign in ((True, 1.0), (False, -1.0)):
+            isp.use_encoders(enabled)
+            gain += sign * len(out) * decibels(isp, samples, shots, out)
+        isp.load_state_dict(start)
+    return gain / len(shots)

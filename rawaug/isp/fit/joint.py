@@ -1,0 +1,60 @@
+r"""End-to-end training, as in the paper, of an ISP that is already fitted.
+
+``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on random pixels of random
+frames; both passes use the weights that their own encoders choose. A tenth of the frames is left out and watched: the
+parameters come back that served these best, which may be those of the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.losses import apart, cycle_error, decibels, mean_square
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.samples import PixelSamples, Shot
+
+MANY_FRAMES = 50
+STEPS = 1000
+FRAMES_A_STEP = 4
+LEARNING_RATE = 2e-4
+CONSISTENCY = 0.01
+
+
+def train_jointly(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
+) -> None:
+    """Refine everything at once, if ``config.joint_steps`` says so; ``isp.info`` tells what it brought."""
+    steps = config.joint_steps if config.joint_steps is not None else (STEPS if len(shots) >= MANY_FRAMES else 0)
+    if steps == 0:
+        return
+    if len(shots) < 2:
+        raise ValueError("joint_steps: end-to-end training leaves frames out to watch; give two frames or more")
+    watched = list(range(0, len(shots), 10))[: max(1, len(shots) // 2)]
+    trained = [k for k in range(len(shots)) if k not in watched]
+
+    def loss(generator: torch.Generator) -> Tensor:
+        chosen = torch.randint(len(trained), (FRAMES_A_STEP,), generator=generator).tolist()
+        pixels = torch.randint(samples.srgb.shape[-1], (config.batch,), generator=generator)
+        return torch.stack([_frame_loss(isp, samples, shots, trained[k], pixels) for k in chosen]).mean()
+
+    def watch() -> float:
+        return decibels(isp, samples, shots, watched)
+
+    tensors = {name: p for name, p in isp.named_parameters() if isp.encoders_in_use or "_encoder.layers" not in name}
+    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=watch)
+    seen = descent.watched["end to end"]
+    isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
+
+
+def _frame_loss(isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor) -> Tensor:
+    part = samples.pick(pixels, torch.tensor([frame]))
+    ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(shots[frame].raw)
+    back: dict[str, Tensor] = {}
+    isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
+    cycle = cycle_error(isp, part, theirs, back)
+    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * apart(ours, theirs)

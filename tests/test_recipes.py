@@ -1,0 +1,126 @@
+"""Every recipe: it opens with its commands, it loads, an unknown key fails, and its stages run in their smoke form."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rawaug.cli import main
+from rawaug.data import open_pairs, open_pictures
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, smoke
+
+FOLDER = Path(__file__).parents[1] / "recipes"
+OTHER_RUNNERS = {"reconstruction", "ablation"}
+"""Recipes of another kind, which have tests of their own."""
+
+NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
+NAMES = [name for name in NAMES if name not in OTHER_RUNNERS]
+
+
+@pytest.fixture(params=NAMES)
+def name(request: pytest.FixtureRequest) -> str:
+    value: str = request.param
+    return value
+
+
+@pytest.fixture(autouse=True, scope="module")
+def data_made_once() -> Iterator[None]:
+    """The demo's scenes take longer to make than a smoke run takes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rawaug.experiment.run.open_pictures", cache(open_pictures))
+        patch.setattr("rawaug.experiment.run.open_pairs", cache(open_pairs))
+        yield
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr with which ``arguments`` are refused."""
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def test_the_recipes_are_all_there() -> None:
+    assert {"fewshot", "unsupervised", "synthetic", "sidd/full", "sidd/fewshot", "sidd/unsupervised"} <= set(NAMES)
+
+
+def test_it_opens_with_its_commands_and_their_cost(name: str) -> None:
+    lines = find_recipe(name).read_text().splitlines()
+    head = "\n".join(lines[: next(k for k, line in enumerate(lines) if not line.startswith("#"))])
+    commands = re.findall(r"^#   rawaug run (\S+)", head, re.MULTILINE)
+    assert len(commands) >= 3 and set(commands) == {name}
+    assert "--seeds 3" in head and "--smoke" in head
+    assert re.search(r"about \d+ (minutes|hours)", head)
+    assert "on a GPU" in "\n".join(lines) or "on a CPU" in "\n".join(lines)
+    assert max(map(len, lines)) <= 120
+
+
+def test_an_unknown_key_is_named(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = find_recipe(name).read_text()
+    mine = tmp_path / "mine.yaml"
+    for place, bogus in (("train:\n", "train:\n  stepz: 3\n"), ("name:", "nmae: x\nname:")):
+        assert place in text
+        mine.write_text(text.replace(place, bogus, 1))
+        assert re.search("stepz|nmae", refused(capsys, "run", str(mine)))
+
+
+def test_its_smoke_form_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", name, "--smoke", "--out", str(tmp_path)]) == 0
+    arms = yaml.safe_load(find_recipe(name).read_text())["arms"]
+    (folder,) = tmp_path.iterdir()
+    results = json.loads((folder / "results.json").read_text())
+    assert set(results["results"]) == set(arms)
+    text = capsys.readouterr().out
+    for arm in arms:
+        (scores,) = results["results"][arm]
+        assert 20.0 < scores["plain"]["psnr"] < 60.0 and 10.0 < scores["self_ensemble"]["psnr_srgb"] < 60.0
+        assert arm[:8] in text
+    assert (folder / "report.html").stat().st_size > 50_000
+
+
+def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quick = [
+        "--train.validate_every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test_count", "1",
+        "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]",
+    ]  # fmt: skip
+    command = ["run", "synthetic", "--seed", "3", "--seeds", "2", "--steps", "2", "--device", "cpu"]
+    assert main([*command, *quick, "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "synthetic" / "results.json").read_text())
+    assert [len(runs) for runs in results["results"].values()] == [2, 2]
+    assert {path.name for path in (tmp_path / "synthetic").glob("seed*")} == {"seed3", "seed4"}
+    assert results["recipe"]["train"]["steps"] == 2
+    weights = tmp_path / "synthetic" / "seed3" / "convex" / "denoiser.safetensors"
+    before = weights.stat().st_mtime_ns
+    assert main([*command, *quick, "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("trained already") == said.count("evaluated already") == 4
+    assert weights.stat().st_mtime_ns == before
+
+
+def test_what_cannot_be_run_is_refused_before_anything_is_fitted(capsys: pytest.CaptureFixture[str]) -> None:
+    arm = {"real": ArmConfig()}
+    with pytest.raises(ValueError, match="at least one way"):
+        Recipe()
+    with pytest.raises(ValueError, match=r"data\.pairs: an ISP is fitted"):
+        Recipe(arms=arm, data=DataConfig(pairs=None))
+    with pytest.raises(ValueError, match="do not mix"):
+        Recipe(arms={**arm, "r2r": ArmConfig(estimator="r2r")})
+    with pytest.raises(ValueError, match="augmented: 1"):
+        Recipe(arms=arm, data=DataConfig(pairs=None), camera="universal")
+    assert "Median is unknown" in refused(capsys, "run", "fewshot", "--classical", "[Median]")
+    assert "sidd/full" in refused(capsys, "run", "sidd/nothing")
+
+
+def test_a_smoke_run_keeps_what_the_recipe_compares() -> None:
+    recipe = Recipe(name="a/b", arms={"r2r": ArmConfig(0.5, estimator="r2r")}, seeds=3, steps=10**6, device="cuda")
+    quick = smoke(recipe)
+    assert quick.arms == recipe.arms and quick.self_supervised
+    assert (quick.name, quick.seeds, quick.train.steps, quick.device) == ("b-smoke", 1, 4, "cpu")
