@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
+BENCHMARKS := augment folder fuzz loader noise synth
+
 .PHONY: demo test lint docs bench clean
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without augmentation
@@ -20,8 +22,8 @@ lint: $(VENV)/.test
 docs: $(VENV)/.docs
 	$(BIN)/mkdocs build --strict
 
-bench: $(VENV)/.demo
-	$(BIN)/python benchmarks/noise.py
+bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly
+	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name --quick || exit 1; done
 
 clean:
 	rm -rf $(VENV) runs build site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,6 +1,6 @@
 """What a large folder of pictures with damaged files costs: its start, an epoch with workers, and their memory.
 
-    python benchmarks/folder.py [--files 20000] [--damaged 0.01] [--workers 2] [--json FILE]
+    python benchmarks/folder.py [--files 20000] [--damaged 0.01] [--workers 2] [--quick] [--json FILE]
 
 The folder is made first, in a temporary place: small JPEGs in a hundred subfolders, of which a share is truncated,
 empty, text, or a link to nowhere. Printed are the seconds until the dataset is there and until the first batch, the
@@ -93,7 +93,9 @@ def main() -> int:
     parser.add_argument("--damaged", type=float, default=0.01, help="share of them")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--quick", action="store_true", help="2,000 files")
     args = parser.parse_args()
+    args.files = min(args.files, 2000) if args.quick else args.files
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,6 +1,6 @@
 """What rawaug costs a training: a whole DataLoader, and a training step, with it and without, as ratios.
 
-    python benchmarks/loader.py [PICTURES] [--json FILE] [--workers N] [--device cpu|cuda]
+    python benchmarks/loader.py [PICTURES] [--json FILE] [--workers N] [--device cpu|cuda] [--quick]
     python benchmarks/loader.py [PICTURES] --memory [--epochs 10]
 
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
@@ -148,7 +148,9 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=32, help="of the U-Net")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--quick", action="store_true", help="one repeat, batches of 4")
     args = parser.parse_args()
+    args.repeats, args.batch = (1, 4) if args.quick else (args.repeats, args.batch)
     name = torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else platform.processor()
     machine = f"{name or platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}"
     print(f"{args.workers} workers, batches of {args.batch} x {args.crop} x {args.crop} ({machine})")

@@ -1,6 +1,6 @@
 """What noise costs: the time of ``apply`` as a ratio to that of the random numbers alone.
 
-    python benchmarks/noise.py [--json FILE] [--threads N] [--device cpu|cuda]
+    python benchmarks/noise.py [--json FILE] [--threads N] [--device cpu|cuda] [--quick]
 
 The random numbers alone are, for each picture, one ``normal_`` from a generator of its own; for exact photon
 statistics, ``torch.poisson`` of the same rates and one ``normal_``. All are timed in turn, and the fastest run of each
@@ -79,7 +79,9 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="as in a DataLoader's worker")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--quick", action="store_true", help="two repeats")
     args = parser.parse_args()
+    args.repeats = 2 if args.quick else args.repeats
     torch.set_num_threads(args.threads)
     name = torch.cuda.get_device_name(args.device) if args.device.type == "cuda" else platform.processor()
     machine = f"{name or platform.machine()}, {args.threads} threads, torch {torch.__version__}"

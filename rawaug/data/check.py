@@ -1,11 +1,14 @@
 """What is in a folder: which dataset, how much of it, of which sizes, patterns and levels, and what is broken.
 
 Everything is read once, as training would read it. A folder is recognised by the names that its publishers gave to the
-files; what has none of these is a folder of RAW files, of pictures, or both.
+files; what has none of these is a folder of RAW files, of pictures, or both. Reading takes place in a process of its
+own: where a damaged file crashes the library that decodes it, the file is named, and another process goes on. (RAW
+files are read in this one: LibRaw's threads do not survive a fork.)
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
 from collections import Counter
@@ -16,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from rawaug.data import picture_folder, raw_folder
 from rawaug.data.dnd import Dnd
@@ -31,6 +35,7 @@ from rawaug.data.zurich import Zurich
 from rawaug.io import RawFrame, read_raw
 
 _SHOWN = 6
+_CRASHES = 5
 
 
 @dataclass
@@ -54,6 +59,15 @@ class PartReport:
     levels: Counter[str] = field(default_factory=Counter)
     signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
+
+    def add(self, other: PartReport) -> None:
+        """Count what another report tells; one damaged file of many blocks is one line."""
+        for name in ("sizes", "cfas", "cameras", "levels"):
+            getattr(self, name).update(getattr(other, name))
+        if other.signal is not None:
+            low, high = self.signal or other.signal
+            self.signal = min(low, other.signal[0]), max(high, other.signal[1])
+        self.broken += [line for line in other.broken if line not in self.broken]
 
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} of them examined"
@@ -176,14 +190,55 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
-    for index in range(part.examined):
-        try:
-            _take(part, items.read(index) if isinstance(items, PictureFolder) else items[index])
-        except (OSError, ValueError) as error:
-            line = " ".join(str(error).split())
-            if line not in part.broken:  # one damaged file of many blocks is one line
-                part.broken.append(line)
+    found = _facts(items, part.examined)
+    for facts in found:
+        part.add(facts)
+    if len(found) < part.examined:
+        part.broken.append(f"nothing is read after {_CRASHES} crashes; replace these files first")
+        part.examined = len(found)
     return part
+
+
+class _Facts(Dataset[PartReport]):
+    """What a report tells of each item by itself."""
+
+    def __init__(self, items: Any) -> None:
+        self.items = items
+
+    def __getitem__(self, index: int) -> PartReport:
+        facts = PartReport("")
+        try:
+            _take(facts, self.items.read(index) if isinstance(self.items, PictureFolder) else self.items[index])
+        except (OSError, ValueError) as error:
+            facts.broken.append(" ".join(str(error).split()))
+        return facts
+
+
+def _facts(items: Any, count: int) -> list[PartReport]:
+    """The facts of the first items, read in a forked process where that can be."""
+    fork = {"num_workers": 1, "prefetch_factor": 1, "multiprocessing_context": "fork"}
+    forks = "fork" in multiprocessing.get_all_start_methods() and not isinstance(items, _RawFrames)
+    apart: dict[str, Any] = fork if forks else {}
+    found: list[PartReport] = []
+    crashes = 0
+    while len(found) < count and crashes < _CRASHES:
+        loader = DataLoader(
+            _Facts(items), None, sampler=range(len(found), count), collate_fn=lambda facts: facts, **apart
+        )
+        try:
+            for facts in loader:
+                found.append(facts)  # one by one: what was found before a crash stays
+        except RuntimeError as error:
+            if not (crash := re.search(r"DataLoader worker.*(killed by signal.*|exited.*)", str(error))):
+                raise
+            crashes += 1
+            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes its decoder ({crash[1]})"]))
+    return found
+
+
+def _name(items: Any, index: int) -> str:
+    names = getattr(items, "names", None)
+    return f"number {index + 1}" if names is None else f"{names[index]}"
 
 
 def _take(part: PartReport, item: Any) -> None:
@@ -201,5 +256,4 @@ def _take(part: PartReport, item: Any) -> None:
         part.levels[f"shot_var {item.shot_var:.1e}, read_var {item.read_var:.1e}"] += 1
     if camera := getattr(item, "camera", None):
         part.cameras[camera] += 1
-    low, high = part.signal or (float("inf"), float("-inf"))
-    part.signal = min(low, raw.min().item()), max(high, raw.max().item())
+    part.signal = raw.min().item(), raw.max().item()

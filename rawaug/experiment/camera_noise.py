@@ -17,6 +17,8 @@ from rawaug.experiment.stream import aligned
 from rawaug.io import read_raw
 from rawaug.noise import NoiseEstimate, estimate_noise, from_dark_frames
 
+WORST_FIT = 0.5
+"""R^2 below which the points are no line."""
 MOST_FRAMES = 16
 """Frames that are measured at most: they are in memory together."""
 
@@ -37,7 +39,12 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
     if dark is not None:
         frames, dark_cfa = _mosaics(RawFolder(dark))
         read_var = from_dark_frames(frames, dark_cfa).read_var
-    return estimate_noise(mosaics, cfa, read_var=read_var)
+    estimate = estimate_noise(mosaics, cfa, read_var=read_var)
+    if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
+        raise ValueError(
+            f"noise: the frames do not lie on one line (R^2 {estimate.r2:.2f}); measure one camera at one ISO at a time"
+        )
+    return estimate
 
 
 def _mosaics(pairs: Sequence[Pair]) -> tuple[list[Tensor], CFA]:

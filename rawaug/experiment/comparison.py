@@ -47,6 +47,7 @@ class Comparison:
         data: the pairs, registered, of one CFA.
         methods: families to fit: dictionary, dictionary-encoders and the baselines.
         seconds: budget of methods that learn by descent, reading not counted.
+        crop, batch: of these methods' training: small ones give more steps to a short budget.
         longer: a second budget for them, as a factor; 0 leaves it out.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
@@ -63,6 +64,8 @@ class Comparison:
     data: str = "demo:train"
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
     seconds: float = 20.0
+    crop: int = 64
+    batch: int = 2
     longer: float = 0.0
     longer_frames: int = 2
     patches: int | None = 8
@@ -160,13 +163,14 @@ class _Comparison:
         """Fitted without one frame, scored on it."""
         settings, left_out = self.settings, self.pairs[frame]
         seconds = settings.seconds * scale
-        key = fingerprint(family, seconds, seed, settings.patches, asdict(settings.fit), [p.name for p in self.pairs])
+        budget = (seconds, settings.crop, settings.batch)
+        key = fingerprint(family, budget, seed, settings.patches, asdict(settings.fit), [p.name for p in self.pairs])
         path = self._path(f"{family}-x{scale:g}-without-{left_out.name}-seed{seed}")
         if (known := _read(path, key)) is not None:
             return known
-        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], settings.fit, seconds, seed)
+        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], settings.fit, budget, seed)
         result = score_rows(fitted, left_out, settings.patches)
-        result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters}
+        result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
         write_json(result, path)
         return result
 
@@ -180,7 +184,8 @@ class _Comparison:
         path = self._path(f"{family}-all-frames")
         if (known := _read(path, key)) is not None:
             return known
-        fitted = fit_family(family, self.pairs, settings.fit, settings.seconds, settings.seed)
+        budget = (settings.seconds, settings.crop, settings.batch)
+        fitted = fit_family(family, self.pairs, settings.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
         if downstream:
             place = self.folder / f"{family}-denoisers"

@@ -29,7 +29,7 @@ from rawaug.metrics import PATCH, psnr
 from rawaug.seeding import derived_seed, keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
-ROWS = {"dictionary": "blind", "as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
+ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
 ORACLE_STEPS = 300
 
@@ -51,8 +51,10 @@ class Fitted(NamedTuple):
     parameters: int
 
 
-def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, seconds: float, seed: int) -> Fitted:
-    """Fit a family to pairs of one CFA; methods that learn by descent get ``seconds``."""
+def fit_family(
+    family: str, pairs: Sequence[Pair], config: FitConfig, budget: tuple[float, int, int], seed: int
+) -> Fitted:
+    """Fit a family to pairs of one CFA; methods that learn by descent have a budget of (seconds, crop, batch)."""
     start = time.perf_counter()
     if family.startswith("dictionary"):
         isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
@@ -60,7 +62,8 @@ def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, seconds: f
     with torch.random.fork_rng():
         torch.manual_seed(derived_seed(seed, "baseline"))
         model = BASELINES[family](cfa=pairs[0].cfa)
-    fit_baseline(model, pairs, seconds=seconds, seed=seed)
+    seconds, crop, batch = budget
+    fit_baseline(model, pairs, seconds, crop=crop, batch=batch, seed=seed)
     return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
 
 

@@ -123,7 +123,8 @@ class DictionaryISP(nn.Module):
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: camera setting; chosen by the encoders (or their constants) if not given.
-            white_balance: the camera's as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``; they choose the colour atoms of such light as well.
+            white_balance: the camera's as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``;
+                they choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.conditioning.on_samples`).

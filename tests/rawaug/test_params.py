@@ -62,6 +62,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
     with pytest.raises(ValueError, match=r"other.*no rawaug parameters"):
         load_params(tmp_path / "other.safetensors")
+    save_file({"place": torch.zeros(5)}, tmp_path / "part.safetensors", {"kind": "augment_params"})
+    with pytest.raises(ValueError, match=r"part\.safetensors: .* missing"):
+        load_params(tmp_path / "part.safetensors")
     (tmp_path / "text.safetensors").write_text("not this")
     with pytest.raises(ValueError, match=r"text.*not a readable"):
         load_params(tmp_path / "text.safetensors")

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +13,7 @@ import torch
 from scipy.io import savemat
 
 from rawaug.cli import main
-from rawaug.data import check
+from rawaug.data import PictureFolder, check
 from rawaug.data.sidd_scenes import HELD_BACK
 from rawaug.io import write_picture
 
@@ -77,6 +80,28 @@ def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
     savemat(tmp_path / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
     report = check(tmp_path, first=5)
     assert len(report.broken) == 1 and "values run from 2 to 2" in report.broken[0]
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+@pytest.mark.parametrize("crash", [lambda: os.kill(os.getpid(), signal.SIGSEGV), lambda: os._exit(1)])
+def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crash: Callable[[], None]
+) -> None:
+    write_pictures(tmp_path)
+
+    def read(folder: PictureFolder, index: int) -> torch.Tensor:
+        if folder.names[index] == "1.png":
+            crash()
+        return torch.zeros(3, 8, 8, dtype=torch.uint8)
+
+    monkeypatch.setattr(PictureFolder, "read", read)
+    (part,) = check(tmp_path).parts
+    assert dict(part.sizes) == {"8 x 8": 2}
+    assert len(part.broken) == 1 and part.broken[0].startswith("1.png: crashes its decoder")
+    monkeypatch.setattr(PictureFolder, "read", lambda folder, index: crash())
+    write_pictures(tmp_path, 9)
+    (part,) = check(tmp_path).parts
+    assert part.examined == 5 and len(part.broken) == 6 and "nothing is read after 5 crashes" in part.broken[-1]
 
 
 def test_what_is_unknown_is_told(tmp_path: Path) -> None:

@@ -160,10 +160,12 @@ def test_incomplete_and_damaged_frames_are_told(tmp_path: Path, mat73: Writer) -
     mat73(gt, {"x": clean_frame(CFA.RGGB, 64, 64)[0].numpy()})
     with pytest.raises(ValueError, match=r"the clean and the noisy frame differ in size"):
         frames[0]
-    savemat(tmp_path / name / "0001_METADATA_RAW_010.MAT", {"metadata": {"Make": "Apple"}})
     gt.write_bytes(content)
-    with pytest.raises(ValueError, match=r"0001_METADATA_RAW_010\.MAT: tells no AsShotNeutral and ColorMatrix2"):
-        frames[0]
+    black = {"AsShotNeutral": np.array([0.5, 1.0, 0.0]), "ColorMatrix2": COLOUR.ravel()}
+    for tags in ({"Make": "Apple"}, black, {**black, "AsShotNeutral": np.ones(3), "ColorMatrix2": np.full(9, np.nan)}):
+        savemat(tmp_path / name / "0001_METADATA_RAW_010.MAT", {"metadata": tags})
+        with pytest.raises(ValueError, match=r"0001_METADATA_RAW_010\.MAT: tells no AsShotNeutral and ColorMatrix2"):
+            frames[0]
 
 
 SIDE = 8

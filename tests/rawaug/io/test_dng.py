@@ -162,6 +162,25 @@ def test_directories_are_copied_in_either_byte_order(tmp_path: Path) -> None:
         assert tiff.byteorder == ">" and "MakerNote" not in tiff.pages.first.tags["ExifTag"].value
 
 
+def test_any_camera_name_and_exposure_can_be_told(tmp_path: Path) -> None:
+    numbers = np.full((32, 32), 900, np.uint16)
+    shot = Exposure(5000.0, 2.8, 35.0, "2020:02:29 12:00:00")
+    frame = a_frame(numbers, CFA.RGGB, (0, 0, 0, 0), 1023, camera="Möller Kamera", exposure=shot)
+    write_dng(tmp_path / "a.dng", frame)
+    read = read_raw(tmp_path / "a.dng")
+    assert read.exposure.seconds == pytest.approx(5000.0) and read.camera == frame.camera
+    with pytest.raises(ValueError, match="does not fit a DNG"):
+        write_dng(tmp_path / "b.dng", dataclasses.replace(frame, white_balance=(1e-12, 1.0, 1.0)))
+
+
+@pytest.mark.parametrize("profile", [(float("nan"), 1e-5), (1e-3, float("inf")), (-1e-3, 1e-5)])
+def test_a_damaged_tag_is_one_line(tmp_path: Path, profile: tuple[float, float]) -> None:
+    frame = a_frame(np.full((32, 32), 900, np.uint16), CFA.RGGB, (0, 0, 0, 0), 1023, noise_profile=profile)
+    write_dng(tmp_path / "a.dng", frame)
+    with pytest.raises(OSError, match=r"a\.dng: its TIFF tags are damaged \(NoiseProfile"):
+        read_raw(tmp_path / "a.dng")
+
+
 def test_what_16_bits_cannot_hold_is_refused(tmp_path: Path) -> None:
     frame = a_frame(np.full((32, 32), 500, np.uint16), CFA.RGGB, (0,) * 4, 1023)
     noisy = dataclasses.replace(frame, mosaic=frame.mosaic - 0.6)

@@ -123,3 +123,23 @@ def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cut.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(ValueError, match=r"cut\.safetensors"):
         DictionaryISP.from_pretrained(tmp_path / "cut.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ('"colour_atoms\\": 3', '"colour_atoms\\": 9', "tensor colour.* does not fit its configuration"),
+        ('"gain_atoms\\": 5,', '"gain_atomz\\": 5,', "its configuration is damaged .*gain_atomz"),
+        ('"cfa\\": \\"RGGB', '"cfa\\": \\"RGGG', "its configuration is damaged"),
+        ("reverse_networks.gamma", "reverse_networks.gumma", "tensor reverse_networks.gamma does not fit"),
+    ],
+)
+def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, told: str) -> None:
+    path = tmp_path / "camera.safetensors"
+    DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=5, encoder_widths=(4, 4, 4))).save(path)
+    content = path.read_bytes()
+    assert before.encode() in content
+    path.write_bytes(content.replace(before.encode(), after.encode()))
+    with pytest.raises(ValueError, match=told) as caught:
+        DictionaryISP.from_pretrained(path)
+    assert "camera.safetensors" in str(caught.value) and "\n" not in str(caught.value)

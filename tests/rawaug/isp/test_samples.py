@@ -18,7 +18,9 @@ SHIFTS = [(0, 0), (4, -6), (-3, 5), (7, 2), (-8, -1)]
 
 def displaced(exact_pair: Callable[..., Pair], dy: int, dx: int) -> Pair:
     """A textured pair whose sRGB lies ``dy`` down and ``dx`` right of its RAW."""
-    texture = torch.nn.functional.avg_pool2d(torch.rand(1, 3, 164, 196, generator=torch.Generator().manual_seed(2)), 5, 1)
+    texture = torch.nn.functional.avg_pool2d(
+        torch.rand(1, 3, 164, 196, generator=torch.Generator().manual_seed(2)), 5, 1
+    )
     texture = 0.1 + 0.8 * (texture - texture.amin()) / (texture.amax() - texture.amin())
     whole = exact_pair("whole", WB, 0, picture=texture[0])
     raw, srgb = whole.raw[:, 16:144, 16:176], whole.srgb[:, 16 - dy : 144 - dy, 16 - dx : 176 - dx]

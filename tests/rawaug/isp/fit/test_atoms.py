@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 from rawaug.data.pairs import Pair
 from rawaug.isp.conditioning import on_gains
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit import fit as stages_of_a_fit
 from rawaug.isp.fit.atoms import best_constants, reach_atoms
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
@@ -25,6 +26,11 @@ def oracle_gains(isp: DictionaryISP, gains: tuple[float, float, float]) -> torch
     one = 1e3 * torch.ones(1, len(inverse)).double()
     weights, _ = nnls(torch.cat([inverse.T, one]).numpy(), torch.cat([wanted, one[0, :1]]).numpy())
     return torch.as_tensor(weights) @ inverse / wanted
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 20)  # the curve of these frames is where the fit starts
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, descent, fit_isp
+from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp
+from rawaug.isp.fit import fit as stages_of_a_fit
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
@@ -21,6 +22,8 @@ TINY = FitConfig(steps=12, pixels=512, batch=128)
 def save_and_report_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(descent, "SAVE_SECONDS", -1.0)
     monkeypatch.setattr(descent, "REPORT_STEPS", 5)
+    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 12)
+    monkeypatch.setattr(atoms, "PRIOR_STEPS", 20)
 
 
 def stopped_at(step: int) -> Callable[[torch.Tensor], Callable[[torch.Generator], torch.Tensor]]:
@@ -44,7 +47,7 @@ def stopped_at(step: int) -> Callable[[torch.Tensor], Callable[[torch.Generator]
 def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False, steps: int = 20) -> torch.Tensor:
     x = torch.zeros(3)
     loss = stopped_at(stop)(x)
-    score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None  # noqa: E731
+    score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None
     Descent(path, key, 0, False).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
     return x
 
@@ -105,11 +108,11 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
 
     # of other settings, or of frames about which the files say something else, it is not used
     liar = replace(exact_pairs[0], white_balance=(1.0, 1.0, 1.0))
-    for pairs, config in ((exact_pairs[:1], replace(TINY, learning_rate=1e-3)), ([liar], TINY)):
+    for pairs, config in ((exact_pairs, replace(TINY, learning_rate=1e-3)), ([liar, *exact_pairs[1:]], TINY)):
         state.write_bytes(stopped)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Descent, "_restore", _refusing(Descent._restore))
-            fit_isp(pairs, replace(config, steps=2), progress=False, state=state)
+            fit_isp(pairs, config, progress=False, state=state)
 
 
 def _refusing(restore: Callable[..., int]) -> Callable[..., int]:

@@ -9,36 +9,36 @@ import torch
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp
+from rawaug.isp.fit import fit as stages_of_a_fit
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
-SETTINGS = {"encoder_widths": (4, 4, 4)}
+SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoders, "STEPS", 25)
+    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 20)
+    monkeypatch.setattr(encoders, "STEPS", 40)
     monkeypatch.setattr(encoders, "FOLDS", 2)
     monkeypatch.setattr(encoders, "FRAMES_A_STEP", 2)
     monkeypatch.setattr(encoders, "PIXELS_A_STEP", 64)
-    monkeypatch.setattr(encoders, "LEARNING_RATE", 2e-2)
+    monkeypatch.setattr(encoders, "LEARNING_RATE", 1.5e-2)
     for module in (atoms, encoders):  # constants that are a compromise between the two lights, not one of them
         monkeypatch.setattr(module, "LOG_MSE_EPS", 1e-3)
 
 
 def config(wanted: str) -> FitConfig:
-    return FitConfig(
-        atoms=2, reach=1.0, steps=0, pixels=512, batch=64, shading="off", encoders=wanted, isp=SETTINGS
-    )  # type: ignore[arg-type]
+    return FitConfig(atoms=2, reach=1.0, steps=0, pixels=512, batch=64, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
 
 
 def frames(exact_pair: Callable[..., Pair], count: int, telling: bool) -> list[Pair]:
-    """Tiny frames in one of two lights; the brightness of the picture tells which, or has nothing to do with it."""
+    """Tiny frames in one of two lights. Brightness tells which, or says the contrary every other time."""
     pairs = []
     for k in range(count):
-        colours = torch.rand(3, 4, 4, generator=torch.Generator().manual_seed(k)).repeat_interleave(6, 1)
+        colours = torch.rand(3, 4, 4, generator=torch.Generator().manual_seed(k)).repeat_interleave(4, 1)
         light = k // 2 % 2
-        bright = light if telling else k // 4 % 2
-        picture = colours.repeat_interleave(6, 2) * 0.4 + (0.45 if bright else 0.15)
+        bright = light if telling or k % 2 else 1 - light
+        picture = colours.repeat_interleave(4, 2) * 0.4 + (0.45 if bright else 0.15)
         pairs.append(exact_pair(f"shot{k}", LIGHTS[light], k, picture=picture))
     return pairs
 
@@ -48,7 +48,7 @@ def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
     isp = fit_isp(pairs, config("on"), progress=False)
     assert isp.encoders_in_use and isp.config.encoders
     dark, bright = (isp.choose(pairs[k].srgb[None]).gains[0] for k in (0, 2))
-    assert dark[0] < bright[0] - 0.2 and dark[2] > bright[2] + 0.2
+    assert dark[0] < bright[0] - 0.01 and dark[2] > bright[2] + 0.01
     theirs = isp.choose_forward(torch.rand(1, 3, 8, 8)).gain_weights
     assert not torch.allclose(theirs, isp.choose_forward(0.1 * torch.rand(1, 3, 8, 8)).gain_weights)
 
@@ -60,13 +60,13 @@ def test_auto_leaves_the_constants_to_few_frames(exact_pair: Callable[..., Pair]
 
 def test_auto_keeps_them_where_the_picture_tells_the_light(exact_pair: Callable[..., Pair]) -> None:
     isp = fit_isp(frames(exact_pair, 12, telling=True), config("auto"), progress=False)
-    assert isp.encoders_in_use and isp.info["encoders_gain_db"] > 3.0
+    assert isp.encoders_in_use and isp.info["encoders_gain_db"] > 1.0
 
 
 def test_auto_drops_them_where_it_does_not(exact_pair: Callable[..., Pair]) -> None:
     pairs = frames(exact_pair, 12, telling=False)
     isp = fit_isp(pairs, config("auto"), progress=False)
-    assert not isp.encoders_in_use and isp.info["encoders_gain_db"] < 0.0
+    assert not isp.encoders_in_use and isp.info["encoders_gain_db"] < -0.2
     off = fit_isp(pairs, config("off"), progress=False)
     assert all(torch.equal(value, off.state_dict()[key]) for key, value in isp.state_dict().items())
 
