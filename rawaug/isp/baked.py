@@ -24,6 +24,7 @@ from rawaug.isp import stages, unprocess
 from rawaug.isp.chooser import Chooser
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import POINTWISE_STAGES, ISPParams
+from rawaug.threads import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
@@ -57,7 +58,7 @@ class BakedISP(nn.Module):
         axis = torch.linspace(0.0, 1.0, nodes)
         cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
         networks = isp.reverse_networks
-        with torch.no_grad():
+        with torch.no_grad(), one_thread():  # the same table in every process
             x = networks.tone(cube) if "tone" in self.config.stages else cube
             x = stages.gamma_expand(x, networks.gamma) if "gamma" in self.config.stages else x
             self.register_buffer("table", _as_table(x, nodes))

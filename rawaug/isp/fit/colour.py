@@ -67,14 +67,16 @@ class Tie:
 
     def __init__(self, shots: Sequence[Shot]) -> None:
         cameras = [shot.camera for shot in shots]
-        same = torch.tensor([[a == b for b in cameras] for a in cameras], dtype=torch.float32)
-        self.mean = same / same.sum(1, keepdim=True)
+        self.groups = [torch.tensor([c == camera for c in cameras]) for camera in dict.fromkeys(cameras)]
         self.balance = torch.tensor([shot.white_balance for shot in shots])
 
     def __call__(self, colour: FrameColour) -> Tensor:
         matrix, neutral = colour.neutral(self.balance)
         values = torch.cat([matrix.flatten(1), neutral], dim=1)
-        square = (values - self.mean @ values) ** 2
+        centre = torch.empty_like(values)
+        for group in self.groups:
+            centre[group] = values.detach()[group].quantile(0.5, dim=0)
+        square = (values - centre) ** 2
         bounded: Tensor = TIE_RANGE**2 * square / (TIE_RANGE**2 + square)
         return TIE * bounded.sum(1).mean()
 

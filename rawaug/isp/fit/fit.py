@@ -17,8 +17,7 @@ makes it hold up with a handful of frames (``docs/fit.md``).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,10 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPConfig
 from rawaug.isp.samples import FramePair, PixelSamples, Shot, sample_pixels
 from rawaug.seeding import derived_seed
+from rawaug.threads import one_thread
 
+STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
+"""gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
 CURVE_STEPS = 150
 CURVE_RATE = 2e-2
 DIMMEST = 0.01
@@ -72,7 +74,7 @@ def fit_isp(
     reading = tqdm(pairs, desc="read", unit="frame", leave=False, disable=None if progress else True)
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
-    with _one_thread():
+    with one_thread():
         fit.curve()
         fit.tone(report)
         fit.atoms(fit.isp)
@@ -82,17 +84,6 @@ def fit_isp(
     fit.descent.finish()
     fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """PyTorch on one thread: a step is so small that more of them gain nothing, and on a busy machine lose tenfold."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _path(state: str | Path | None) -> Path | None:
@@ -136,7 +127,21 @@ class _Fit:
         self.isp = new_isp(shots, config)
         self.tie = Tie(shots)
         self.toe = torch.zeros(())
-        self.colour = FrameColour.from_product(least_squares(self._curved(samples), samples))
+        self.colour = self._start()
+
+    @torch.no_grad()
+    def _start(self) -> FrameColour:
+        """Least squares under the curve of the standard that fits best."""
+        tried = []
+        for gamma, toe in STANDARD_CURVES:
+            self.isp.reverse_networks.gamma.fill_(gamma)
+            self.toe.fill_(toe)
+            self.colour = FrameColour.from_product(least_squares(self._curved(self.samples), self.samples))
+            tried.append((self._error(), gamma, toe, self.colour))
+        _, gamma, toe, colour = min(tried, key=lambda one: one[0])
+        self.isp.reverse_networks.gamma.fill_(gamma)
+        self.toe.fill_(toe)
+        return colour
 
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 

@@ -41,6 +41,19 @@ def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
     assert psnr(BakedISP(isp)(srgb, params), unbaked).min().item() > 75.0
 
 
+def test_the_table_has_the_same_bits_with_any_number_of_threads() -> None:
+    isp, before = curved_isp(), torch.get_num_threads()
+    tables = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            tables.append(BakedISP(isp).table)
+            assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+    assert torch.equal(tables[0], tables[1]) and torch.equal(tables[0], tables[2])
+
+
 @pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("left_out", POINTWISE_STAGES)
 def test_any_stage_may_be_left_out(left_out: str) -> None:

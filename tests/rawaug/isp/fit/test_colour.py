@@ -120,4 +120,4 @@ def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
     liar = replace(exact_pair("liar", (1.9, 1.0, 1.4), 5), white_balance=(1.0, 1.0, 1.0))
     isp = fit_isp([*exact_pairs, liar], replace(CURVE, steps=60), progress=False)
     torch.testing.assert_close(isp.colour.atoms(), camera_matrix.expand(4, 3, 3), atol=0.02, rtol=0)
-    assert error_db(isp, exact_pair("unseen", (1.7, 1.0, 1.6), 9)) > 42.0
+    assert error_db(isp, exact_pair("unseen", (1.7, 1.0, 1.6), 9)) > 60.0

@@ -57,7 +57,7 @@ def test_noisy_frames_give_the_constants_of_clean_ones(exact_pair: Callable[...,
     unread = [replace(pair, raw=torch.full_like(pair.raw, torch.nan)) for pair in pairs]  # the clean RAW is not seen
     noisy = fit_isp(unread, replace(config, noisy=True), progress=False)
     srgb = pairs[0].srgb[None]
-    torch.testing.assert_close(noisy.choose(srgb).gains, clean.choose(srgb).gains, rtol=0.02, atol=0)
+    torch.testing.assert_close(noisy.choose(srgb).gains, clean.choose(srgb).gains, rtol=0.03, atol=0)
     torch.testing.assert_close(noisy.choose(srgb).matrix, clean.choose(srgb).matrix, rtol=0, atol=0.03)
 
 
