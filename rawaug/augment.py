@@ -42,6 +42,9 @@ class RawAugment(nn.Module):
             ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed.
+        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly; ``(0, 0)`` is that of the
+            camera which the ISP knows. Cameras differ in the headroom that they leave above their JPEG's white: for
+            training that is to serve others, (-1.5, 0).
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -59,16 +62,20 @@ class RawAugment(nn.Module):
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
+        exposure: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
             raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
+        if len(exposure) != 2 or not exposure[0] <= exposure[1]:
+            raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
         self.isp = isp.eval().requires_grad_(False)
         self.baked = BakedISP(self.isp)
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
         self.seed = seed
+        self.exposure = exposure
         self._calls = 0
 
     @classmethod
@@ -90,7 +97,8 @@ class RawAugment(nn.Module):
         if place is None:
             place = torch.tensor([0, 0, *batch.shape[-2:], 0]).repeat(len(batch), 1)
         with _float32(batch):
-            params = AugmentParams(self._sample_isp(batch, generator), self.noise.sample(len(batch), generator), place)
+            setting = self._expose(self._sample_isp(batch, generator), generator)
+            params = AugmentParams(setting, self.noise.sample(len(batch), generator), place)
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
@@ -106,6 +114,14 @@ class RawAugment(nn.Module):
             colour = perturb(chosen.colour_weights, self.strength, generator)
             gain = perturb(chosen.gain_weights, self.strength, generator)
         return self.isp.params_from_weights(colour, gain)
+
+    def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
+        """An exposure of e stops divides the gains of the forward direction by 2^e."""
+        if not any(self.exposure):
+            return setting
+        low, high = self.exposure
+        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator)
+        return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:

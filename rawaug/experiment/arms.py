@@ -58,7 +58,7 @@ def training_stream(
         seed: of the run.
     """
     config, seed = recipe.train, derived_seed(seed, "stream")
-    augment = RawAugment(isp, noise, arm.sampling, arm.strength)
+    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
     estimator = estimator_of(arm)
     real: Source | None = None
     synthetic: Source | None = None

@@ -41,6 +41,8 @@ class DownstreamConfig:
         methods: families that are tried.
         test: RAW frames of cameras that no method has seen; folders, or ``kind:path``.
         test_crop: side of the piece at each test frame's centre that is scored; null scores all of it.
+        exposure: lowest and highest exposure in stops at which the dictionary ISP's RAW is drawn, for the test cameras'
+            headroom is not known; UPI's published distributions have theirs.
         noise: preset, in training and on the test frames.
         denoiser: the network.
         train: the loop.
@@ -49,6 +51,7 @@ class DownstreamConfig:
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
     test: list[str] = field(default_factory=lambda: ["demo:test"])
     test_crop: int | None = 1024
+    exposure: tuple[float, float] = (-1.5, 0.0)
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -66,7 +69,7 @@ def psnr_d(
 ) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
-    crops = _crops(model, pictures, noise, config.train.crop)
+    crops = _crops(model, pictures, noise, config)
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
     watched = [Sample(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
     net = train(
@@ -77,9 +80,12 @@ def psnr_d(
     return sum(scores) / len(scores)
 
 
-def _crops(model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, crop: int) -> Source:
+def _crops(
+    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
+) -> Source:
+    crop = config.train.crop
     if isinstance(model, DictionaryISP):
-        return PictureCrops(RawPairs(pictures, RawAugment(model, noise), crop))
+        return PictureCrops(RawPairs(pictures, RawAugment(model, noise, exposure=config.exposure), crop))
     if isinstance(model, UPI):
         return MadeCrops(pictures, lambda x, g: model.apply(x, model.sample(1, g)), model.cfa, noise, crop)
     return MadeCrops(pictures, lambda x, g: model.reverse(x), model.cfa, noise, crop)

@@ -90,6 +90,7 @@ class ArmConfig:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
         sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
         strength: of ``perturb``.
+        exposure: lowest and highest exposure of the RAW in stops.
         estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
             :mod:`rawaug.experiment.estimators`.
         alpha: of noisier and r2r: strength of the extra noise.
@@ -100,6 +101,7 @@ class ArmConfig:
     augmented: float = 0.0
     sampling: Literal["convex", "perturb", "chosen"] = "convex"
     strength: float = 0.1
+    exposure: tuple[float, float] = (0.0, 0.0)
     estimator: Literal["supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"] = "supervised"
     alpha: float = 1.0
     correct: bool = False

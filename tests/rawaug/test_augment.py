@@ -71,9 +71,24 @@ def test_a_picture_does_not_depend_on_its_batch(augment: RawAugment, srgb: Tenso
     torch.testing.assert_close(augment.apply(srgb[1:2], alone).noisy, pair.noisy[1:2])
 
 
-def test_unknown_sampling_is_refused(isp: DictionaryISP) -> None:
+def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
+    dim = torch.full((500, 3, 4, 4), 0.2)  # far from the highlights that the gains spare
+    as_is, draws = RawAugment(isp, noise=(0.0, 0.0)), torch.Generator()
+    clean = as_is(dim, draws.manual_seed(1)).clean
+    for low, high in ((-1.0, -1.0), (-2.0, 1.0)):
+        augment = RawAugment(isp, noise=(0.0, 0.0), exposure=(low, high))
+        pair = augment(dim, draws.manual_seed(1))
+        stops = (pair.clean / clean).log2().mean((1, 2, 3))
+        assert low - 1e-4 <= stops.min() <= low + 0.02 and high - 0.02 <= stops.max() <= high + 1e-4
+        assert stops.mean().item() == pytest.approx((low + high) / 2, abs=0.15)
+        assert torch.equal(augment.apply(dim, pair.params).clean, pair.clean)
+
+
+def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
     with pytest.raises(ValueError, match="convex, perturb, chosen"):
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="lowest and the highest in stops"):
+        RawAugment(isp, exposure=(1.0, -1.0))
 
 
 def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
