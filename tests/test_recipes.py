@@ -12,15 +12,15 @@ import pytest
 import yaml
 
 from rawaug.cli import main
-from rawaug.data import open_pairs, open_pictures
+from rawaug.data import demo_pictures, open_pairs, open_pictures
+from rawaug.experiment.ablation import LEFT_OUT, SPACES, TITLES
+from rawaug.experiment.experiments import kind_of
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, smoke
 
 FOLDER = Path(__file__).parents[1] / "recipes"
-OTHER_RUNNERS = {"reconstruction", "ablation"}
-"""Recipes of another kind, which have tests of their own."""
-
-NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
-NAMES = [name for name in NAMES if name not in OTHER_RUNNERS]
+ALL = {file.relative_to(FOLDER).with_suffix("").as_posix(): kind_of(file) for file in sorted(FOLDER.rglob("*.yaml"))}
+NAMES = [name for name, kind in ALL.items() if kind == "training"]
+"""The recipes that train denoisers."""
 
 
 @pytest.fixture(params=NAMES)
@@ -48,6 +48,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 def test_the_recipes_are_all_there() -> None:
     assert {"fewshot", "unsupervised", "synthetic", "sidd/full", "sidd/fewshot", "sidd/unsupervised"} <= set(NAMES)
+    assert {name: kind for name, kind in ALL.items() if kind != "training"} == {
+        "ablation": "ablation",
+        "reconstruction": "reconstruction",
+    }
 
 
 def test_it_opens_with_its_commands_and_their_cost(name: str) -> None:
@@ -82,6 +86,56 @@ def test_its_smoke_form_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFi
         assert 20.0 < scores["plain"]["psnr"] < 60.0 and 10.0 < scores["self_ensemble"]["psnr_srgb"] < 60.0
         assert arm[:8] in text
     assert (folder / "report.html").stat().st_size > 50_000
+
+
+@pytest.fixture
+def two_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the demo's frames and pictures only two, and few steps to the best weights: the same code in less time."""
+    for module in ("ablation", "comparison", "downstream"):
+        monkeypatch.setattr(f"rawaug.experiment.{module}.open_pairs", lambda spec, split: open_pairs(spec, split)[:2])
+    monkeypatch.setattr("rawaug.experiment.comparison.open_pictures", lambda spec, min_side: demo_pictures(9)[-2:])
+    monkeypatch.setattr("rawaug.experiment.contenders.ORACLE_STEPS", 10)
+
+
+@pytest.mark.usefixtures("two_frames")
+def test_the_smoke_form_of_reconstruction_ends_with_its_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "reconstruction", "--smoke", "--out", str(tmp_path)]) == 0
+    folder = tmp_path / "reconstruction-smoke"
+    table = json.loads((folder / "table.json").read_text())
+    dictionary = [
+        "dictionary",
+        *(f"dictionary, {row}" for row in ("as-shot gains", "64 RAW samples", "oracle weights")),
+    ]
+    assert list(table["rows"]) == [*dictionary, "upi", "upi-tuned"]
+    text = capsys.readouterr().out
+    for name, row in table["rows"].items():
+        (mean,) = row["psnr_r"]
+        values = [value for values in row["frames"].values() for value in values]
+        assert len(values) == 2 and mean == pytest.approx(sum(values) / 2) and 15.0 < min(values) < max(values) < 60.0
+        assert name in text and f"{mean:.2f}" in text and f"{row['worst25'][0]:.2f}" in text
+        assert len(list(folder.glob(f"{name}-x1-without-*-seed0.json"))) == (0 if "," in name else 2)
+    psnr_d = {name: row["psnr_d"] for name, row in table["rows"].items() if "psnr_d" in row}
+    assert set(psnr_d) == {"dictionary", "upi"} and all(20.0 < value < 60.0 for (value,) in psnr_d.values())
+    assert {name for name, row in table["rows"].items() if "cycle" in row} == {"dictionary", "upi", "upi-tuned"}
+    assert f"{table['mosaic_only_psnr']:.2f} dB (ceiling of the cycle)" in text
+
+
+@pytest.mark.usefixtures("two_frames")
+def test_the_smoke_form_of_ablation_ends_with_table_and_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "ablation", "--smoke", "--out", str(tmp_path)]) == 0
+    folder = tmp_path / "ablation-smoke"
+    result = json.loads((folder / "ablation.json").read_text())
+    text = capsys.readouterr().out
+    for rows in result["stages"].values():
+        assert len(rows) == len(TITLES) and all(len(row) == len(SPACES) for row in rows)
+        assert rows[5][0] > rows[2][0] > rows[0][0] and f"{rows[5][0]:.2f}" in text
+    assert list(result["without"]) == ["none", *LEFT_OUT]
+    assert max(result["without"].values()) > 30.0 and f"gains {result['without']['gains']:.2f}" in text
+    assert (folder / "ablation.png").stat().st_size > 20_000 and str(folder / "ablation.png") in text
 
 
 def test_seeds_steps_and_device_work_and_nothing_is_done_twice(

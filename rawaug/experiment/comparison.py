@@ -18,11 +18,14 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.conform import even_sided
 from rawaug.data import open_pairs, open_pictures
+from rawaug.data.pairs import Pair
 from rawaug.experiment.contenders import (
     FAMILIES,
+    POINTWISE,
     ROWS,
     cycle_psnr,
     fit_family,
@@ -30,11 +33,12 @@ from rawaug.experiment.contenders import (
     score_rows,
 )
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
-from rawaug.experiment.evaluate import write_json
+from rawaug.experiment.evaluate import frozen_sample, write_json
 from rawaug.experiment.report import mean_and_spread
 from rawaug.experiment.run import fingerprint
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
+from rawaug.noise import NoiseModel, noise_model
 
 
 @dataclass
@@ -44,7 +48,9 @@ class Comparison:
     Args:
         experiment: "reconstruction".
         name: of the folder in ``out`` that it writes.
-        data: the pairs, registered, of one CFA.
+        data: the pairs, of one CFA; methods that train on crops need them registered.
+        noise: preset that is added to every frame once and for all; the dictionary ISP is then fitted to these noisy
+            frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines.
         seconds: budget of methods that learn by descent, reading not counted.
         crop, batch: of these methods' training: small ones give more steps to a short budget.
@@ -62,6 +68,7 @@ class Comparison:
     experiment: str = "reconstruction"
     name: str = "reconstruction"
     data: str = "demo:train"
+    noise: str | None = None
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
     seconds: float = 20.0
     crop: int = 64
@@ -82,19 +89,23 @@ class Comparison:
             raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
         if self.seeds < 1:
             raise ValueError(f"seeds is at least 1, got {self.seeds}")
+        if self.patches is not None and self.patches < 1:
+            raise ValueError(f"patches is at least 1, or null for all, got {self.patches}")
+        if self.noise and any(not method.startswith("dictionary") for method in self.methods):
+            raise ValueError("noise: only the dictionary ISP is fitted to noisy frames; leave the other methods out")
 
 
 def smoke_comparison(comparison: Comparison) -> Comparison:
     """The comparison in seconds, on the demo camera."""
     downstream = comparison.downstream and comparison.downstream.smoke()
     tiny = replace(comparison.fit, steps=2, pixels=512, batch=128)
-    methods = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
+    quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
     return replace(
         comparison,
         name=f"{comparison.name}-smoke",
         data="demo:validation",
         pictures="demo:",
-        methods=methods,
+        methods=quick or ["dictionary"],
         longer=0.0,
         patches=1,
         seeds=1,
@@ -114,10 +125,22 @@ class _Comparison:
         self.pairs = list(open_pairs(settings.data, split="train"))
         if len(self.pairs) < 2:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leaving one out needs two or more")
-        odd = [pair.name for pair in self.pairs if not pair.registered or pair.cfa != self.pairs[0].cfa]
-        if odd:
-            raise ValueError(f"data: {odd[0]} is not registered or of another CFA; a table needs pixel-exact pairs")
-        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures))]
+        exact = any(method not in POINTWISE for method in settings.methods)
+        for pair in self.pairs:
+            if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
+                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has another CFA"
+                raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
+        if settings.noise:
+            noise = noise_model(settings.noise)
+            self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
+        self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
+        names = [pair.name for pair in self.pairs]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"data: several frames are named {twice[0]}; give each file a name of its own")
+        if settings.longer and not 1 <= settings.longer_frames <= len(names):
+            raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
+        side = settings.downstream.train.crop if settings.downstream else 2
+        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
 
     def table(self) -> dict[str, dict[str, Any]]:
         """All rows; printed, and written with every single figure."""
@@ -153,7 +176,7 @@ class _Comparison:
                 "worst25": [worst for worst, _ in quarters],
                 "best25": [best for _, best in quarters],
                 "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
-                "mpix_s": statistics.median(fold["mpix_s"] for *_, fold in folds),
+                "mpix_s": _median([fold["mpix_s"] for *_, fold in folds]),
                 "parameters": folds[0][2]["parameters"],
                 **(whole if row == "blind" else {}),
             }
@@ -164,11 +187,11 @@ class _Comparison:
         settings, left_out = self.settings, self.pairs[frame]
         seconds = settings.seconds * scale
         budget = (seconds, settings.crop, settings.batch)
-        key = fingerprint(family, budget, seed, settings.patches, asdict(settings.fit), [p.name for p in self.pairs])
+        key = fingerprint(family, budget, seed, settings.patches, *self._frames())
         path = self._path(f"{family}-x{scale:g}-without-{left_out.name}-seed{seed}")
         if (known := _read(path, key)) is not None:
             return known
-        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], settings.fit, budget, seed)
+        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], self.fit, budget, seed)
         result = score_rows(fitted, left_out, settings.patches)
         result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
         write_json(result, path)
@@ -179,22 +202,39 @@ class _Comparison:
         settings = self.settings
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
         seeds = range(settings.seed, settings.seed + settings.seeds)
-        parts = (asdict(settings.fit), downstream and asdict(downstream), [p.name for p in self.pairs])
-        key = fingerprint(family, settings.seconds, list(seeds), settings.pictures, *parts)
+        budget = (settings.seconds, settings.crop, settings.batch)
+        parts = (
+            asdict(self.fit),
+            settings.noise,
+            downstream and asdict(downstream),
+            settings.data,
+            [p.name for p in self.pairs],
+        )
+        key = fingerprint(family, budget, list(seeds), settings.pictures, *parts)
         path = self._path(f"{family}-all-frames")
         if (known := _read(path, key)) is not None:
             return known
-        budget = (settings.seconds, settings.crop, settings.batch)
-        fitted = fit_family(family, self.pairs, settings.fit, budget, settings.seed)
+        fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
         if downstream:
-            place = self.folder / f"{family}-denoisers"
+            place = self.folder / f"{family}-denoisers-{key}"  # a checkpoint of other settings is not gone on from
             result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
         write_json(result, path)
         return result
 
+    def _frames(self) -> tuple[Any, ...]:
+        """What a fit depends on besides its family, budget and seed."""
+        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
+
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem}.json"
+
+
+def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
+    """The frame with noise keyed by its name, as a noisy capture."""
+    cfa = CFA(pair.cfa)
+    noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
+    return replace(pair, noisy=noisy)
 
 
 def _each(pictures: Any) -> Iterator[Tensor]:
@@ -209,13 +249,19 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
     return known if known.get("key") == key else None
 
 
+def _median(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
 def _cells(row: dict[str, Any]) -> list[str]:
     def figures(name: str) -> str:
         value = row.get(name)
         return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
 
-    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "psnr_d")]
-    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", f"{row['mpix_s']:.3g}"]
+    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "cycle_without_mosaic", "psnr_d")]
+    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
 
 
 def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
@@ -224,7 +270,7 @@ def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float
 
     frames = len(next(iter(rows.values()))["frames"])
     table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
-    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "PSNR_d", "M parameters", "s to fit", "Mpix/s")
+    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
     for k, head in enumerate(("method", *heads)):
         table.add_column(head, justify="right" if k else "left")
     for name, row in rows.items():

@@ -17,18 +17,21 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.experiment.reconstruction import windows_of, windows_psnr
+from rawaug.experiment.reconstruction import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.isp import conditioning
 from rawaug.isp.baselines import BASELINES, ReverseISP, fit_baseline
+from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPParams
-from rawaug.isp.samples import sample_pixels
+from rawaug.isp.samples import block_averages, sample_pixels
 from rawaug.isp.stages import as_float
 from rawaug.metrics import PATCH, psnr
-from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.seeding import keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
+POINTWISE = ("dictionary", "dictionary-encoders", "upi", "upi-tuned")
+"""Families that need no pixel-exact pairs."""
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
 ORACLE_STEPS = 300
@@ -59,9 +62,9 @@ def fit_family(
     if family.startswith("dictionary"):
         isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
         return Fitted(isp, time.perf_counter() - start, _in_use(isp))
-    with torch.random.fork_rng():
-        torch.manual_seed(derived_seed(seed, "baseline"))
-        model = BASELINES[family](cfa=pairs[0].cfa)
+    method = BASELINES[family]
+    start_of: dict[str, Any] = {"seed": seed} if issubclass(method, CropTrainedISP) else {}
+    model = method(cfa=pairs[0].cfa, **start_of)
     seconds, crop, batch = budget
     fit_baseline(model, pairs, seconds, crop=crop, batch=batch, seed=seed)
     return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
@@ -76,16 +79,30 @@ def _in_use(isp: DictionaryISP) -> int:
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
-    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass."""
+    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass.
+
+    An unregistered pair is scored over blocks, by methods of :data:`POINTWISE`.
+    """
     model = fitted.model
+    if not pair.registered:
+        return {"rows": _block_rows(model, pair), "mpix_s": None}
     if isinstance(model, DictionaryISP):
         makers = {row: _dictionary(model, params) for row, params in dictionary_params(model, pair).items()}
     else:
         makers = {"blind": _baseline(model)}
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
-    pixels = len(makers) * len(windows_of(pair, patches)) * PATCH**2
+    area = min(PATCH, pair.raw.shape[-2]) * min(PATCH, pair.raw.shape[-1])
+    pixels = len(makers) * len(windows_of(pair, patches)) * area
     return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
+
+
+@torch.no_grad()
+def _block_rows(model: DictionaryISP | ReverseISP, pair: Pair) -> dict[str, float]:
+    if isinstance(model, DictionaryISP):
+        return {"blind": psnr_r(model, pair), "as-shot": psnr_r(model, pair, white_balance=True)}
+    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
+    return {"blind": block_psnr(model.unprocess(blocks.srgb[None])[0], blocks.raw, blocks.clipped)}
 
 
 def _dictionary(isp: DictionaryISP, params: ISPParams) -> Maker:

@@ -242,6 +242,9 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def write_json(result: dict[str, Any], path: str | Path) -> None:
-    """Write a result, making its folder."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(result, indent=1) + "\n")
+    """Write a result whole or not at all, making its folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(result, indent=1) + "\n")
+    partial.replace(path)

@@ -43,9 +43,10 @@ def kind_of(recipe: str | Path) -> str:
 
     try:
         content = yaml.safe_load(Path(recipe).read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{recipe}: not a YAML file ({error}); see the recipes in the package") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{recipe}: not a YAML file ({reason}); see the recipes in the package") from error
     kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ValueError(f"{recipe}: experiment {kind!r} is none of {', '.join(KINDS)}")
-    return str(kind)
+    return kind

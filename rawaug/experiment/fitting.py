@@ -13,7 +13,7 @@ from rawaug.experiment.camera_noise import as_info, measure_camera_noise
 from rawaug.experiment.reconstruction import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import plot_noise
+from rawaug.noise import NoiseEstimate, plot_noise
 
 WATCHED_PATCHES = 4
 
@@ -55,23 +55,31 @@ def fit(
     start = time.perf_counter()
     pairs = _pairs(source, camera_jpeg)
     watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
+    estimate = _measured_noise(pairs, noise, dark)  # before the fit: what fails here fails early
     isp = fit_isp(pairs, FitConfig(**settings), progress, state, watch)
     if watch is not None:
         watch(isp)
         isp.info["held_out"] = watch.scores
-    if noise != "off":
-        try:
-            estimate = measure_camera_noise(pairs, dark)
-        except ValueError as error:
-            if noise == "on":
-                raise
-            isp.info["noise_not_measured"] = str(error)
-        else:
-            isp.info["noise"] = as_info(estimate)
-            if noise_figure is not None:
-                plot_noise(estimate, noise_figure, title=", ".join(isp.info["frames"][:4]))
+    if isinstance(estimate, str):
+        isp.info["noise_not_measured"] = estimate
+    elif estimate is not None:
+        isp.info["noise"] = as_info(estimate)
+        if noise_figure is not None:
+            plot_noise(estimate, noise_figure, title=", ".join(isp.info["frames"][:4]))
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
+
+
+def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> NoiseEstimate | str | None:
+    """The levels, or why they are not known."""
+    if noise == "off":
+        return None
+    try:
+        return measure_camera_noise(pairs, dark)
+    except ValueError as error:
+        if noise == "on":
+            raise
+        return str(error)
 
 
 class _Watch:

@@ -64,9 +64,12 @@ def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
 
 
 def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
-    """Corners of ``count`` random non-overlapping patches of the frame, keyed by its name; all if None."""
-    height, width = pair.raw.shape[-2:]
-    every = [(top, left) for top in range(0, height - PATCH + 1, PATCH) for left in range(0, width - PATCH + 1, PATCH)]
+    """Corners of ``count`` random non-overlapping patches of the frame, keyed by its name; all if None.
+
+    As in :func:`rawaug.metrics.patch_psnr`, a side shorter than a patch is the patch's side.
+    """
+    rows, columns = (range(0, max(side - PATCH, 0) + 1, PATCH) for side in pair.raw.shape[-2:])
+    every = [(top, left) for top in rows for left in columns]
     if count is None or count >= len(every):
         return every
     order = torch.randperm(len(every), generator=keyed_generator("windows", pair.name)).tolist()
@@ -76,9 +79,9 @@ def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
     """Mean PSNR over windows of what ``make`` makes of an sRGB patch ``(1, 3, h, w)`` and its place in the frame."""
-    values = []
+    values, (height, width) = [], pair.raw.shape[-2:]
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
-        place = place_in_frame(PATCH, PATCH, (top, left), (pair.raw.shape[-2], pair.raw.shape[-1]))
+        place = place_in_frame(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
         values.append(psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]).item())
     return sum(values) / len(values)

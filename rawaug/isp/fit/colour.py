@@ -115,7 +115,7 @@ def fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Te
     means = torch.einsum("fkp,fcp->fkc", terms, bright) / count.transpose(1, 2)
     centred = (terms[:, :, None] - means[..., None]) * bright[:, None]  # (F, 5, 3, P)
     normal = torch.einsum("fkcp,flcp->kl", centred, centred) + 1e-6 * torch.eye(5).double()
-    c = torch.linalg.solve(normal, torch.einsum("fkcp,fcp->k", centred, ratio)).float()
-    precision = -torch.tensor([[2 * c[2], c[3]], [c[3], 2 * c[4]]])
-    mean = torch.linalg.lstsq(precision, c[:2, None]).solution[:, 0]
-    return mean.clamp(-0.5, 0.5), precision
+    c = torch.linalg.solve(normal, torch.einsum("fkcp,fcp->k", centred, ratio))
+    precision = -torch.stack([2 * c[2], c[3], c[3], 2 * c[4]]).reshape(2, 2)
+    mean = torch.linalg.lstsq(precision, c[:2, None]).solution[:, 0]  # double to the end: sums vary in their last bit
+    return mean.clamp(-0.5, 0.5).float(), precision.float()

@@ -1,0 +1,140 @@
+"""PSNR_d and its crops: one seed one figure, whatever the method; the pattern is kept, and every draw is replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
+from rawaug.experiment import downstream
+from rawaug.experiment.downstream import DownstreamConfig, MadeCrops, psnr_d
+from rawaug.experiment.evaluate import score_denoiser
+from rawaug.isp.baselines import UPI
+from rawaug.isp.baselines.unet import UNetISP
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.params import ISPConfig
+from rawaug.noise import NoiseModel, noise_model
+
+SILENT = noise_model((0.0, 0.0))
+TINY = DownstreamConfig().smoke()
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def made(
+    pictures: Sequence[Tensor], cfa: CFA = CFA.GRBG, noise: NoiseModel = SILENT, gain: float = 1.0, crop: int = 16
+) -> MadeCrops:
+    return MadeCrops(pictures, lambda x, g: bayer.mosaic(gain * x, cfa), cfa, noise, crop)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_crops_keep_the_pattern_in_every_turn(cfa: CFA) -> None:
+    colours = torch.tensor([51, 102, 204], dtype=torch.uint8)[:, None, None].expand(3, 40, 48)
+    expected = (torch.tensor([51.0, 102.0, 102.0, 204.0]) / 255.0)[:, None, None].expand(4, 8, 8)
+    for seed in range(16):
+        sample = made([colours], cfa).draw(seeded(seed))
+        assert torch.equal(sample.clean, expected) and torch.equal(sample.noisy, expected)
+        assert sample.variance.abs().max() == 0.0
+
+
+def test_a_crop_is_replayed_from_its_generator_alone() -> None:
+    pictures = [torch.randint(0, 256, (3, 40, 48), generator=seeded(k), dtype=torch.uint8) for k in range(3)]
+    upi, noise = UPI("GRBG"), noise_model("cycleisp_sidd")
+    crops = MadeCrops(pictures, lambda x, g: upi.apply(x, upi.sample(1, g)), upi.cfa, noise, 16)
+    torch.manual_seed(0)
+    before, once = torch.get_rng_state(), crops.draw(seeded(5))
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(1)
+    crops.draw(seeded(6))
+    again, other = crops.draw(seeded(5)), crops.draw(seeded(6))
+    assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
+    assert not torch.equal(once.clean, other.clean)
+
+
+def test_every_picture_place_and_turn_is_drawn() -> None:
+    pictures = [torch.randint(0, 256, (3, 18, 20), generator=seeded(k), dtype=torch.uint8) for k in range(2)]
+    crops = made(pictures)
+    drawn = {crops.draw(seeded(seed)).clean.numpy().tobytes() for seed in range(1200)}
+    expected = set()
+    for picture, top, left, view in product(pictures, (0, 2), (0, 2, 4), range(8)):
+        patch = bayer.turn(picture[:, top : top + 16, left : left + 16], view)
+        expected.add(bayer.pack(bayer.mosaic(patch[None] / 255.0, "GRBG"), "GRBG")[0].numpy().tobytes())
+    assert len(expected) == 96 and drawn == expected
+
+
+def test_noise_is_clipped_at_white_but_not_at_black() -> None:
+    black, white = (torch.full((3, 32, 32), value, dtype=torch.uint8) for value in (0, 255))
+    dark, bright = (made([picture], noise=noise_model((0.0, 1e-2)), gain=3.0) for picture in (black, white))
+    shadows, lights = dark.draw(seeded(0)), bright.draw(seeded(0))
+    assert shadows.clean.max() == 0.0 and shadows.noisy.min() < 0.0
+    assert abs(float(shadows.noisy.mean())) < 3 * 0.1 / shadows.noisy.numel() ** 0.5
+    assert float(shadows.noisy.var()) == pytest.approx(1e-2, rel=0.2)
+    assert lights.clean.max() == 1.0 and lights.noisy.max() == 1.0  # 3 times white is white
+    assert torch.allclose(shadows.variance, torch.tensor(1e-2))
+
+
+@pytest.fixture
+def scores(monkeypatch: pytest.MonkeyPatch, frame_of: Callable[..., Pair]) -> list[list[Pair]]:
+    """The test frames of each call of :func:`psnr_d`, two small ones; one is measured whole and one in part."""
+    seen: list[list[Pair]] = []
+
+    def score(net: Any, frames: list[Pair], *rest: Any) -> Any:
+        seen.append(frames)
+        return score_denoiser(net, frames, *rest)
+
+    frames = [frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))]
+    monkeypatch.setattr(downstream, "open_pairs", lambda spec, split: frames)
+    monkeypatch.setattr(downstream, "score_denoiser", score)
+    return seen
+
+
+PICTURES = [torch.randint(0, 256, (3, 40, 48), generator=seeded(k), dtype=torch.uint8) for k in range(3)]
+MODELS: dict[str, Callable[[], Any]] = {
+    "dictionary": lambda: DictionaryISP(ISPConfig(cfa="GRBG"), seeded(0)),
+    "upi": lambda: UPI("GRBG"),
+    "network": lambda: UNetISP("GRBG", width=4).eval(),
+}
+
+
+@pytest.mark.parametrize("family", list(MODELS))
+def test_psnr_d_depends_on_the_seed_alone(family: str, scores: list[list[Pair]], tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    once = psnr_d(MODELS[family](), PICTURES, TINY, tmp_path / "a", 3)
+    log = tmp_path / "a" / "seed3" / "log.csv"
+    steps = log.read_text()
+    torch.manual_seed(1)
+    assert psnr_d(MODELS[family](), PICTURES, TINY, tmp_path / "a", 3) == once
+    assert log.read_text() == steps  # from its checkpoint, not trained again
+    if family != "upi":
+        return
+    torch.manual_seed(2)
+    assert psnr_d(MODELS[family](), PICTURES, TINY, tmp_path / "b", 3) == once
+    assert psnr_d(MODELS[family](), PICTURES, TINY, tmp_path / "a", 4) != once
+    assert 5.0 < once < 60.0
+
+
+def test_the_piece_at_the_centre_is_scored_in_its_pattern(scores: list[list[Pair]], tmp_path: Path) -> None:
+    for side in (None, 66):
+        psnr_d(MODELS["upi"](), PICTURES, replace(TINY, test_crop=side), tmp_path, 0)
+    (small, large), (same, piece) = scores
+    assert same is small and piece.raw.shape == (1, 66, 66) and piece.srgb.shape == (3, 66, 66)
+    assert piece.cfa == large.cfa
+    assert torch.equal(piece.raw, large.raw[:, 14:80, 32:98]) and torch.equal(piece.srgb, large.srgb[:, 14:80, 32:98])
+
+
+def test_the_smoke_form_measures_what_the_whole_does() -> None:
+    whole = DownstreamConfig(methods=["upi"], noise="cycleisp_dnd", test=["somewhere"])
+    quick = whole.smoke()
+    assert (quick.methods, quick.noise, quick.test) == (["upi"], "cycleisp_dnd", ["demo:validation"])
+    assert quick.train.steps == 2 and quick.denoiser.settings == {"width": 4, "scales": 2}
