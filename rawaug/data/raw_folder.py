@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import overload
 
 from torch import Tensor
 
 from rawaug.bayer import turn_back
+from rawaug.data.lazy import LazyPairs
 from rawaug.data.pairs import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 
@@ -19,7 +19,7 @@ EXTENSIONS = (
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 
 
-class RawFolder(Sequence[Pair]):
+class RawFolder(LazyPairs):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
 
     A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size (it is turned
@@ -52,26 +52,11 @@ class RawFolder(Sequence[Pair]):
             raise ValueError(f"{path}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr = adjust_maximum_thr
-        self._last: tuple[int, Pair] | None = None
+        super().__init__([file.stem for file in self.files])
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    @overload
-    def __getitem__(self, index: int) -> Pair: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Pair]: ...
-
-    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        index = range(len(self))[index]
-        if self._last is None or self._last[0] != index:
-            self._last = index, self._read(self.files[index])
-        return self._last[1]
-
-    def _read(self, file: Path) -> Pair:
+    def read(self, index: int) -> Pair:
+        """The frame of ``files[index]``, developed, or with its camera's JPEG."""
+        file = self.files[index]
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
             frame = read_raw(file)
