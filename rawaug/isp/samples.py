@@ -23,6 +23,8 @@ from rawaug.seeding import keyed_generator
 
 CLIPPED_SRGB = 0.98
 CLIPPED_RAW = 0.98
+LEAST_LIKENESS = 0.8
+"""Correlation of the greens of an unregistered pair, shift taken out, below which it is refused."""
 BLOCK = 16
 """Side in pixels of the blocks over which unregistered pairs are averaged."""
 
@@ -117,9 +119,13 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
     generator = keyed_generator(seed, "pixels", pair.name)
     draw = _sites if pair.registered else _blocks
+    try:
+        drawn = draw(pair.srgb, raw, pair.cfa, pixels, generator)
+    except ValueError as error:
+        raise ValueError(f"{pair.name}: {error}") from None
     small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
     shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw)
-    return draw(pair.srgb, raw, pair.cfa, pixels, generator), shot
+    return drawn, shot
 
 
 def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
@@ -147,6 +153,10 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
 def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Generator) -> PixelSamples:
     """Averages over blocks, linear light: tolerant to a shift of a few pixels."""
     blocks = block_averages(srgb, raw, cfa)
+    greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]
+    likeness = float(torch.corrcoef(greens)[0, 1])
+    if likeness < LEAST_LIKENESS:
+        raise ValueError(f"sRGB and RAW hardly resemble each other (correlation {likeness:.2f}); are they of one shot?")
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)

@@ -16,10 +16,10 @@ WB = (1.6, 1.0, 1.5)
 SHIFTS = [(0, 0), (4, -6), (-3, 5), (7, 2), (-8, -1)]
 
 
-def displaced(exact_pair: Callable[..., Pair], dy: int, dx: int) -> Pair:
+def displaced(exact_pair: Callable[..., Pair], dy: int, dx: int, seed: int = 2) -> Pair:
     """A textured pair whose sRGB lies ``dy`` down and ``dx`` right of its RAW."""
     texture = torch.nn.functional.avg_pool2d(
-        torch.rand(1, 3, 164, 196, generator=torch.Generator().manual_seed(2)), 5, 1
+        torch.rand(1, 3, 164, 196, generator=torch.Generator().manual_seed(seed)), 5, 1
     )
     texture = 0.1 + 0.8 * (texture - texture.amin()) / (texture.amax() - texture.amin())
     whole = exact_pair("whole", WB, 0, picture=texture[0])
@@ -91,6 +91,15 @@ def test_blocks_show_the_same_and_know_their_place(
     torch.testing.assert_close(blocks.raw[0, 0, 0], reds.mean())
     place = place_in_frame(*pair.raw.shape[-2:])[0, :, window[0], window[1]].mean((1, 2))
     torch.testing.assert_close(blocks.place[0, :, 0, 0], place)
+
+
+def test_a_picture_of_another_shot_is_refused(exact_pair: Callable[..., Pair]) -> None:
+    pair = displaced(exact_pair, 2, -4)
+    sample_pixels([pair], 100, seed=0)
+    mixed_up = replace(pair, srgb=displaced(exact_pair, 2, -4, seed=7).srgb)
+    for wrong in (mixed_up, replace(pair, srgb=pair.srgb.flip(-1))):
+        with pytest.raises(ValueError, match=f"{pair.name}: sRGB and RAW hardly resemble each other"):
+            sample_pixels([wrong], 100, seed=0)
 
 
 def test_a_block_with_one_clipped_site_is_clipped(exact_pair: Callable[..., Pair]) -> None:
