@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-THUMBNAIL = 64
+THUMBNAIL = 48
 """Longest side of what an encoder looks at."""
 
 
