@@ -252,8 +252,8 @@ class _Fit:
             frames, part = self._draw(generator)
             params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
             with torch.no_grad():
-                isp.reverse_pixels(part.cell_srgb, params, part.place, back)
-            return cycle_error(isp, part, params, back)
+                back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
+            return cycle_error(isp, part, params, back, self.config.noisy)
 
         self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 

@@ -40,7 +40,7 @@ def train_jointly(
     def loss(generator: torch.Generator) -> Tensor:
         chosen = torch.randint(len(trained), (FRAMES_A_STEP,), generator=generator).tolist()
         pixels = torch.randint(samples.srgb.shape[-1], (config.batch,), generator=generator)
-        return torch.stack([_frame_loss(isp, samples, shots, trained[k], pixels) for k in chosen]).mean()
+        return torch.stack([_frame_loss(isp, samples, shots, trained[k], pixels, config.noisy) for k in chosen]).mean()
 
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
@@ -51,10 +51,12 @@ def train_jointly(
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 
-def _frame_loss(isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor) -> Tensor:
+def _frame_loss(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, noisy: bool
+) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
     ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(shots[frame].raw)
     back: dict[str, Tensor] = {}
-    isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
-    cycle = cycle_error(isp, part, theirs, back)
+    back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
+    cycle = cycle_error(isp, part, theirs, back, noisy)
     return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * apart(ours, theirs)

@@ -26,10 +26,16 @@ def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
     return (error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)).mean()
 
 
-def cycle_error(isp: DictionaryISP, part: PixelSamples, params: ISPParams, back: Mapping[str, Tensor]) -> Tensor:
-    """l2 on the sRGB of the forward pass, and on every intermediate image against ``back``, the reverse pass's."""
+def cycle_error(
+    isp: DictionaryISP, part: PixelSamples, params: ISPParams, back: Mapping[str, Tensor], noisy: bool = False
+) -> Tensor:
+    """l2 on the sRGB of the forward pass, and on every intermediate image against ``back``, the reverse pass's.
+
+    From ``noisy`` readings the pass would learn to mend noise, so that it starts where the reverse pass ended.
+    """
     ahead: dict[str, Tensor] = {}
-    error = (isp.forward_pixels(part.cell_raw, params, part.place, ahead) - part.cell_srgb) ** 2
+    start = back["raw"].detach() if noisy else part.cell_raw
+    error = (isp.forward_pixels(start, params, part.place, ahead) - part.cell_srgb) ** 2
     for name in ahead:
         error = error + INTERMEDIATE_WEIGHT * (ahead[name] - back[name]) ** 2 if name in back else error
     return (error * part.cell_weight).sum() / (3.0 * part.cell_weight.sum()).clamp_min(1.0)

@@ -61,6 +61,14 @@ def test_noisy_frames_give_the_constants_of_clean_ones(exact_pair: Callable[...,
     torch.testing.assert_close(noisy.choose(srgb).matrix, clean.choose(srgb).matrix, rtol=0, atol=0.03)
 
 
+def test_the_forward_pass_of_a_noisy_fit_does_not_learn_the_noise(exact_pair: Callable[..., Pair]) -> None:
+    pair = exact_pair("shot", (1.6, 1.0, 1.5), 0, shot_var=2e-2)
+    isp = fit_isp([pair], replace(QUICK, batch=512, shading="off", noisy=True), progress=False)
+    x5 = isp.reverse(pair.srgb[None])
+    back = isp.forward(x5.raw, x5.params).srgb
+    assert psnr(back, pair.srgb[None] / 255.0).item() > 36.0
+
+
 def test_an_unregistered_pair_is_fitted_over_blocks(
     exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
 ) -> None:
