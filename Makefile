@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-BENCHMARKS := augment folder fuzz loader noise synth
+BENCHMARKS := augment folder fuzz loader networks noise synth
 
 .PHONY: demo test lint docs bench clean
 
