@@ -110,6 +110,7 @@ def _swatches(axis: Any, isp: DictionaryISP) -> None:
     patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
     axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")
     axis.set_xticks(range(6), ["red", "green", "blue", "white", "skin", "sky"], fontsize=8)
+    axis.yaxis.get_major_locator().set_params(integer=True)
     axis.set(ylabel="atom")
     axis.set_title("colour atoms: sRGB as the camera sees it", fontsize=9)
 
