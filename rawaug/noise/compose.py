@@ -50,10 +50,10 @@ class Compose(NoiseModel):
             params |= model.sample(batch, generator)
         return params
 
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        noisy = clean
-        for model in self.models:
-            noisy = model.disturb(noisy, params)
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        noisy = self.models[0].disturb(clean, params, out)
+        for model in self.models[1:]:
+            model.disturb(noisy, params, out=noisy)
         return noisy
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:

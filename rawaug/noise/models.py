@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import ClassVar
 
 import torch
@@ -34,6 +34,8 @@ Params = dict[str, Tensor]
 
 _NO_SHOT = 1e-30
 """Stands for a shot_var of 0, so that it can be divided by: too small for any effect on the picture."""
+_GROUP = 2**18
+"""Values whose photons are counted together: many small pictures, or one large."""
 
 
 class NoiseModel(ABC):
@@ -51,8 +53,14 @@ class NoiseModel(ABC):
         device."""
 
     @abstractmethod
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        """The noisy RAW before the clip at white, as a new tensor: what composed models hand on to one another."""
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        """The noisy RAW before the clip at white: what composed models hand on to one another.
+
+        Args:
+            clean: packed RAW ``(B, 4, h, w)``.
+            params: of :meth:`sample`.
+            out: where the result is written, ``clean`` itself or a tensor like it; a new tensor by default.
+        """
 
     @abstractmethod
     def variance(self, clean: Tensor, params: Params) -> Tensor:
@@ -107,6 +115,14 @@ def per_picture(value: Tensor, like: Tensor) -> Tensor:
     return value.to(like).reshape(-1, 1, 1, 1)
 
 
+def drawn_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
+    """Standard normals in the shape and type of ``like``, one generator a picture."""
+    drawn = torch.empty_like(like, memory_format=torch.contiguous_format)
+    for picture, generator in zip(drawn, generators, strict=True):
+        picture.normal_(generator=generator)
+    return drawn
+
+
 class ShotReadModel(NoiseModel):
     """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
 
@@ -151,8 +167,9 @@ class ShotReadNoise(ShotReadModel):
         return self._disturbed(clean, params, white=1.0, with_variance=True)
 
     @torch.no_grad()
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        return self._disturbed(clean, params, white=math.inf)[0]
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        noisy, _ = self._disturbed(clean, params, white=math.inf)
+        return noisy if out is None else out.copy_(noisy)
 
     def _disturbed(
         self, clean: Tensor, params: Params, white: float, with_variance: bool = False
@@ -170,10 +187,7 @@ class ShotReadNoise(ShotReadModel):
     def _normals(self, like: Tensor, params: Params) -> Tensor:
         if like.device.type == "cpu":
             return torch.stack([normals(key, *like.shape[-2:]) for key in self._keys(params)]).to(like)
-        drawn = torch.empty_like(like, memory_format=torch.contiguous_format)
-        for picture, generator in zip(drawn, self.generators(params, like.device), strict=True):
-            picture.normal_(generator=generator)
-        return drawn
+        return drawn_normals(like, self.generators(params, like.device))
 
     def _keys(self, params: Params) -> list[int]:
         return [derived_seed(seed, self.stream) for seed in params["seed"].tolist()]
@@ -186,16 +200,23 @@ class PoissonGaussianNoise(ShotReadModel):
     """
 
     @torch.no_grad()
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        noisy = clean.clone(memory_format=torch.contiguous_format)
-        for i, generator in enumerate(self.generators(params, clean.device)):
-            shot_var = float(params["shot_var"][i])
-            if shot_var > _NO_SHOT:
-                light = clean[i].clamp(min=0)
-                noisy[i] += poisson(light / shot_var, generator).mul_(shot_var).sub_(light)
-            noisy[i] += self.read_noise(noisy[i], i, params, generator)
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        noisy = torch.empty_like(clean, memory_format=torch.contiguous_format) if out is None else out
+        generators = list(self.generators(params, clean.device))
+        together = max(1, _GROUP // max(1, clean[:1].numel()))
+        for first in range(0, len(clean), together):
+            group = slice(first, first + together)
+            torch.add(clean[group], self._noise(clean[group], params, group, generators[group]), out=noisy[group])
         return noisy
 
-    def read_noise(self, like: Tensor, picture: int, params: Params, generator: torch.Generator) -> Tensor:
-        """Read noise of the shape ``(4, h, w)`` of ``like``, for one picture of the batch."""
-        return torch.empty_like(like).normal_(generator=generator).mul_(float(params["read_var"][picture]) ** 0.5)
+    def _noise(self, clean: Tensor, params: Params, group: slice, generators: Sequence[torch.Generator]) -> Tensor:
+        """The noise of a group of pictures; of each, photons are drawn first, then read noise."""
+        shot_var = per_picture(params["shot_var"][group], clean)
+        light = clean.clamp(min=0)
+        photons = poisson(light / shot_var.clamp(min=_NO_SHOT), drawn_normals(clean, generators)).mul_(shot_var)
+        noise = photons.sub_(light).masked_fill_(shot_var <= _NO_SHOT, 0.0)
+        return noise.add_(self.read_noise(clean, {name: value[group] for name, value in params.items()}, generators))
+
+    def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        """Read noise of the shape ``(b, 4, h, w)`` of ``like``, from one generator a picture."""
+        return drawn_normals(like, generators).mul_(per_picture(params["read_var"], like).sqrt())

@@ -17,24 +17,26 @@ from torch import Tensor
 INVERSION_LIMIT = 10.0
 """Rates below it are drawn by walking the sum; from it on the expansion's distribution function is right to 5e-5."""
 
-
 _CACHED = 2**15  # as in models.py; smaller, because more arrays are at work
 
 
-def poisson(rate: Tensor, generator: torch.Generator) -> Tensor:
+def poisson(rate: Tensor, normals: Tensor) -> Tensor:
     """Poisson counts for the expected counts ``rate >= 0``, any shape, float32 or float64, as floats of the same type.
 
+    Args:
+        rate: expected counts.
+        normals: a standard normal draw for each, contiguous; the counts are written over them.
+
     Example:
-        >>> counts = poisson(torch.full((1000,), 3.0), torch.Generator().manual_seed(0))
+        >>> counts = poisson(torch.full((1000,), 3.0), torch.randn(1000, generator=torch.Generator().manual_seed(0)))
     """
-    counts = torch.empty_like(rate, memory_format=torch.contiguous_format).normal_(generator=generator)
     piece = _CACHED if rate.device.type == "cpu" else max(rate.numel(), 1)
-    for part, out in zip(rate.reshape(-1).split(piece), counts.view(-1).split(piece), strict=True):
+    for part, out in zip(rate.reshape(-1).split(piece), normals.view(-1).split(piece), strict=True):
         low = part < INVERSION_LIMIT
         walked = _walked(part[low], out[low]).to(out)
         out.copy_(_expanded(part, out))
         out[low] = walked
-    return counts
+    return normals
 
 
 def _expanded(rate: Tensor, w: Tensor) -> Tensor:

@@ -12,12 +12,13 @@ logistic at 0, near the normal at 0.14, heavier the lower the shape (Joiner and 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from rawaug.noise.levels import NoiseLevels, log_uniform
-from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, new_seeds, per_picture
+from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, drawn_normals, new_seeds, per_picture
 
 Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
@@ -68,14 +69,21 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
         uniform = torch.rand(batch, generator=generator, device=generator.device)
         return super().sample(batch, generator) | {"tukey_lambda": low + (high - low) * uniform}
 
-    def read_noise(self, like: Tensor, picture: int, params: Params, generator: torch.Generator) -> Tensor:
-        shape = float(params["tukey_lambda"][picture])
-        sd = math.sqrt(float(params["read_var"][picture]) / tukey_lambda_variance(shape))
-        u = torch.rand(like.shape, generator=generator, device=like.device)
-        log_u, log_v = u.clamp(min=2**-25).log_(), (1 - u).log_()  # rand is a multiple of 2^-24, and may be 0
-        if shape == 0:
-            return (log_u - log_v).mul_(sd).to(like)
-        return (torch.expm1(shape * log_u) - torch.expm1(shape * log_v)).mul_(sd / shape).to(like)
+    def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        noise = torch.empty_like(like, memory_format=torch.contiguous_format)
+        shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
+        for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
+            u = torch.rand(picture.shape, generator=generator, device=like.device)
+            picture.copy_(_tukey_lambda(u, shape).mul_(math.sqrt(read_var / tukey_lambda_variance(shape))))
+        return noise
+
+
+def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
+    """The quantile function Q(u)."""
+    log_u, log_v = u.clamp(min=2**-25).log_(), (1 - u).log_()  # rand is a multiple of 2^-24, and may be 0
+    if shape == 0:
+        return log_u.sub_(log_v)
+    return log_u.mul_(shape).expm1_().sub_(log_v.mul_(shape).expm1_()).div_(shape)
 
 
 class RowNoise(NoiseModel):
@@ -94,12 +102,10 @@ class RowNoise(NoiseModel):
         return {"row_var": _draw(self.row_var, batch, generator), "seed": new_seeds(batch, generator)}
 
     @torch.no_grad()
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        rows = clean.new_empty(len(clean), 2, clean.shape[-2], 1)
-        for picture, generator in zip(rows, self.generators(params, clean.device), strict=True):
-            picture.normal_(generator=generator)
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        rows = drawn_normals(clean[:, :2, :, :1], self.generators(params, clean.device))
         rows *= per_picture(params["row_var"], clean).sqrt()
-        return clean + rows.repeat_interleave(2, dim=1)
+        return torch.add(clean, rows.repeat_interleave(2, dim=1), out=out)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         return per_picture(params["row_var"], clean).expand_as(clean).clone()
@@ -124,8 +130,8 @@ class BlackOffset(_FixedPattern):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         return {"black_offset": self.sd * torch.randn(batch, generator=generator, device=generator.device)}
 
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        return clean + per_picture(params["black_offset"], clean)
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        return torch.add(clean, per_picture(params["black_offset"], clean), out=out)
 
 
 class ColourBias(_FixedPattern):
@@ -140,8 +146,8 @@ class ColourBias(_FixedPattern):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         return {"colour_bias": self.sd * torch.randn(batch, 4, generator=generator, device=generator.device)}
 
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        return clean + params["colour_bias"].to(clean)[:, :, None, None]
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        return torch.add(clean, params["colour_bias"].to(clean)[:, :, None, None], out=out)
 
 
 class DefectPixels(_FixedPattern):
@@ -149,8 +155,7 @@ class DefectPixels(_FixedPattern):
 
     Args:
         dead, hot: the share of pixels, typically 1e-5 to 1e-3. ``variance`` leaves them out: they are not noise of a
-        pixel's
-            signal but pixels to be found.
+            pixel's signal but pixels to be found.
     """
 
     stream = "defects"
@@ -165,8 +170,8 @@ class DefectPixels(_FixedPattern):
         shares = {"dead_share": _draw(self.dead, batch, generator), "hot_share": _draw(self.hot, batch, generator)}
         return shares | {"seed": new_seeds(batch, generator)}
 
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
-        noisy = clean.clone()
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        noisy = clean.clone() if out is None else out.copy_(clean)
         for i, generator in enumerate(self.generators(params, clean.device)):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
             place, current = torch.rand((2, *clean.shape[1:]), generator=generator, device=clean.device).to(clean)
@@ -195,9 +200,9 @@ class Quantisation(NoiseModel):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         return {"quantum": torch.full((batch,), self.quantum, device=generator.device)}
 
-    def disturb(self, clean: Tensor, params: Params) -> Tensor:
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         quantum = per_picture(params["quantum"], clean)
-        return (clean / quantum).round_().mul_(quantum)
+        return torch.div(clean, quantum, out=out).round_().mul_(quantum)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         return (per_picture(params["quantum"], clean).square() / 12).expand_as(clean).clone()

@@ -183,6 +183,15 @@ def test_non_contiguous_pictures_and_double_precision() -> None:
     assert model.apply(clean.double(), params).dtype == torch.float64
 
 
+@pytest.mark.parametrize("name", list(EVERY))
+def test_noise_may_be_written_over_the_picture(name: str) -> None:
+    model = EVERY[name]()
+    clean, params = torch.rand(3, 4, 20, 30, generator=generator(0)), model.sample(3, generator(1))
+    expected, copy = model.disturb(clean, params), clean.clone()
+    assert model.disturb(copy, params, out=copy) is copy and torch.equal(copy, expected)
+    assert not torch.equal(clean, expected)
+
+
 @pytest.mark.parametrize("name", ["gaussian", "poisson", "full sensor"])
 def test_noise_and_variance_at_once_are_the_two_apart(name: str) -> None:
     model = EVERY[name]()

@@ -13,8 +13,8 @@ N = 400_000
 
 
 def draw(rate: float, device: str, n: int = N) -> torch.Tensor:
-    counts = poisson(torch.full((n,), rate, device=device), torch.Generator(device).manual_seed(7))
-    return counts.double().cpu()
+    normals = torch.empty(n, device=device).normal_(generator=torch.Generator(device).manual_seed(7))
+    return poisson(torch.full((n,), rate, device=device), normals).double().cpu()
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -57,5 +57,5 @@ def test_far_tail_is_neither_cut_nor_endless() -> None:
 
 
 def test_no_light_no_photons() -> None:
-    assert (poisson(torch.zeros(1000), torch.Generator().manual_seed(0)) == 0).all()
-    assert poisson(torch.zeros(0), torch.Generator()).shape == (0,)
+    assert (poisson(torch.zeros(1000), torch.linspace(-6, 6, 1000)) == 0).all()
+    assert poisson(torch.zeros(0), torch.zeros(0)).shape == (0,)
