@@ -11,7 +11,7 @@ behind a DataLoader.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from rawaug.conform import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
-from rawaug.isp.baked import BakedISP
 from rawaug.isp.dictionary import convex_weights, perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPParams
+from rawaug.isp.unbaked import reverse_pass
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.params import AugmentParams, RawPair
 from rawaug.seeding import keyed_generator
@@ -35,13 +35,14 @@ class RawAugment(nn.Module):
     """sRGB batches to RAW pairs.
 
     Args:
-        isp: the fitted camera.
+        isp: the fitted camera; is put in eval mode, without gradients.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
             ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
-        seed: of the module's own draws, where no generator is passed.
+        seed: of the module's own draws, where no generator is passed. They are counted from its construction on: what
+            is to go on where it stopped passes a generator, or takes RawPairs or wrap.
         exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly; ``(0, 0)`` is that of the
             camera which the ISP knows. Cameras differ in the headroom that they leave above their JPEG's white: for
             training that is to serve others, (-1.5, 0).
@@ -67,10 +68,12 @@ class RawAugment(nn.Module):
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
             raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
+        if not strength >= 0:
+            raise ValueError(f"strength is a standard deviation, at least 0, got {strength}")
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
         self.isp = isp.eval().requires_grad_(False)
-        self.baked = BakedISP(self.isp)
+        self.baked = reverse_pass(self.isp)
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
@@ -172,6 +175,15 @@ class RawAugment(nn.Module):
         srgb = self._batch(pictures)
         pair = self._pair(srgb, self.sample(srgb, generator))
         return replaced(batch, where, pair.map(lambda t: t[0]) if is_picture(pictures) else pair)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RawAugment:
+        """Go where the surrounding network goes, but stay float32, in a network of bfloat16 too."""
+
+        def moved(tensor: Tensor) -> Tensor:
+            probe = fn(tensor.new_empty(0))
+            return fn(tensor) if probe.dtype == tensor.dtype else tensor.to(probe.device)
+
+        return super()._apply(moved, recurse)
 
     @property
     def device(self) -> torch.device:

@@ -169,6 +169,8 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     rows, columns = cfa.turned(view).shift_to(cfa)
     turned = turn(raw, view)
     height, width = turned.shape[-2:]
+    if height <= 2 * rows or width <= 2 * columns:
+        raise ValueError(f"a mosaic of {height} x {width} has no lines to spare for a turn that keeps its CFA")
     return turned[..., rows : height - rows, columns : width - columns]
 
 
@@ -196,7 +198,7 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     """
     if top % 2 or left % 2 or height % 2 or width % 2:
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
-    if min(top, left) < 0 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
+    if min(top, left) < 0 or min(height, width) < 1 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
         raise ValueError(f"crop {height} x {width} at ({top}, {left}) leaves the mosaic {tuple(raw.shape[-2:])}")
     return raw[..., top : top + height, left : left + width]
 

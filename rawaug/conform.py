@@ -15,12 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.isp.stages import as_float
+from rawaug.isp.stages import as_float, require_display_range
 
 _CHANNELS = (1, 3, 4)
 _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
-_HALF_LEVEL = 0.5 / 255
 
 Where = str | int | None
 """Where in a sample the picture stands: a key, an index, or None where the sample is the picture."""
@@ -77,8 +76,14 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
 
 
 def even_sided(image: Tensor) -> Tensor:
-    """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2."""
+    """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2.
+
+    Raises:
+        ValueError: if nothing would be left.
+    """
     height, width = image.shape[-2:]
+    if min(image.shape[0], height // 2, width // 2) < 1:
+        raise ValueError(f"a picture is 2 x 2 or larger, and a batch has one or more; got {tuple(image.shape)}")
     return image[..., : height - height % 2, : width - width % 2]
 
 
@@ -105,9 +110,9 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
         if batched and key is None and is_picture(sample[0]):
             return None
         where = key or 0
-        if not isinstance(where, int) or where >= len(sample):
+        if not isinstance(where, int) or not -len(sample) <= where < len(sample):
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
-        return where
+        return where % len(sample)
     if key is not None:
         raise ValueError(
             f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; leave key out"
@@ -160,18 +165,8 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
         return image.float() / 65535.0
     if not image.is_floating_point():
         raise ValueError(f"a picture is uint8, uint16 or float in [0, 1], got {image.dtype}; convert it first")
-    _require_display_range(image)
+    require_display_range(image)
     return image.float()
-
-
-def _require_display_range(image: Tensor) -> None:
-    if image.device.type != "cpu" or not image.numel():
-        return
-    low, high = (float(value) for value in torch.aminmax(image))
-    if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
-        raise ValueError(
-            f"a float picture is in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
-        )
 
 
 def _described(value: Any) -> str:

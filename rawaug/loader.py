@@ -1,7 +1,8 @@
 """A DataLoader of sRGB pictures as a loader of RAW pairs: one line, on the device of the training.
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
-augmentation's: whatever the loader's workers do, the same batches make the same pairs.
+augmentation's: whatever the loader's workers do, the same batches make the same pairs. In a distributed run the keys of
+processes but the first have their rank as well.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rawaug.augment import RawAugment
 from rawaug.bayer import RandomCrop
-from rawaug.conform import even_sided, find_picture, picked, replaced, stacked, to_rgb_batch, to_rgb_tensor
+from rawaug.conform import even_sided, find_picture, is_picture, picked, replaced, stacked, to_rgb_batch, to_rgb_tensor
 from rawaug.pairs import placed, random_place
 from rawaug.params import RawPair
 from rawaug.seeding import keyed_generator
@@ -57,8 +59,13 @@ class WrappedLoader:
     def _pairs(self, epoch: int, start: int) -> Iterator[Any]:
         for number, batch in enumerate(self.loader, start):
             where = find_picture(batch, self.key, batched=True)
-            generator = keyed_generator(self.augment.seed, "wrap", epoch, number)
-            yield replaced(batch, where, self._pair(picked(batch, where), generator))
+            generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *_rank())
+            yield replaced(batch, where, self._pair(self._pictures(picked(batch, where)), generator))
+
+    def _pictures(self, batch: Any) -> Any:
+        """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
+        grey = isinstance(batch, (Tensor, np.ndarray)) and batch.ndim == 3
+        return batch[:, None] if grey and getattr(self.loader, "batch_size", None) is not None else batch
 
     def _pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
         whole = even_sided(to_rgb_batch(pictures)) if self.crop is None else None
@@ -69,7 +76,8 @@ class WrappedLoader:
 
     def _crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """One crop of each picture ``(B, 3, crop, crop)``, and their places ``(B, 5)``."""
-        whole = [even_sided(to_rgb_tensor(picture)) for picture in pictures]
+        listed = [pictures] if is_picture(pictures) else pictures
+        whole = [even_sided(to_rgb_tensor(picture)) for picture in listed]
         places = [random_place(picture, self.crop, False, generator) for picture in whole]
         patches = [placed(picture, place, self.crop) for picture, place in zip(whole, places, strict=True)]
         return stacked(patches), torch.stack(places)
@@ -78,6 +86,13 @@ class WrappedLoader:
         if name == "loader":  # asked for before it is set, by copy and pickle
             raise AttributeError(name)
         return getattr(self.loader, name)
+
+
+def _rank() -> tuple[int, ...]:
+    """The key of a process in a distributed run; the first, and a process alone, have none."""
+    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+    rank = torch.distributed.get_rank() if distributed else 0
+    return (rank,) if rank else ()
 
 
 def wrap(

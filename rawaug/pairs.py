@@ -8,7 +8,7 @@ any start method, any batch size, and after a resume in the middle of an epoch.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sized
-from typing import Any
+from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -60,7 +60,7 @@ class RawPairs(Dataset[Any]):
         self.dataset, self.augment, self.crop, self.seed, self.key = dataset, augment, crop, seed, key
         self.turns = turns
         if crop is not None:
-            bayer.RandomCrop(crop)  # an odd one is told here, not in a worker
+            bayer.RandomCrop(int(crop))  # an odd one is told here, not in a worker
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # persistent workers see it change
 
     def set_epoch(self, epoch: int) -> None:
@@ -75,6 +75,8 @@ class RawPairs(Dataset[Any]):
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Any:
+        if not isinstance(index, SupportsIndex):
+            raise TypeError(f"a pair has a number, got {type(index).__name__}; take parts with torch.utils.data.Subset")
         index = range(len(self))[index]  # IndexError ends iteration
         return self.draw(index, self._generator(index))
 

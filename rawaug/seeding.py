@@ -7,6 +7,8 @@ number of workers or on the order in which samples are asked for.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -25,3 +27,16 @@ def derived_seed(*keys: int | str) -> int:
 def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> torch.Generator:
     """A ``torch.Generator`` on ``device``, seeded with :func:`derived_seed`."""
     return torch.Generator(device).manual_seed(derived_seed(*keys))
+
+
+@contextmanager
+def initialised_from(seed: int) -> Iterator[None]:
+    """Layers made inside draw their weights from ``seed``; PyTorch's global state is afterwards what it was.
+
+    Example:
+        >>> with initialised_from(0):
+        ...     layer = torch.nn.Linear(3, 3)
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        yield

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ class Pair:
         srgb: uint8 ``(3, H, W)``, in the sensor's orientation.
         raw: the clean mosaic, float32 ``(1, H, W)``, black 0, white 1, sides even.
         cfa: the pattern of ``raw`` and ``noisy``.
-        white_balance: as-shot multipliers of R, G, B, green being 1.
+        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 where they are not known.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
         noisy: a noisy mosaic of the same scene, like ``raw``, where one was captured.
         shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
@@ -36,8 +36,8 @@ class Pair:
     srgb: Tensor
     raw: Tensor
     cfa: CFA
-    white_balance: tuple[float, float, float]
-    color_matrix: Tensor
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
     noisy: Tensor | None = None
     shot_var: float | None = None
     read_var: float | None = None
@@ -45,6 +45,7 @@ class Pair:
     registered: bool = True
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name
         self._require_shape("srgb", self.srgb, 3, torch.uint8)
         self._require_shape("raw", self.raw, 1, torch.float32)
         if self.noisy is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -16,15 +18,18 @@ EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
 )
+_MARGIN = 0.03
+"""Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 
 
 class RawFolder(LazyPairs):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
 
-    A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size (it is turned
-    into the sensor's orientation, and the pair is not ``registered``), else LibRaw's rendering (see
-    :func:`rawaug.io.read_raw_and_develop`, also on forked workers). Files are read when asked for; the last one stays.
+    A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
+    is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
+    ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`, also on forked workers), with
+    a warning if there is a JPEG of another size. Files are read when asked for; the last one stays.
 
     Args:
         path: where the RAW files are.
@@ -61,10 +66,20 @@ class RawFolder(LazyPairs):
         if jpeg is not None:
             frame = read_raw(file)
             srgb = turn_back(read_picture(jpeg), frame.upright_view)
-            height, width = frame.mosaic.shape[-2:]
-            if (srgb.shape[-2] // 2 * 2, srgb.shape[-1] // 2 * 2) == (height, width):
-                return _pair(frame, srgb[:, :height, :width].contiguous(), registered=False)
+            size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
+            sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
+            if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
+                frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
+                return _pair(frame, _centre(srgb, *size), registered=False)
+            told = "{} x {} beside a RAW file of {} x {}".format(*sides)
+            warnings.warn(f"{jpeg}: {told}; LibRaw's rendering is taken instead of it", stacklevel=2)
         return _pair(*read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
+
+
+def _centre(image: Tensor, height: int, width: int) -> Tensor:
+    """The middle of ``(C, H, W)``, from an even row and column on."""
+    top, left = (image.shape[-2] - height) // 4 * 2, (image.shape[-1] - width) // 4 * 2
+    return image[:, top : top + height, left : left + width].contiguous()
 
 
 def _pair(frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:

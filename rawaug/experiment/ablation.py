@@ -79,7 +79,7 @@ def ablate(ablation: Ablation) -> dict[str, Any]:
             curves.append(stage_psnr(isp, left_out, given != "blind"))
         without["none"].append(psnr_r(isp, left_out, white_balance=True))
         for stage in LEFT_OUT:
-            kept = tuple(s for s in POINTWISE_STAGES if s != stage)
+            kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
             lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
             without[stage].append(psnr_r(lacking, left_out, white_balance=stage != "gains"))
     means = {given: torch.tensor(curves).mean(0).tolist() for given, curves in stagewise.items()}

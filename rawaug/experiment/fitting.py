@@ -52,6 +52,8 @@ def fit(
         >>> isp.info["frames"][0]
         'train_00_astronaut'
     """
+    if noise not in ("auto", "on", "off"):
+        raise ValueError(f"noise is auto, on or off, got {noise!r}")
     start = time.perf_counter()
     pairs = _pairs(source, camera_jpeg)
     watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
@@ -86,12 +88,13 @@ class _Watch:
     """PSNR_r of frames that the fit does not see, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = list(pairs)
+        self.pairs = pairs
         self.scores: list[dict[str, float]] = []
 
     def __call__(self, isp: DictionaryISP) -> str:
         blind, given = (
-            sum(psnr_r(isp, pair, white_balance, WATCHED_PATCHES) for pair in self.pairs) / len(self.pairs)
+            sum(psnr_r(isp, self.pairs[k], white_balance, WATCHED_PATCHES) for k in range(len(self.pairs)))
+            / len(self.pairs)
             for white_balance in (False, True)
         )
         self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
@@ -101,8 +104,12 @@ class _Watch:
 def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
         source = [source]
-    if len(source) and isinstance(source[0], Pair):
-        return list(source)  # type: ignore[arg-type]
+    if not hasattr(source, "__getitem__") or not len(source):
+        raise ValueError("a fit takes files, folders or pairs, in a sequence of one or more")
+    if isinstance(source[0], Pair):
+        return source  # type: ignore[return-value]
+    if not isinstance(source[0], (str, Path)):
+        raise ValueError(f"a fit takes files, folders or rawaug.Pair, got {type(source[0]).__name__}; see docs/fit.md")
     opened = [open_pairs(str(item), split="train") for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]

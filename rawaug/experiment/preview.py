@@ -38,27 +38,32 @@ def preview(picture: str | Path, weights: str | Path, out: str | Path, count: in
     Returns:
         The two paths.
     """
+    if count < 0:
+        raise ValueError(f"count is at least 0, got {count}")
     isp = DictionaryISP.from_pretrained(weights)
-    srgb = _centre(even_sided(read_picture(picture)))[None]
-    out = Path(out)
+    whole = even_sided(read_picture(picture))
+    out = Path(out) if Path(out).suffix else Path(f"{out}.png")
     out.parent.mkdir(parents=True, exist_ok=True)
     atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")
-    _draw_stages(isp, srgb, count, seed).savefig(out, dpi=130)
+    _draw_stages(isp, whole, count, seed).savefig(out, dpi=130)
     _draw_atoms(isp).savefig(atoms, dpi=130)
     return [out, atoms]
 
 
-def _centre(srgb: Tensor) -> Tensor:
+def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
+    """Top, left, height and width of what is shown."""
     height, width = (min(side, _MAXIMUM) for side in srgb.shape[-2:])
     top, left = ((side - size) // 4 * 2 for side, size in zip(srgb.shape[-2:], (height, width), strict=True))
-    return srgb[:, top : top + height, left : left + width]
+    return top, left, height, width
 
 
 @torch.no_grad()
-def _draw_stages(isp: DictionaryISP, srgb: Tensor, count: int, seed: int) -> Any:
+def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
     from matplotlib.figure import Figure
 
-    reverse = isp.reverse(srgb, intermediates=True)
+    top, left, height, width = _centre(whole)
+    srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
+    reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
     panels = {"sRGB x": srgb[0] / 255.0}
     for name, image in reverse.intermediates.items():
         shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
@@ -67,7 +72,7 @@ def _draw_stages(isp: DictionaryISP, srgb: Tensor, count: int, seed: int) -> Any
     augment = RawAugment(isp)
     generator = keyed_generator(seed, "preview")
     for k in range(count):
-        pair = augment(srgb, generator)
+        pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
         title = f"noisy RAW {k + 1}\nshot {pair.params.noise['shot_var'].item():.1e}"
         panels[title] = encode_srgb(bayer.demosaic(bayer.unpack(pair.noisy, isp.cfa), isp.cfa)[0].clamp(0, 1))
     columns = len(panels) - count
@@ -105,7 +110,7 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
 
 
 def _swatches(axis: Any, isp: DictionaryISP) -> None:
-    """One row an atom: what it makes of sRGB red, green, blue, white and two skin-like tones."""
+    """One row an atom: what it makes of sRGB red, green, blue, white, skin and sky."""
     tones = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])
     patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
     axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")

@@ -12,6 +12,7 @@ has a table of its own.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 
 import torch
@@ -53,7 +54,7 @@ class BakedISP(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         self.config = isp.config
-        if self.config.stages != tuple(stage for stage in POINTWISE_STAGES if stage in self.config.stages):
+        if not bakeable(self.config.stages):
             raise ValueError(f"only stages in the usual order can be baked, got {' '.join(self.config.stages)}")
         axis = torch.linspace(0.0, 1.0, nodes)
         cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
@@ -87,7 +88,7 @@ class BakedISP(nn.Module):
         Raises:
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.
         """
-        self._check(srgb, params, place)
+        require_batch(srgb, params, place)
         camera = self._camera(srgb, params, place)
         if srgb.dtype != torch.uint8:
             srgb = srgb.float()
@@ -96,13 +97,6 @@ class BakedISP(nn.Module):
         from rawaug.isp import fused
 
         return fused.unprocess(srgb, camera, white)
-
-    def _check(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
-        if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
-            raise ValueError(f"sRGB has shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
-        for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
-            if value is not None and len(value) != len(srgb):
-                raise ValueError(f"{what} is for {len(value)} pictures, the batch has {len(srgb)}")
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> unprocess.Camera:
         batch, _, height, width = srgb.shape
@@ -119,6 +113,20 @@ class BakedISP(nn.Module):
             shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
         return unprocess.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
+
+
+def bakeable(order: Sequence[str]) -> bool:
+    """Whether stages stand in the usual order; any may be left out."""
+    return list(order) == [stage for stage in POINTWISE_STAGES if stage in order]
+
+
+def require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
+    """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
+    if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
+        raise ValueError(f"sRGB has shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
+    for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
+        if value is not None and len(value) != len(srgb):
+            raise ValueError(f"{what} is for {len(value)} pictures, the batch has {len(srgb)}")
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:

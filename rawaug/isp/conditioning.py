@@ -35,25 +35,33 @@ def on_gains(
     Args:
         isp: whose dictionaries are used.
         params: chosen parameters.
-        white_balance: as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``, as the file tells them.
+        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as the file tells them; green is made 1.
         digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
 
     Raises:
-        ValueError: if a shape is another.
+        ValueError: if a shape is another, or a gain is not positive.
     """
     batch = len(params.gains)
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
             raise ValueError(f"white_balance is (3,) or ({batch}, 3), got {tuple(balance.shape)}")
+        _require_factor("white_balance", balance)
+        balance = balance / balance[..., 1:2]
         params = _in_light(isp, params, balance.expand_as(params.gains))
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
         if len(digital) not in (1, batch):
             raise ValueError(f"digital_gain is one number or ({batch},), got {len(digital)}")
+        _require_factor("digital_gain", digital)
         own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
         params = params._replace(gains=params.gains / own * digital)
     return params
+
+
+def _require_factor(name: str, value: Tensor) -> None:
+    if not (value.isfinite() & (value > 0)).all():
+        raise ValueError(f"{name} is positive, got {value.flatten().tolist()}")
 
 
 def _in_light(isp: DictionaryISP, params: ISPParams, balance: Tensor) -> ISPParams:
@@ -93,8 +101,10 @@ def on_samples(isp: DictionaryISP, x: Tensor, params: ISPParams, raw_samples: Te
 
 
 def _require_places(raw_samples: Tensor, x: Tensor) -> None:
-    if raw_samples.ndim != 3 or raw_samples.shape[0] != len(x) or raw_samples.shape[2] != 3:
+    if raw_samples.ndim != 3 or len(raw_samples) != len(x) or raw_samples.shape[2] != 3 or not raw_samples.shape[1]:
         raise ValueError(f"raw_samples is ({len(x)}, K, 3): row, column, value; got {tuple(raw_samples.shape)}")
+    if not raw_samples.isfinite().all():
+        raise ValueError("raw_samples: a value is not a number; leave such readings out")
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
     if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
         raise ValueError(f"raw_samples: a row or column lies outside the picture, {x.shape[-2]} x {x.shape[-1]}")

@@ -73,9 +73,9 @@ class GainDictionary(nn.Module):
     Drawn from U(1, 2) at first, as in the paper.
     """
 
-    def __init__(self, atoms: int, generator: torch.Generator | None = None) -> None:
+    def __init__(self, atoms: int) -> None:
         super().__init__()
-        self.log_gains = nn.Parameter((1.0 + torch.rand(atoms, 3, generator=generator)).log())
+        self.log_gains = nn.Parameter((1.0 + torch.rand(atoms, 3)).log())
 
     def atoms(self) -> Tensor:
         """``(M, 3)``: g_d, g_r, g_b."""

@@ -24,6 +24,7 @@ from rawaug.isp import conditioning, stages
 from rawaug.isp.dictionary import ColourDictionary, GainDictionary
 from rawaug.isp.encoder import Encoder, thumbnail
 from rawaug.isp.params import POINTWISE_STAGES, ISPConfig, ISPParams, Pass
+from rawaug.seeding import initialised_from
 
 WEIGHTS_DIR = Path(__file__).parents[1] / "weights"
 
@@ -43,6 +44,10 @@ class DirectionNetworks(nn.Module):
 class DictionaryISP(nn.Module):
     """A learned, interpretable camera.
 
+    Args:
+        config: what it is made of.
+        seed: of the networks and gains that it starts with.
+
     Example:
         >>> isp = DictionaryISP()
         >>> srgb = torch.rand(2, 3, 64, 96)
@@ -50,15 +55,16 @@ class DictionaryISP(nn.Module):
         torch.Size([2, 1, 64, 96])
     """
 
-    def __init__(self, config: ISPConfig | None = None, generator: torch.Generator | None = None) -> None:
+    def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
         self.config = config or ISPConfig()
         self.info: dict[str, Any] = {}
-        self.colour = ColourDictionary(self.config.colour_atoms)
-        self.gain = GainDictionary(self.config.gain_atoms, generator)
-        self.shading = stages.GaussianMask()
-        self.reverse_networks = DirectionNetworks(self.config)
-        self.forward_networks = DirectionNetworks(self.config)
+        with initialised_from(seed):
+            self.colour = ColourDictionary(self.config.colour_atoms)
+            self.gain = GainDictionary(self.config.gain_atoms)
+            self.shading = stages.GaussianMask()
+            self.reverse_networks = DirectionNetworks(self.config)
+            self.forward_networks = DirectionNetworks(self.config)
         self.use_encoders(self.config.encoders)
 
     @property
@@ -123,8 +129,8 @@ class DictionaryISP(nn.Module):
         Args:
             srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
             params: camera setting; chosen by the encoders (or their constants) if not given.
-            white_balance: the camera's as-shot multipliers R, G, B with green 1, ``(3,)`` or ``(B, 3)``;
-                they choose the colour atoms of such light as well.
+            white_balance: the camera's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``; green is made 1. They
+                choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.conditioning.on_samples`).
@@ -136,12 +142,15 @@ class DictionaryISP(nn.Module):
             A :class:`Pass` whose ``raw`` is the mosaic ``(B, 1, H, W)`` with the ISP's CFA, white at 1.
 
         Raises:
-            ValueError: if the shape is not ``(B, 3, H, W)`` or a side is odd.
+            ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, the picture or a gain is out of range, or
+                what is given is for another number of pictures.
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3:
             raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
-        x = stages.as_float(srgb)
+        x = stages.display_referred(srgb)
         params = conditioning.on_gains(self, params or self.choose(x), white_balance, digital_gain)
+        if len(params.gains) != len(x):
+            raise ValueError(f"the parameters are those of {len(params.gains)} pictures, the batch has {len(x)}")
         if raw_samples is not None:
             params = conditioning.on_samples(self, x, params, raw_samples, self.place(x, place))
         seen: dict[str, Tensor] = {}
@@ -253,7 +262,6 @@ class DictionaryISP(nn.Module):
             raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
             settings: dict[str, Any] = json.loads(header["config"])
-            settings = {key: tuple(v) if isinstance(v, list) else v for key, v in settings.items()}
             config = ISPConfig(**settings)
             info = dict(json.loads(header.get("info", "{}")))
             with torch.device("meta"):  # takes no memory before the tensors are known to fit

@@ -40,9 +40,15 @@ class ISPConfig:
 
     def __post_init__(self) -> None:
         CFA(self.cfa)
-        unknown = set(self.stages) - set(POINTWISE_STAGES)
-        if unknown:
-            raise ValueError(f"stages: unknown {sorted(unknown)}; choose from {' '.join(POINTWISE_STAGES)}")
+        for key in ("stages", "encoder_widths"):  # a recipe or a file gives lists
+            object.__setattr__(self, key, tuple(getattr(self, key)))
+        wrong = [stage for stage in self.stages if stage not in POINTWISE_STAGES or self.stages.count(stage) > 1]
+        if wrong or not self.stages:
+            raise ValueError(f"stages: {wrong or 'none'}; choose each at most once of {' '.join(POINTWISE_STAGES)}")
+        if len(self.encoder_widths) != 3 or min(self.colour_atoms, self.gain_atoms, *self.encoder_widths) < 1:
+            raise ValueError("encoder_widths are three, and these and the numbers of atoms at least 1")
+        if not 0.0 <= self.knee < 1.0:
+            raise ValueError(f"knee is in [0, 1), got {self.knee}")
 
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))

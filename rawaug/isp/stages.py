@@ -26,6 +26,8 @@ from torch import Tensor, nn
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
 
+_HALF_LEVEL = 0.5 / 255
+
 HIGHLIGHT_KNEE = 0.9
 """Mean linear value above which Brooks' inverse gains bend towards 1."""
 
@@ -33,6 +35,31 @@ HIGHLIGHT_KNEE = 0.9
 def as_float(srgb: Tensor) -> Tensor:
     """uint8 to float32 in [0, 1]; floats pass."""
     return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
+
+
+def display_referred(srgb: Tensor) -> Tensor:
+    """:func:`as_float` of what is seen to be a picture: uint8, or float32 in [0, 1] within half an 8-bit level.
+
+    Floats are looked at on the CPU only, elsewhere that would stall the device.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if srgb.dtype not in (torch.uint8, torch.float32):
+        raise ValueError(f"a picture is uint8, or float32 in [0, 1], got {srgb.dtype}; convert it first")
+    require_display_range(srgb)
+    return as_float(srgb)
+
+
+def require_display_range(image: Tensor) -> None:
+    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level."""
+    if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
+        return
+    low, high = (float(value) for value in torch.aminmax(image.detach()))
+    if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
+        raise ValueError(
+            f"a float picture is in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
+        )
 
 
 class ToneNetwork(nn.Module):

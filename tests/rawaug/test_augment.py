@@ -19,7 +19,7 @@ from rawaug.params import AugmentParams, RawPair
 
 @pytest.fixture(scope="module")
 def isp() -> DictionaryISP:
-    return DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3), torch.Generator().manual_seed(0))
+    return DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3))
 
 
 @pytest.fixture

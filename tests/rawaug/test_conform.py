@@ -111,10 +111,16 @@ def test_pictures_that_make_no_batch_are_refused() -> None:
         to_rgb_batch(torch.zeros(1, 2, 3, 4, 4))
 
 
-@given(st.integers(1, 9), st.integers(1, 9))
+@given(st.integers(2, 9), st.integers(2, 9))
 def test_odd_sides_lose_a_line(height: int, width: int) -> None:
     image = torch.zeros(3, height, width)
     assert even_sided(image).shape == (3, height // 2 * 2, width // 2 * 2)
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 8), (3, 8, 0), (0, 3, 8, 8)])
+def test_what_holds_no_bayer_cell_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="2 x 2 or larger"):
+        even_sided(torch.zeros(shape))
 
 
 Named = namedtuple("Named", ["image", "label"])

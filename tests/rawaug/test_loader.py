@@ -22,7 +22,7 @@ from rawaug.params import RawPair
 
 @pytest.fixture(scope="module")
 def augment() -> RawAugment:
-    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3), torch.Generator().manual_seed(0)))
+    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
 
 
 @pytest.fixture

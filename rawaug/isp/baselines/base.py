@@ -7,8 +7,7 @@ Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training sees t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -18,8 +17,6 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.samples import FramePair
 from rawaug.isp.stages import as_float
-from rawaug.metrics import PATCH
-from rawaug.seeding import derived_seed
 
 
 class ReverseISP(nn.Module, ABC):
@@ -78,22 +75,6 @@ class ReverseISP(nn.Module, ABC):
             ValueError: if the shape or the type is another, or a side is odd.
         """
         return self.to_mosaic(self.unprocess(checked_srgb(srgb)))
-
-    @torch.no_grad()
-    def reverse_patchwise(self, srgb: Tensor, patch: int = PATCH, **given: Any) -> Tensor:
-        """:meth:`reverse` of a whole frame, patch by patch, without gradients, to bound memory.
-
-        The patches are those of :func:`rawaug.metrics.patch_psnr`; InvISP is evaluated in this way. ``given`` goes to
-        :meth:`reverse`.
-        """
-        if patch < 2 or patch % 2:
-            raise ValueError(f"patch must be even and at least 2, got {patch}")
-        rows = []
-        for top in range(0, srgb.shape[-2], patch):
-            lefts = range(0, srgb.shape[-1], patch)
-            row = [self.reverse(srgb[..., top : top + patch, left : left + patch], **given) for left in lefts]
-            rows.append(torch.cat(row, dim=-1))
-        return torch.cat(rows, dim=-2)
 
     def forward(self, raw: Tensor) -> Tensor:
         """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1].
@@ -159,11 +140,3 @@ def checked_raw(raw: Tensor) -> Tensor:
     if raw.shape[2] % 2 or raw.shape[3] % 2:
         raise ValueError(f"a Bayer mosaic has even sides, got {tuple(raw.shape[2:])}; crop the last row or column")
     return raw
-
-
-@contextmanager
-def initialised_from(seed: int) -> Iterator[None]:
-    """Layers made inside draw their weights from ``seed``; the global state stays as it was."""
-    with torch.random.fork_rng():
-        torch.manual_seed(derived_seed(seed, "baseline"))
-        yield

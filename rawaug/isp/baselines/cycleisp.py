@@ -22,7 +22,8 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb, initialised_from
+from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
+from rawaug.seeding import derived_seed, initialised_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
@@ -148,7 +149,7 @@ class CycleISP(CropTrainedISP):
         seed: int = 0,
     ) -> None:
         super().__init__(cfa)
-        with initialised_from(seed):
+        with initialised_from(derived_seed(seed, "baseline")):
             self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
             self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
             self.ccm = ColourBranch(features, reduction=reduction)

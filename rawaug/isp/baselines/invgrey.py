@@ -21,7 +21,8 @@ from torch import Tensor, nn
 from denoisers.network import pad_to_multiple
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.baselines.base import Crops, CropTrainedISP, initialised_from
+from rawaug.isp.baselines.base import Crops, CropTrainedISP
+from rawaug.seeding import derived_seed, initialised_from
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
@@ -90,7 +91,7 @@ class InvertibleGrey(CropTrainedISP):
 
     def __init__(self, cfa: CFA | str = "RGGB", features: int = 64, blocks: int = 8, seed: int = 0) -> None:
         super().__init__(cfa)
-        with initialised_from(seed):
+        with initialised_from(derived_seed(seed, "baseline")):
             self.encoder = Encoder(features)
             self.decoder = decoder(features, blocks)
 

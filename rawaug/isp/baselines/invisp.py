@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
-from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb, initialised_from
+from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
 from rawaug.isp.samples import FramePair
+from rawaug.seeding import derived_seed, initialised_from
 
 SCALE_CLAMP = 0.8
 GAMMA = 2.2
@@ -126,7 +127,7 @@ class InvISP(CropTrainedISP):
         if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality is in 1 to 100, got {jpeg_quality}")
         self.jpeg_quality = jpeg_quality
-        with initialised_from(seed):
+        with initialised_from(derived_seed(seed, "baseline")):
             self.flow = Flow(blocks, growth)
         self.balance: Tensor
         self.register_buffer("balance", torch.ones(1, 3))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
+
+from rawaug.isp.params import POINTWISE_STAGES, ISPConfig
 
 
 @dataclass(frozen=True)
@@ -49,5 +51,12 @@ class FitConfig:
         for key in ("atoms", "pixels", "batch"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key} is at least 1, got {getattr(self, key)}")
+        for key in ("shading", "encoders"):
+            if getattr(self, key) not in ("auto", "on", "off"):
+                raise ValueError(f"{key} is auto, on or off, got {getattr(self, key)!r}")
+        if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
+            raise ValueError(f"isp: unknown {sorted(unknown)}; there are {[key.name for key in fields(ISPConfig)]}")
+        if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):
+            raise ValueError("isp: a fit needs the stage tone or gamma")
         if self.steps < 0 or self.reach < 1:
             raise ValueError(f"steps is at least 0 and reach at least 1, got {self.steps} and {self.reach}")

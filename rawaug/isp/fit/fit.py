@@ -114,9 +114,7 @@ def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
     fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
     if not fewest <= settings["gain_atoms"] <= most:
         raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames call for {fewest} to {most}")
-    with torch.random.fork_rng():
-        torch.manual_seed(derived_seed(config.seed, "isp"))
-        return DictionaryISP(ISPConfig(**settings))
+    return DictionaryISP(ISPConfig(**settings), derived_seed(config.seed, "isp"))
 
 
 class _Fit:

@@ -101,7 +101,7 @@ def scores(monkeypatch: pytest.MonkeyPatch, frame_of: Callable[..., Pair]) -> li
 
 PICTURES = [torch.randint(0, 256, (3, 40, 48), generator=seeded(k), dtype=torch.uint8) for k in range(3)]
 MODELS: dict[str, Callable[[], Any]] = {
-    "dictionary": lambda: DictionaryISP(ISPConfig(cfa="GRBG"), seeded(0)),
+    "dictionary": lambda: DictionaryISP(ISPConfig(cfa="GRBG")),
     "upi": lambda: UPI("GRBG"),
     "network": lambda: UNetISP("GRBG", width=4).eval(),
 }

@@ -15,7 +15,7 @@ from rawaug.metrics import psnr
 def curved_isp(**settings: object) -> DictionaryISP:
     """An ISP with atoms apart from each other, and with tone, attention and shading that do something."""
     generator = torch.Generator().manual_seed(0)
-    isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings), generator)  # type: ignore[arg-type]
+    isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings))  # type: ignore[arg-type]
     with torch.no_grad():
         isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
         for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):

@@ -17,14 +17,14 @@ def test_colour_atoms_have_rows_of_l1_norm_one() -> None:
 
 
 def test_gain_atoms_start_between_one_and_two_as_published() -> None:
-    atoms = GainDictionary(64, torch.Generator().manual_seed(0)).atoms()
+    atoms = GainDictionary(64).atoms()
     assert ((atoms >= 1) & (atoms <= 2)).all()
     assert atoms.min() < 1.1 and atoms.max() > 1.9
 
 
 def test_combining_parameters_equals_combining_images() -> None:
     generator = torch.Generator().manual_seed(0)
-    colour, gain = ColourDictionary(4), GainDictionary(4, generator)
+    colour, gain = ColourDictionary(4), GainDictionary(4)
     with torch.no_grad():
         colour.matrices.copy_(torch.rand(4, 3, 3, generator=generator))
     weights = convex_weights(1, 4, generator)

@@ -109,7 +109,7 @@ def test_wrong_shapes_are_refused(shape: tuple[int, ...]) -> None:
 
 
 def test_a_file_holds_the_whole_isp(tmp_path: Path, srgb: torch.Tensor) -> None:
-    isp = DictionaryISP(ISPConfig(cfa="BGGR", colour_atoms=3, gain_atoms=5), torch.Generator().manual_seed(3))
+    isp = DictionaryISP(ISPConfig(cfa="BGGR", colour_atoms=3, gain_atoms=5), seed=3)
     isp.info = {"frames": ["a"]}
     isp.save(tmp_path / "camera.safetensors")
     loaded = DictionaryISP.from_pretrained(tmp_path / "camera.safetensors")
