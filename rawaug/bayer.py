@@ -18,6 +18,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import get_worker_info
+
+from rawaug.seeding import keyed_generator
 
 N_VIEWS = 8
 """Number of flips and quarter turns of a picture (the dihedral group of the square)."""
@@ -204,7 +207,21 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
 
 
 class _Transform(nn.Module):
-    """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``."""
+    """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``.
+
+    Without a generator, as in ``nn.Sequential``, it draws by ``seed``, the worker that it is in and the call's number.
+    """
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.seed, self._calls = seed, 0
+
+    def _own(self, generator: torch.Generator | None) -> torch.Generator:
+        if generator is not None:
+            return generator
+        self._calls += 1
+        worker = get_worker_info()
+        return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls)
 
     def apply(self, raw: Any, params: Tensor | None = None) -> Any:
         return super().apply(raw) if params is None else self._apply_params(raw, params)
@@ -220,6 +237,7 @@ class RandomCrop(_Transform):
 
     Args:
         size: even side, or (height, width), in mosaic pixels.
+        seed: of its own draws, where no generator is passed.
 
     Raises:
         ValueError: if the size is odd, or, on use, if the mosaic is smaller.
@@ -232,8 +250,8 @@ class RandomCrop(_Transform):
         torch.Size([2, 1, 4, 4])
     """
 
-    def __init__(self, size: int | tuple[int, int]) -> None:
-        super().__init__()
+    def __init__(self, size: int | tuple[int, int], seed: int = 0) -> None:
+        super().__init__(seed)
         self.size = (size, size) if isinstance(size, int) else size
         if any(side % 2 or side < 2 for side in self.size):
             raise ValueError(f"a crop is even and at least 2, got {size}")
@@ -250,8 +268,8 @@ class RandomCrop(_Transform):
         top, left = params.tolist()
         return crop(raw, top, left, *self.size)
 
-    def forward(self, raw: Tensor, generator: torch.Generator) -> Tensor:
-        return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], generator))
+    def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], self._own(generator)))
 
 
 class RandomTurn(_Transform):
@@ -261,6 +279,7 @@ class RandomTurn(_Transform):
         cfa: pattern of the mosaics.
         keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turned(view)``.
         quarter: draw quarter turns too; without them the sides are not exchanged.
+        seed: of its own draws, where no generator is passed.
 
     Example:
         >>> turn = RandomTurn("GRBG")
@@ -268,8 +287,8 @@ class RandomTurn(_Transform):
         torch.Size([1, 1, 6, 12])
     """
 
-    def __init__(self, cfa: CFA | str, keep_cfa: bool = True, quarter: bool = True) -> None:
-        super().__init__()
+    def __init__(self, cfa: CFA | str, keep_cfa: bool = True, quarter: bool = True, seed: int = 0) -> None:
+        super().__init__(seed)
         self.cfa, self.keep_cfa, self.views = CFA(cfa), keep_cfa, N_VIEWS if quarter else N_VIEWS // 2
 
     def sample(self, generator: torch.Generator) -> Tensor:
@@ -280,8 +299,8 @@ class RandomTurn(_Transform):
         view = int(params)
         return turn_keeping_cfa(raw, self.cfa, view) if self.keep_cfa else turn(raw, view)
 
-    def forward(self, raw: Tensor, generator: torch.Generator) -> Tensor:
-        return self._apply_params(raw, self.sample(generator))
+    def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._apply_params(raw, self.sample(self._own(generator)))
 
 
 class Pack(nn.Module):

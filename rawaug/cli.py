@@ -93,11 +93,15 @@ def _parser(kind: str) -> Any:
     evaluate = new("PSNR and SSIM of an ISP or a denoiser; the file says which.")
     evaluate.add_argument("weights", type=str, help="a .safetensors file of rawaug fit or rawaug run")
     evaluate.add_argument("--data", type=str, required=True, help="folder of RAW files, one file, or kind:path")
-    evaluate.add_argument("--self-ensemble", action="store_true", help="average a denoiser over eight views")
-    evaluate.add_argument("--noise", type=str | None, default=None, help="preset for frames without a noisy capture")
+    evaluate.add_argument("--self-ensemble", action="store_true", help="average a denoiser over eight views, besides")
+    noise_help = "for frames without a noisy capture: a preset, a measured camera, or [shot_var, read_var]"
+    evaluate.add_argument("--noise", type=tuple[float, float] | str | None, default=None, help=noise_help)
     evaluate.add_argument("--seed", type=int, default=0, help="of that noise")
     classical = "also score NonLocalMeans, Wavelet, TotalVariation or BM3D on the same noise"
     evaluate.add_argument("--classical", type=list[str], default=[], help=classical)
+    evaluate.add_argument("--device", type=str, default="cpu", help="where a denoiser runs: cpu, cuda, ...")
+    page_help = "also write a page with the scores and with crops of the frames of a denoiser to this HTML file"
+    evaluate.add_argument("--report", type=str | None, default=None, help=page_help)
     evaluate.add_argument("--json", type=str | None, default=None, help="also write the result to this file")
 
     preview = new("Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.")
@@ -192,7 +196,7 @@ def _evaluate(arguments: Any) -> None:
     from rawaug.experiment.report import print_scores
 
     a = arguments
-    result = evaluate(a.weights, a.data, a.self_ensemble, a.noise, a.seed, a.classical)
+    result = evaluate(a.weights, a.data, a.self_ensemble, a.noise, a.seed, a.classical, a.device, a.report)
     print_scores(result)
     if a.json:
         write_json(result, a.json)

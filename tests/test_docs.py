@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 OPTIONAL = {
-    "datasets": "pip install rawaug[examples]",
+    "datasets": "pip install rawaug[test]",
     "pytorch_lightning": "pip install rawaug[test]",
     "webdataset": "pip install rawaug[test]",
 }

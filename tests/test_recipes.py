@@ -169,6 +169,10 @@ def test_what_cannot_be_run_is_refused_before_anything_is_fitted(capsys: pytest.
         Recipe(arms={**arm, "r2r": ArmConfig(estimator="r2r")})
     with pytest.raises(ValueError, match="augmented: 1"):
         Recipe(arms=arm, data=DataConfig(pairs=None), camera="universal")
+    for flags in (["--steps", "0"], ["--train.batch", "0"], ["--train.crop", "63"], ["--train.checkpoint_every", "0"]):
+        assert flags[0].removeprefix("--train.").removeprefix("--") in refused(capsys, "run", "fewshot", *flags)
+    assert "noise 'Foo' is unknown" in refused(capsys, "run", "fewshot", "--noise", "Foo")
+    assert "thickness" in refused(capsys, "run", "fewshot", "--denoiser.settings", "{thickness: 3}")
     assert "Median is unknown" in refused(capsys, "run", "fewshot", "--classical", "[Median]")
     assert "sidd/full" in refused(capsys, "run", "sidd/nothing")
 
@@ -177,4 +181,4 @@ def test_a_smoke_run_keeps_what_the_recipe_compares() -> None:
     recipe = Recipe(name="a/b", arms={"r2r": ArmConfig(0.5, estimator="r2r")}, seeds=3, steps=10**6, device="cuda")
     quick = smoke(recipe)
     assert quick.arms == recipe.arms and quick.self_supervised
-    assert (quick.name, quick.seeds, quick.train.steps, quick.device) == ("b-smoke", 1, 4, "cpu")
+    assert (quick.name, quick.seeds, quick.train.steps, quick.device) == ("a-b-smoke", 1, 4, "cpu")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +30,8 @@ class RawFolder(LazyPairs):
     A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
     is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
     ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`, also on forked workers), with
-    a warning if there is a JPEG of another size. Files are read when asked for; the last one stays.
+    a warning if there is a JPEG of another size. Its name is the file's stem; where two would have the same, the path.
+    Files are read when asked for; the last one stays.
 
     Args:
         path: where the RAW files are.
@@ -57,7 +59,7 @@ class RawFolder(LazyPairs):
             raise ValueError(f"{path}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr = adjust_maximum_thr
-        super().__init__([file.stem for file in self.files])
+        super().__init__(_names(self.files))
 
     def read(self, index: int) -> Pair:
         """The frame of ``files[index]``, developed, or with its camera's JPEG."""
@@ -70,10 +72,10 @@ class RawFolder(LazyPairs):
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
                 frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
-                return _pair(frame, _centre(srgb, *size), registered=False)
+                return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
             told = "{} x {} beside a RAW file of {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {told}; LibRaw's rendering is taken instead of it", stacklevel=2)
-        return _pair(*read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
+        return _pair(self.names[index], *read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
 
 
 def _centre(image: Tensor, height: int, width: int) -> Tensor:
@@ -82,9 +84,18 @@ def _centre(image: Tensor, height: int, width: int) -> Tensor:
     return image[:, top : top + height, left : left + width].contiguous()
 
 
-def _pair(frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
+def _names(files: Sequence[Path]) -> list[str]:
+    """Stems, with as much of the path before them as tells equal ones apart."""
+    names = [file.stem for file in files]
+    if len(set(names)) < len(names):
+        above = os.path.commonpath([file.resolve().parent for file in files])
+        names = [file.resolve().relative_to(above).as_posix() for file in files]
+    return names
+
+
+def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
     return Pair(
-        name=frame.name,
+        name=name,
         srgb=srgb,
         raw=frame.mosaic,
         cfa=frame.cfa,

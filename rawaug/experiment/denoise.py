@@ -29,7 +29,7 @@ from rawaug.experiment.pair_files import sha256
 from rawaug.experiment.stream import Sample
 from rawaug.experiment.synth import require_same_settings
 from rawaug.io import RawFrame, read_raw, write_dng
-from rawaug.noise import camera_names, estimate_noise, noise_levels
+from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -97,8 +97,8 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
         ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or wants an ISO.
     """
     if not isinstance(noise, str):
-        shot_var, read_var = (float(level) for level in noise)
-        return shot_var, read_var, "given"
+        fixed = FixedLevels(*noise)
+        return fixed.shot_var, fixed.read_var, "given"
     if noise == "profile" or (noise == "auto" and frame.noise_profile is not None):
         if frame.noise_profile is None:
             raise ValueError(f"{frame.name}: has no NoiseProfile tag; give --noise estimate, or the two variances")
@@ -113,8 +113,14 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
         raise ValueError(f"noise {noise!r} is none of auto, profile, estimate, two variances, {camera_names()}")
     if frame.iso is None:
         raise ValueError(f"{frame.name}: does not tell its ISO, which the levels of {noise} need; give two variances")
-    sampled = noise_levels(noise, iso=frame.iso).sample(1, keyed_generator(0, "denoise"))
-    return float(sampled[0]), float(sampled[1]), noise
+    try:
+        levels = noise_levels(noise, iso=frame.iso)
+    except ValueError as error:
+        raise ValueError(f"{frame.name}: {error}") from None
+    if isinstance(levels, EldLevels):
+        return *levels.typical(), noise
+    shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # one ISO: nothing is left to chance
+    return float(shot_var), float(read_var), noise
 
 
 def denoise_file(
@@ -234,5 +240,5 @@ def print_denoised(result: DenoisedFolder) -> None:
         print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.there or result.broken:
         print(f"{len(result.files)} denoised, {result.there} there already, {len(result.broken)} broken")
-    for reason in result.broken.values():
-        print(f"broken: {reason}")
+    for file, reason in result.broken.items():
+        print(f"broken: {reason}" if Path(file).stem in reason else f"broken: {file}: {reason}")

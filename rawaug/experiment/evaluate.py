@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,16 +28,17 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Pair
+from rawaug.experiment.page import Page, shown_on_page
 from rawaug.experiment.reconstruction import psnr_r
-from rawaug.experiment.report import METRICS, developed, exposure_of
+from rawaug.experiment.report import METRICS, Row, developed, exposure_of
 from rawaug.experiment.stream import Sample, aligned
 from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model, stabilise
 from rawaug.seeding import keyed_generator
 
-TILE = 256
-"""Side in packed pixels of the pieces in which large frames are denoised."""
+TILE, OVERLAP = 384, 64
+"""Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; what it may know of the pair are the levels of the noise."""
@@ -96,8 +97,8 @@ def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> T
         The same shape, on the CPU.
     """
     run: Any = model
-    if max(sample.noisy.shape[-2:]) > TILE + 64:
-        run = partial(denoisers.tiled, model, tile=TILE, overlap=32)
+    if max(sample.noisy.shape[-2:]) > TILE:
+        run = partial(denoisers.tiled, model, tile=TILE, overlap=OVERLAP)
     if self_ensemble:
         run = denoisers.SelfEnsemble(run, cfa, views=8)
     device = next(model.parameters()).device
@@ -123,6 +124,19 @@ def score_denoiser(
     return score_method(lambda _, sample: denoise(model, sample, cfa, self_ensemble), pairs, noise, cfa, seed, label)
 
 
+def row_of(models: Mapping[str, Denoiser], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
+    """Panels of a frame: noisy, denoised by each model, clean."""
+    row = Row(pair, {}, {})
+    for name, model in models.items():
+        score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, seed, False, f"picture, {name}"))
+        row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
+        row.panels[name] = denoised
+        row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", name: f"{score.psnr:.2f} dB"}
+    row.panels["clean"] = sample.clean
+    row.captions["clean"] = pair.name
+    return row
+
+
 def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float, float, float, float]:
     """PSNR and SSIM on the mosaic and on sRGB of packed RAW ``(1, 4, h, w)`` against the clean one."""
     exposure = exposure_of(clean, pair)
@@ -135,21 +149,28 @@ def evaluate(
     weights: str | Path,
     data: str,
     self_ensemble: bool = False,
-    noise: str | None = None,
+    noise: str | Sequence[float] | None = None,
     seed: int = 0,
     classical: Sequence[str] = (),
     device: str = "cpu",
+    report: str | Path | None = None,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
     Args:
         weights: an ISP's or a denoiser's; the file says which.
         data: a folder of RAW files, or ``kind:path``.
-        self_ensemble: average a denoiser over eight views.
-        noise: preset for frames without a noisy capture; by default the one that the denoiser was trained with.
+        self_ensemble: average a denoiser over eight views; its scores without stand under ``plain``.
+        noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
+            with.
         seed: of that noise.
         classical: classical denoisers to score beside it on the same noise, see :data:`CLASSICAL`.
         device: where the denoiser runs.
+        report: HTML file to write: scores and pictures of a denoiser.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
+            is for denoisers and the file is an ISP's.
     """
     require_classical(classical)
     weights = find_weights(weights)
@@ -157,6 +178,8 @@ def evaluate(
     result: dict[str, Any] = {"kind": kind, "data": data}
     pairs = open_pairs(data, split="test")
     if kind == "isp":
+        if self_ensemble or noise is not None or classical or report is not None:
+            raise ValueError(f"{weights}: is an ISP; self-ensemble, noise, classical and report are for denoisers")
         isp = DictionaryISP.from_pretrained(weights)
         scores = [
             Score(pair.name, psnr_r(isp, pair)) for pair in tqdm(pairs, desc="evaluate", unit="image", leave=False)
@@ -165,11 +188,21 @@ def evaluate(
         model, info = denoisers.load(weights)
         levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
         cfa = CFA(info.get("cfa", "RGGB"))
-        scored = score_denoiser(model.to(device), pairs, levels, cfa, seed, self_ensemble, "evaluate")
-        scores = [score for score, *_ in scored]
+        model = model.to(device)
+        scores = [score for score, *_ in score_denoiser(model, pairs, levels, cfa, seed, False, "evaluate")]
         result |= {"self_ensemble": self_ensemble, "seed": seed}
+        runs = {"plain": summary(scores)}
+        if self_ensemble:
+            scored = score_denoiser(model, pairs, levels, cfa, seed, True, "evaluate, self-ensemble")
+            scores = [score for score, *_ in scored]
+            result["plain"], runs["self_ensemble"] = runs["plain"], summary(scores)
         if classical:
             result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
+        if report is not None:
+            page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
+            for pair in shown_on_page(pairs):
+                page.add_frame(row_of({"denoised": model}, pair, levels, cfa, seed), cfa)
+            page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
     return {**result, **summary(scores), "weights_sha256": digest, "version": __version__}
 

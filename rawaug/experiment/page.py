@@ -11,7 +11,7 @@ import csv
 import html
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
 from rawaug.experiment.report import COLUMNS, QUARTERS, Row, Runs, developed, exposure_of, table_rows
 
 WINDOW = 64
@@ -27,6 +28,9 @@ WINDOW = 64
 
 WHOLE = 640
 """Largest width of a whole frame on the page, in pixels."""
+
+ON_PAGE = 12
+"""Frames on the page at most."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
@@ -89,6 +93,12 @@ class Page:
         text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
         path.write_text(f"{text}</body></html>\n", encoding="utf-8")
         return path
+
+
+def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:
+    """At most :data:`ON_PAGE` of the frames, evenly spaced."""
+    count = min(ON_PAGE, len(pairs))
+    return (pairs[k * len(pairs) // count] for k in range(count))
 
 
 def most_detailed(packed: Tensor) -> tuple[int, int]:

@@ -94,7 +94,7 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])
     _swatches(colour, isp)
-    _gain_points(gains, isp)
+    _gain_swatches(gains, isp)
     mask = isp.shading(place_in_frame(75, 100))[0, 0] if "shading" in isp.config.stages else torch.ones(75, 100)
     image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
     figure.colorbar(image, ax=shading, shrink=0.6)
@@ -120,12 +120,15 @@ def _swatches(axis: Any, isp: DictionaryISP) -> None:
     axis.set_title("colour atoms: sRGB as the camera sees it", fontsize=9)
 
 
-def _gain_points(axis: Any, isp: DictionaryISP) -> None:
-    """Red against blue gain of each atom, in the colour of its illuminant; size by the constant weight."""
-    digital, red, blue = isp.gain.atoms().unbind(1)
-    light = torch.stack([1 / red, torch.ones_like(red), 1 / blue], dim=1)
-    light = encode_srgb(light / light.amax(1, keepdim=True))
+def _gain_swatches(axis: Any, isp: DictionaryISP) -> None:
+    """One row an atom, in the colour of its light: white as it comes back, with the three gains and the weight."""
+    atoms, channels = isp.gain.atoms(), isp.gain.channel_gains()
+    light = channels.amin(1, keepdim=True) / channels
+    axis.imshow(encode_srgb(light)[:, None].numpy(), aspect="auto", extent=(0, 1, len(atoms) - 0.5, -0.5))
     weight = isp.reverse_networks.gain_encoder.prior.softmax(0)
-    axis.scatter(red.numpy(), blue.numpy(), s=40 + 400 * weight.numpy(), c=light.numpy(), edgecolors="black")
-    axis.set(xlabel="red gain", ylabel="blue gain")
-    axis.set_title(f"gain atoms, digital gain {digital.min():.2f} to {digital.max():.2f}", fontsize=9)
+    for row, ((digital, red, blue), share) in enumerate(zip(atoms.tolist(), weight.tolist(), strict=True)):
+        text = f"{digital:.2f}   {red:.2f}   {blue:.2f}   {share:.0%}"
+        axis.text(0.5, row, text, ha="center", va="center", fontsize=min(8, 120 / len(atoms)), color="black")
+    axis.set(ylabel="atom", xticks=[])
+    axis.yaxis.get_major_locator().set_params(integer=True)
+    axis.set_title("gain atoms: digital, red, blue, constant weight", fontsize=9)

@@ -54,7 +54,9 @@ class TrainConfig:
         batch: samples in a step, over all processes.
         crop: side of the mosaic crops in pixels.
         learning_rate: of Adam at its highest.
-        warmup: steps of linear warm-up before the cosine.
+        warmup: steps of linear warm-up.
+        schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
+        halve_every: steps.
         loss: l1, l2 or charbonnier.
         ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
@@ -71,6 +73,8 @@ class TrainConfig:
     crop: int = 64
     learning_rate: float = 7e-4
     warmup: int = 50
+    schedule: Literal["cosine", "step"] = "cosine"
+    halve_every: int = 20000
     loss: Literal["l1", "l2", "charbonnier"] = "l1"
     ema: float = 0.99
     clip_norm: float = 0.1
@@ -80,6 +84,15 @@ class TrainConfig:
     precision: str = "32-true"
     channels_last: bool = True
     compile: bool = False
+
+    def __post_init__(self) -> None:
+        for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"train.{key} is at least 1, got {getattr(self, key)}")
+        if self.crop < 8 or self.crop % 2:
+            raise ValueError(f"train.crop is even and at least 8, got {self.crop}")
+        if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:
+            raise ValueError("train: ema is in [0, 1), and warmup, workers and clip_norm are at least 0")
 
 
 @dataclass
@@ -121,8 +134,9 @@ class Recipe:
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
         camera: an ISP that is taken as it is, the name of a shipped one or a file; null fits one to ``data.pairs``.
-        noise: preset of what is added to clean RAW, in training and where a test frame has no noisy capture; "camera":
-            the levels measured on the frames that the ISP is fitted to.
+        noise: what is added to clean RAW, in training and where a test frame has no noisy capture: the name of a preset
+            or of a measured camera, [shot_var, read_var], or "camera", the levels measured on the frames that the ISP
+            is fitted to.
         denoiser: the network.
         train: the loop.
         arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
@@ -139,7 +153,7 @@ class Recipe:
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
     camera: str | None = None
-    noise: str = "cycleisp_sidd"
+    noise: tuple[float, float] | str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
@@ -179,7 +193,7 @@ def smoke(recipe: Recipe) -> Recipe:
     few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
     return replace(
         recipe,
-        name=f"{Path(recipe.name).name}-smoke",
+        name=f"{recipe.name.replace('/', '-')}-smoke",
         data=replace(
             DataConfig(count=1, test_count=1),
             pairs=recipe.data.pairs and "demo:train",

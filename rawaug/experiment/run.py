@@ -19,25 +19,29 @@ import denoisers
 from denoisers.network import Denoiser
 from rawaug.augment import noise_for
 from rawaug.bayer import CFA
-from rawaug.data import RawFolder, open_pairs, open_pictures
+from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pairs import Pair
 from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
-from rawaug.experiment.evaluate import require_classical, score_classical, score_denoiser, summary, write_json
+from rawaug.experiment.evaluate import (
+    require_classical,
+    row_of,
+    score_classical,
+    score_denoiser,
+    summary,
+    write_json,
+)
 from rawaug.experiment.fitting import fit
 from rawaug.experiment.noisy_frames import noisy_only
-from rawaug.experiment.page import Page, draw_curves
+from rawaug.experiment.page import Page, draw_curves, shown_on_page
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.report import Row, draw, print_table
 from rawaug.experiment.train import train
 from rawaug.isp.model import DictionaryISP, find_weights
-from rawaug.noise import NoiseModel
+from rawaug.noise import NoiseModel, noise_model
 
 SHOWN = 3
 """Test frames in the picture."""
-
-ON_PAGE = 12
-"""Test frames on the page at most."""
 
 Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
@@ -58,6 +62,9 @@ class _Run:
         self.recipe, self.data = recipe, recipe.data
         self.folder = Path(recipe.out) / recipe.name
         require_classical(recipe.classical)
+        if recipe.noise != "camera":
+            noise_model(recipe.noise)
+        denoisers.build(recipe.denoiser.name, **recipe.denoiser.settings)
         self.test = _first(open_pairs(self.data.test), self.data.test_count)
         source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
         self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
@@ -94,7 +101,7 @@ class _Run:
         path = self.folder / f"seed{seed}" / "isp.safetensors"
         settings = {**asdict(self.recipe.isp), "seed": seed}
         measure = self.recipe.noise == "camera"
-        key = fingerprint("isp", settings, [pair.name for pair in self.pairs], measure, self.recipe.self_supervised)
+        key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
@@ -111,13 +118,15 @@ class _Run:
         path = place / "denoiser.safetensors"
         config, network = recipe.train, recipe.denoiser
         parts = (recipe.arms[arm], config, network, self.data)
-        key = fingerprint(isp.info["key"], recipe.noise, *(asdict(part) for part in parts))
+        seen = (stamps(self.pairs), stamps(self.validation), len(self.pictures))
+        key = fingerprint(isp.info["key"], recipe.noise, *seen, *(asdict(part) for part in parts))
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
                 print(f"trained already: {path}")
                 return model
-        _discard_other_checkpoint(place, key)
+        if _leads():
+            _discard_other_checkpoint(place, key)
         stream = training_stream(recipe, recipe.arms[arm], self.pairs, self.pictures, isp, noise, seed)
         validation = validation_samples(recipe, self.validation, self.pictures, isp, noise)
         label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
@@ -135,7 +144,7 @@ class _Run:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
         digest = hashlib.sha256((place / "denoiser.safetensors").read_bytes()).hexdigest()
-        key = fingerprint(digest, self.data.test, sorted(_identities(self.test)))
+        key = fingerprint(digest, self.data.test, stamps(self.test))
         path = place / "evaluation.json"
         if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
             print(f"evaluated already: {path}")
@@ -163,34 +172,23 @@ class _Run:
         write_json(everything, self.folder / "results.json")
         settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
         title = f"{recipe.name}: {settings}, tested on {self.data.test}"
-        page, shown = Page(title, results, classical), []
+        page, shown = Page(title, results, classical), list[Row]()
         seeds = range(recipe.seed, recipe.seed + recipe.seeds)
         page.add_curves(
             draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
         )
         for model in models.values():
             model.to(_device(recipe.device))
-        count = min(ON_PAGE, len(self.test))
-        for k in range(count):
-            row = self.row(self.test[k * len(self.test) // count], models, noise, cfa)
+        for pair in shown_on_page(self.test):
+            row = row_of(models, pair, noise, cfa, seed=0)
             page.add_frame(row, cfa)
-            shown += [row] if k < SHOWN else []
+            shown += [row] if len(shown) < SHOWN else []
         picture = draw(shown, cfa, self.folder / "picture.png")
         written = page.write(self.folder / "report.html", asdict(recipe))
         print_table(results, title, classical)
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
-
-    def row(self, pair: Pair, models: dict[str, Denoiser], noise: NoiseModel, cfa: CFA) -> Row:
-        """Panels of a test frame with the last seed's models."""
-        row = Row(pair, {}, {})
-        for arm, model in models.items():
-            score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, 0, False, f"picture, {arm}"))
-            row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
-            row.panels[arm] = denoised
-            row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", arm: f"{score.psnr:.2f} dB"}
-        row.panels["clean"] = sample.clean
-        row.captions["clean"] = pair.name
-        return row
+        if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
+            print(self.pictures.report())
 
 
 def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
@@ -242,3 +240,24 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
     stamp.write_text(key)
+
+
+def stamps(pairs: Sequence[Pair]) -> list[str]:
+    """What a stage that was done with these frames depends on, by frame, told without reading files again.
+
+    Of RAW files path, size and time of change; of the frames of a dataset their names; of frames in memory what is in
+    them, in samples.
+    """
+    if isinstance(pairs, RawFolder):
+        return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]
+    if isinstance(pairs, LazyPairs):
+        return list(pairs.names)
+    return [_sampled(pair) for pair in pairs]
+
+
+def _sampled(pair: Pair) -> str:
+    digest = hashlib.sha256(repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode())
+    for image in (pair.srgb, pair.raw, pair.noisy):
+        if image is not None:
+            digest.update(image.flatten()[::4099].contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -114,6 +114,8 @@ def synth(
     pictures = _pictures(source, out)
     if format not in ("dng", "npz", "tiff") or per_image < 1:
         raise ValueError(f"format is dng, npz or tiff, and per_image at least 1; got {format} and {per_image}")
+    if workers is not None and workers < 0:
+        raise ValueError(f"workers is at least 0, got {workers}")
     augmentation(weights, levels, sampling)  # a wrong name is told here, not by a worker
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
@@ -146,9 +148,12 @@ def _pictures(source: Path, out: Path) -> list[Path]:
 def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Iterator[_Task]:
     """Pictures that differ in their extension alone keep it in the names of their pairs."""
     stems = Counter(picture.with_suffix("") for picture in pictures)
+    taken: dict[Path, Path] = {}
     for picture in pictures:
         bare = picture.with_suffix("")
         own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
+        if taken.setdefault(own, picture) != picture:
+            raise ValueError(f"{picture}: its pairs would have the names of those of {taken[own].name}; rename one")
         stem = out / own.relative_to(source)
         missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
         yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
@@ -165,7 +170,11 @@ def require_same_settings(path: Path, settings: dict[str, object]) -> None:
         ValueError: if the files that are there were made with others.
     """
     if path.is_file():
-        for key, value in json.loads(path.read_text()).items():
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+        for key, value in known.items():
             if settings.get(key) != value:
                 raise ValueError(f"{path}: made with {key} {value}, not {settings.get(key)}; choose another folder")
         return

@@ -1,7 +1,8 @@
 """The training loop: one denoiser, one stream of samples, one page.
 
 ``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
-weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or several processes (``torchrun``).
+weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
+``torchrun`` or ``fabric run`` start them.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import copy
 import csv
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -54,18 +56,18 @@ def train(
         network, config: what is trained, and how.
         folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
         seed: of the network's start.
-        device, devices: Fabric's accelerator and number of devices.
+        device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
         label: heads the progress bar.
         estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
 
     Returns:
         The network with the averaged weights of the best validation, in eval mode, on the CPU.
-    """
-    from lightning_fabric import Fabric
 
+    Raises:
+        ValueError: if no validation score was a number: the training has diverged.
+    """
     estimator = estimator or Supervised()
-    fabric = Fabric(accelerator=device, devices=devices, precision=config.precision)
-    fabric.launch()
+    fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
     ema = torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
@@ -108,18 +110,42 @@ def train(
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
             write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
-        bar.set_postfix_str(f"loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}", refresh=False)
+        rate = (step - start) * stream.batch / (time.perf_counter() - began)
+        told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
+        bar.set_postfix_str(told, refresh=False)
     if journal is not None:
         journal.close()
+    if "net" not in best:
+        raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
     trained.load_state_dict(best["net"])
     trained.cpu().to(memory_format=torch.contiguous_format)
     return estimator.corrected(trained).eval()
 
 
+def launched(device: str, devices: int, precision: str) -> Any:
+    """Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself.
+
+    All have met here when it returns, so that none looks for a checkpoint before the first has put away an old one.
+    """
+    from lightning_fabric import Fabric
+
+    nodes = 1
+    if torch.distributed.is_torchelastic_launched():
+        devices = int(os.environ["LOCAL_WORLD_SIZE"])
+        nodes = int(os.environ["WORLD_SIZE"]) // devices
+    fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision)
+    if os.environ.get("LT_CLI_USED") != "1":  # ``fabric run`` has launched it
+        fabric.launch()
+    fabric.barrier()
+    return fabric
+
+
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
-    """Linear warm-up, then a cosine to 1% of the highest rate."""
+    """Linear warm-up, then a cosine to 1% of the highest rate, or a halving every ``halve_every`` steps."""
     if step < config.warmup:
         return (step + 1) / config.warmup
+    if config.schedule == "step":
+        return float(0.5 ** (step // config.halve_every))
     progress = (step - config.warmup) / max(1, config.steps - config.warmup)
     return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
 

@@ -8,6 +8,7 @@ Source: DNG specification 1.4, chapters 4 to 6. Any program that reads DNG takes
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
@@ -26,6 +27,7 @@ from rawaug.io.tiff_tags import damage_told
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
 _LARGEST = 2.0**31 - 2
+_LARGEST_ISO = 65535
 _CFA_PHOTOMETRIC = 32803
 _DNG_VERSION, _UNIQUE_CAMERA_MODEL = 50706, 50708
 _D65 = 21
@@ -47,7 +49,8 @@ def write_dng(
         baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own is kept in its place.
 
     Raises:
-        ValueError: if a digital number or a level does not fit 16 bits, or the mosaic's sides are not even.
+        ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain, the
+            colour matrix or the ISO cannot be written.
         FileNotFoundError: if the source or the folder does not exist.
         OSError: if tags of the source are damaged.
 
@@ -56,6 +59,7 @@ def write_dng(
         >>> write_dng("shot.dng", frame, source="shot.cr2")  # doctest: +SKIP
     """
     path = Path(path)
+    _require_colour(frame, path)
     numbers = digital_numbers(frame, path)
     size = numbers.shape[0], numbers.shape[1]
     carried = read_carried_tags(Path(source), size) if source is not None else CarriedTags("<", {}, {})
@@ -86,6 +90,18 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
         software=software,
         metadata=None,
     )
+
+
+def _require_colour(frame: RawFrame, path: Path) -> None:
+    gains = (*frame.white_balance, *frame.daylight)
+    if not all(math.isfinite(gain) and gain > 0 for gain in gains):
+        raise ValueError(f"{path}: white balance and daylight gains are positive, got {gains}")
+    if not abs(float(torch.linalg.det(frame.color_matrix.double()))) > 1e-6:
+        raise ValueError(f"{path}: the colour matrix has no inverse, which a DNG needs")
+    if frame.orientation not in _EXIF_ORIENTATIONS:
+        raise ValueError(f"{path}: orientation is LibRaw's flip, one of 0 to 7, got {frame.orientation}")
+    if frame.iso is not None and not 0 <= frame.iso <= _LARGEST_ISO:
+        raise ValueError(f"{path}: EXIF holds an ISO of at most {_LARGEST_ISO}, got {frame.iso:g}; leave it out")
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
@@ -175,7 +191,7 @@ def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
         if value is not None
     ]
     if frame.iso is not None:
-        entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", min(round(frame.iso), 65535))))
+        entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", round(frame.iso))))
     if shot.date is not None:
         entries.append(Entry(36867, ASCII, len(shot.date) + 1, shot.date.encode() + b"\0"))
     return [*entries, Entry(36864, UNDEFINED, 4, b"0230")] if entries else []

@@ -51,7 +51,7 @@ def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels
         )
     if isinstance(spec, str):
         return Preset(spec)
-    if len(spec) != 2:
+    if not isinstance(spec, Sequence) or len(spec) != 2:
         raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
     return FixedLevels(*spec)
 

@@ -106,6 +106,8 @@ def estimate_noise(
     """
     frames = [mosaics] if isinstance(mosaics, Tensor) else list(mosaics)
     measured = [_measure(frame, cfa) for frame in frames]
+    if not measured:
+        raise ValueError("there is no frame to measure the noise of")
     blocks = _Blocks(*(torch.cat([getattr(m, f.name) for m in measured]) for f in fields(_Blocks)))
     levels = _split_levels(blocks)
     points = _start(levels)

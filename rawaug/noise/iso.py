@@ -32,7 +32,7 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
     """
     if iso is None:
         return measured
-    low, high = iso if isinstance(iso, tuple) else (iso, iso)
+    low, high = (iso, iso) if isinstance(iso, (int, float)) else (iso[0], iso[1])
     if not measured[0] <= low <= high <= measured[1]:
         raise ValueError(f"ISO {iso} is outside what was measured for {camera}: {measured[0]:g} to {measured[1]:g}")
     return float(low), float(high)
@@ -99,6 +99,13 @@ class EldLevels:
         line = self.camera[law]
         scatter = line["sigma"] * torch.randn(gain.shape, generator=generator, device=gain.device)
         return torch.exp(line["slope"] * gain.log() + line["bias"] + scatter - math.log(self.white_dn))
+
+    def typical(self) -> tuple[float, float]:
+        """(shot_var, read_var) without the scatter, at the middle of the limits in the logarithm."""
+        gain = math.sqrt(self.iso[0] * self.iso[1]) * (self.camera["Kmin"] / self.lowest_iso)
+        line = self.camera["gaussian"]
+        read_sd = math.exp(line["slope"] * math.log(gain) + line["bias"]) / self.white_dn
+        return gain / self.white_dn, read_sd**2
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         gain = self.sample_gain(batch, generator)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from rawaug import bayer
 from rawaug.augment import RawAugment
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import ISPConfig
@@ -180,3 +182,24 @@ def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:
     params = RawAugment(measured, noise="camera")(torch.rand(2, 3, 8, 8)).params
     torch.testing.assert_close(params.noise["shot_var"], torch.full((2,), 2e-3))
     torch.testing.assert_close(params.noise["read_var"], torch.full((2,), 3e-5))
+
+
+def test_a_network_in_bfloat16_leaves_it_in_float32(isp: DictionaryISP, srgb: Tensor) -> None:
+    augment = RawAugment(copy.deepcopy(isp), seed=3)
+    whole = torch.nn.Sequential(augment, torch.nn.Conv2d(4, 4, 1)).to(torch.bfloat16)
+    assert whole[1].weight.dtype == torch.bfloat16
+    expected = RawAugment(isp, seed=3)(srgb)
+    assert torch.equal(augment(srgb).noisy, expected.noisy)
+
+
+def test_any_order_of_stages_makes_pairs(srgb: Tensor) -> None:
+    augment = RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))), noise=(0.0, 0.0))
+    pair = augment(srgb)
+    expected = augment.isp.reverse(srgb, pair.params.isp).raw.clamp(max=1.0)
+    torch.testing.assert_close(bayer.unpack(pair.clean, augment.isp.cfa), expected)
+
+
+@pytest.mark.parametrize("key", [-1, 1])
+def test_a_negative_index_names_the_pictures_too(augment: RawAugment, srgb: Tensor, key: int) -> None:
+    labels, pair = augment((["a", "b"], srgb), key=key)
+    assert labels == ["a", "b"] and isinstance(pair, RawPair)

@@ -136,3 +136,31 @@ def test_pinned_pictures_become_pairs_on_the_gpu(srgb: Tensor) -> None:
     loader = DataLoader(TensorDataset(srgb, torch.arange(6)), batch_size=3, pin_memory=True, num_workers=2)
     for pair, labels in wrap(loader, augment, device="cuda"):
         assert pair.noisy.is_cuda and pair.variance.is_cuda and labels.is_pinned()
+
+
+def test_a_loader_of_single_pictures_makes_single_crops(augment: RawAugment) -> None:
+    pictures = [torch.rand(3, 24, 30) for _ in range(3)]
+    pairs = list(wrap(DataLoader(pictures, batch_size=None), augment, crop=16))  # type: ignore[arg-type]
+    assert [pair.noisy.shape for pair in pairs] == [(1, 4, 8, 8)] * 3
+
+
+@pytest.mark.parametrize("batch", [1, 3, 4, 5])
+def test_a_batch_of_grey_pictures_is_no_colour_picture(augment: RawAugment, batch: int) -> None:
+    grey = torch.rand(batch, 8, 10)
+    (pair,) = wrap(DataLoader(grey, batch_size=batch), augment)  # type: ignore[arg-type]
+    (expected,) = wrap([grey[:, None].expand(-1, 3, -1, -1)], augment)
+    assert torch.equal(pair.noisy, expected.noisy) and len(pair.noisy) == batch
+
+
+def test_processes_of_a_distributed_run_draw_apart(
+    augment: RawAugment, srgb: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (alone,) = wrap([srgb], augment)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    drawn: list[RawPair] = []
+    for rank in range(3):
+        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        drawn += wrap([srgb], augment)
+    assert torch.equal(drawn[0].noisy, alone.noisy)
+    assert not torch.equal(drawn[1].params.isp.gains, drawn[0].params.isp.gains)
+    assert not torch.equal(drawn[1].params.isp.gains, drawn[2].params.isp.gains)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from rawaug.isp.params import POINTWISE_STAGES, ISPConfig
+from rawaug.isp.params import POINTWISE_STAGES, SMALL, ISPConfig
+
+_SWITCH = ("auto", "on", "off")
 
 
 @dataclass(frozen=True)
@@ -13,6 +15,7 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
+        size: "small" has at most 8 atoms in each dictionary and narrow encoders: 0.12 M parameters instead of 0.52 M.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
         reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
             digital gain its fourth root) to either side of the frames' mean, so that the hull holds other light as
@@ -33,6 +36,7 @@ class FitConfig:
         isp: further keys of :class:`rawaug.isp.params.ISPConfig`, such as ``encoder_widths``.
     """
 
+    size: Literal["default", "small"] = "default"
     atoms: int = 16
     reach: float = 1.6
     steps: int = 200
@@ -47,13 +51,18 @@ class FitConfig:
     seed: int = 0
     isp: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def most_atoms(self) -> int:
+        """``atoms``, as far as the size allows."""
+        return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
+
     def __post_init__(self) -> None:
         for key in ("atoms", "pixels", "batch"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key} is at least 1, got {getattr(self, key)}")
-        for key in ("shading", "encoders"):
-            if getattr(self, key) not in ("auto", "on", "off"):
-                raise ValueError(f"{key} is auto, on or off, got {getattr(self, key)!r}")
+        for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
+            if getattr(self, key) not in values:
+                raise ValueError(f"{key} is {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
             raise ValueError(f"isp: unknown {sorted(unknown)}; there are {[key.name for key in fields(ISPConfig)]}")
         if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):

@@ -36,7 +36,7 @@ from rawaug.isp.fit.encoders import train_encoders
 from rawaug.isp.fit.joint import train_jointly
 from rawaug.isp.fit.losses import cycle_error, reading_error
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
+from rawaug.isp.params import SMALL, ISPConfig
 from rawaug.isp.samples import FramePair, PixelSamples, Shot, sample_pixels
 from rawaug.seeding import derived_seed
 from rawaug.threads import one_thread
@@ -102,11 +102,12 @@ def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[Shot]) -> str
 def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
     """An ISP of the size that the frames call for, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
-    count = min(config.atoms, len(shots))
+    count = min(config.most_atoms, len(shots))
     more = REACH_ATOMS if config.reach > 1.0 else 0
     settings: dict[str, Any] = {
         "colour_atoms": count,
-        "gain_atoms": min(max(config.atoms, count), count + more),
+        "gain_atoms": min(config.most_atoms, count + more),
+        "encoder_widths": (SMALL if config.size == "small" else ISPConfig()).encoder_widths,
         "attention": config.attention,
         "cfa": str(patterns.pop()) if len(patterns) == 1 else "RGGB",
         **config.isp,

@@ -60,11 +60,30 @@ def test_a_camera_jpeg_is_turned_into_the_sensors_orientation(tmp_path: Path, ba
     assert RawFolder(tmp_path, camera_jpeg=False)[0].registered
 
 
-def test_a_jpeg_of_another_size_is_not_taken(tmp_path: Path, bayer_dng: Dng) -> None:
+def test_a_jpeg_of_another_size_is_not_taken_and_told(tmp_path: Path, bayer_dng: Dng) -> None:
     path = bayer_dng(tmp_path / "a.dng", NUMBERS)
     write_picture(tmp_path / "a.jpg", torch.zeros(3, 20, 31, dtype=torch.uint8))
-    pair = RawFolder(tmp_path)[0]
+    with pytest.warns(UserWarning, match=r"a.jpg: 20 x 31 beside a RAW file of 40 x 62; LibRaw's rendering is taken"):
+        pair = RawFolder(tmp_path)[0]
     assert pair.registered and torch.equal(pair.srgb, develop(path))
+
+
+def test_a_jpeg_that_lacks_a_few_lines_is_taken_and_the_mosaic_is_cut(tmp_path: Path, bayer_dng: Dng) -> None:
+    numbers = np.random.default_rng(1).integers(0, 4096, (160, 240)).astype(np.uint16)
+    path = bayer_dng(tmp_path / "a.dng", numbers, "GRBG")
+    write_picture(tmp_path / "a.png", develop(path)[:, 2:158, 2:238])
+    (tmp_path / "a.png").rename(tmp_path / "a.jpg")
+    pair = RawFolder(tmp_path)[0]
+    assert not pair.registered and pair.cfa == CFA.GRBG
+    assert torch.equal(pair.raw, read_raw(path).mosaic[:, 2:158, 2:238])
+    assert torch.equal(pair.srgb, develop(path)[:, 2:158, 2:238])
+
+
+def test_files_of_one_stem_have_names_of_their_own(tmp_path: Path, bayer_dng: Dng) -> None:
+    for folder in ("x", "y"):
+        (tmp_path / folder).mkdir()
+        bayer_dng(tmp_path / folder / "IMG.dng", NUMBERS)
+    assert [pair.name for pair in RawFolder(tmp_path)] == ["x/IMG.dng", "y/IMG.dng"]
 
 
 def test_nothing_to_read_is_named(tmp_path: Path) -> None:

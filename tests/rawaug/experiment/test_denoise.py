@@ -18,6 +18,7 @@ from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
 from rawaug.experiment.denoise import denoise_file, denoise_folder, denoise_mosaic, levels_of
 from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)
 Dng = Callable[..., Path]
@@ -103,6 +104,13 @@ def test_where_the_levels_come_from(tmp_path: Path, bayer_dng: Dng) -> None:
     assert levels_of(frame, (1e-2, 1e-4)) == (1e-2, 1e-4, "given")
     phone = dataclasses.replace(frame, iso=800.0)
     assert levels_of(phone, "Google Pixel")[0] == pytest.approx(0.001764, rel=1e-3)
+    for camera in ("SonyA7S2", "NikonD850"):  # the law itself, not a draw about it
+        draws = noise_levels(camera, iso=800).sample(4001, torch.Generator().manual_seed(0))[1]
+        assert levels_of(phone, camera)[1] == pytest.approx(draws.median().item(), rel=0.05)
+    with pytest.raises(ValueError, match="a: ISO 800000"):
+        levels_of(dataclasses.replace(frame, iso=8e5), "Google Pixel")
+    with pytest.raises(ValueError, match="not negative"):
+        levels_of(frame, (-1e-3, -0.1))
     with pytest.raises(ValueError, match="does not tell its ISO"):
         levels_of(frame, "Google Pixel")
     with pytest.raises(ValueError, match="'upi' is none of auto, profile, estimate"):

@@ -106,3 +106,16 @@ def test_the_development_is_the_same_for_both(identity: Path) -> None:
     whole = compared(sample.noisy, sample.clean, pair.cfa, pair)
     half = compared(sample.noisy / 2, sample.clean / 2, pair.cfa, pair)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
+
+
+def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(identity: Path, tmp_path: Path) -> None:
+    result = evaluate(identity, "demo:validation", self_ensemble=True, report=tmp_path / "new" / "page.html")
+    assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
+    page = (tmp_path / "new" / "page.html").read_text()
+    assert page.count("<h3>") == 4 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
+
+
+def test_what_is_for_denoisers_is_refused_for_an_isp(tmp_path: Path) -> None:
+    for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
+        with pytest.raises(ValueError, match="is an ISP"):
+            evaluate("universal-small", "demo:test", **flags)

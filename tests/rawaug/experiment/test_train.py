@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import socket
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -72,6 +76,37 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Sample], tmp_path: Path) -> None:
+    config = replace(CONFIG, learning_rate=1e30, clip_norm=0.0, warmup=0)
+    with pytest.raises(ValueError, match="diverged"):
+        loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
+
+
+def test_the_rate_of_the_step_schedule_halves() -> None:
+    config = replace(CONFIG, schedule="step", halve_every=3, warmup=2)
+    assert [loop.learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
+
+
+def test_torchrun_s_processes_count(tmp_path: Path) -> None:
+    script = tmp_path / "meet.py"
+    script.write_text(
+        "from rawaug.experiment.train import launched\n"
+        "fabric = launched('cpu', 1, '32-true')\n"
+        "print(f'{fabric.global_rank} of {fabric.world_size}', flush=True)\n"
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    meeting = ["--nnodes", "2", "--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", port]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", *meeting]
+    nodes = [
+        subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
+        for rank in (0, 1)
+    ]
+    told = "".join(node.communicate(timeout=120)[0] for node in nodes)
+    assert sorted(re.findall(r"\d of \d", told)) == [f"{rank} of 4" for rank in range(4)]
 
 
 def test_the_rate_warms_up_and_falls() -> None:

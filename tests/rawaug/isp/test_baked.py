@@ -9,6 +9,8 @@ from rawaug import bayer, compiled
 from rawaug.isp.baked import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.params import POINTWISE_STAGES, ISPConfig
+from rawaug.isp.stages import place_in_frame
+from rawaug.isp.unbaked import UnbakedISP, reverse_pass
 from rawaug.metrics import psnr
 
 
@@ -126,7 +128,24 @@ def test_bytes_and_floats_agree() -> None:
     torch.testing.assert_close(baked(srgb, params), baked(srgb / 255.0, params), atol=1e-6, rtol=1e-5)
 
 
-def test_another_order_of_stages_is_refused() -> None:
-    isp = DictionaryISP(ISPConfig(stages=("gamma", "tone", "colour", "gains")))
+ODD_ORDER = ("gamma", "shading", "gains", "colour")
+
+
+def test_another_order_of_stages_is_not_baked() -> None:
+    isp = DictionaryISP(ISPConfig(stages=ODD_ORDER))
     with pytest.raises(ValueError, match="usual order"):
         BakedISP(isp)
+    assert isinstance(reverse_pass(isp), UnbakedISP)
+    assert isinstance(reverse_pass(DictionaryISP(ISPConfig(stages=["tone", "gains"]))), BakedISP)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("view", list(bayer.View))
+def test_unbaked_is_the_isp_wherever_the_crop_is(view: bayer.View) -> None:
+    isp = curved_isp(stages=ODD_ORDER)
+    frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(2))
+    crop = bayer.turn(frame[..., 6:26, 34:54], view).contiguous()
+    params = isp.choose(frame)
+    place = bayer.turn(place_in_frame(20, 20, (6, 34), (40, 60)), view)
+    expected = bayer.pack(isp.reverse(crop, params, place=place).raw, isp.cfa)
+    raw = reverse_pass(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
+    torch.testing.assert_close(raw, expected, atol=1e-6, rtol=1e-5)

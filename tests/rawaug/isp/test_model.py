@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -143,3 +144,58 @@ def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, tol
     with pytest.raises(ValueError, match=told) as caught:
         DictionaryISP.from_pretrained(path)
     assert "camera.safetensors" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance is positive"),
+        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance is positive"),
+        ({"digital_gain": 0.0}, "digital_gain is positive"),
+        ({"raw_samples": torch.zeros(2, 0, 3)}, "row, column, value"),
+        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "not a number"),
+    ],
+)
+def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        DictionaryISP().reverse(srgb, **given)
+
+
+def test_pictures_out_of_range_and_parameters_of_others_are_refused(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    with pytest.raises(ValueError, match="a float picture is in"):
+        isp.reverse(255.0 * srgb)
+    with pytest.raises(ValueError, match="uint8, or float32"):
+        isp.reverse(srgb.double())
+    with pytest.raises(ValueError, match="the parameters are those of 1 pictures, the batch has 2"):
+        isp.reverse(srgb, isp.choose(srgb[:1]))
+
+
+def test_a_file_s_multipliers_need_no_scale(srgb: torch.Tensor) -> None:
+    isp = DictionaryISP()
+    a, b = (isp.reverse(srgb, white_balance=wb).raw for wb in ((2.0, 1.0, 1.5), (2048.0, 1024.0, 1536.0)))
+    torch.testing.assert_close(a, b)
+
+
+def test_nothing_is_drawn_from_the_global_state() -> None:
+    before = torch.get_rng_state()
+    one, same, other = DictionaryISP(seed=1), DictionaryISP(seed=1), DictionaryISP(seed=2)
+    DictionaryISP.from_pretrained("universal-small")
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), same.parameters(), strict=True))
+    assert not torch.equal(one.gain.log_gains, other.gain.log_gains)
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"stages": ("tone", "tone")}, "at most once"),
+        ({"stages": ()}, "stages: none"),
+        ({"encoder_widths": (8, 8)}, "are three"),
+        ({"knee": 1.0}, "knee is in"),
+        ({"gain_atoms": 0}, "at least 1"),
+    ],
+)
+def test_impossible_configurations_are_refused(settings: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        ISPConfig(**settings)
