@@ -9,9 +9,9 @@ and never at black: zero-mean noise stays zero-mean in the shadows.
 
 Every model splits in ``sample(batch, generator) -> params`` and a pure ``apply(clean, params)``. The parameters hold
 one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever else is in the
-batch and on any number of threads. (The CPU and CUDA have different streams: a replay is exact on the same kind of
-device. On a CPU the default noise is made by compiled loops; PyTorch, where there are none, makes the same within 1e-6
-of its standard deviation.)
+batch and on any number of threads. The default noise is the same on a CPU and, by a kernel, on a GPU within 1e-6 of
+its standard deviation; everything else, and a GPU without Triton, has a stream for each kind of device, on which a
+replay is exact.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from rawaug import compiled
+from rawaug import compiled, kernels
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.philox import normals
 from rawaug.noise.poisson import poisson
@@ -175,11 +175,20 @@ class ShotReadNoise(ShotReadModel):
         self, clean: Tensor, params: Params, white: float, with_variance: bool = False
     ) -> tuple[Tensor, Tensor]:
         """The noisy RAW and, if asked for, its variance map."""
-        if clean.device.type == "cpu" and clean.dtype == torch.float32 and compiled.available():
-            from rawaug.noise import fused
-
+        if clean.dtype == torch.float32:
             levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-            return fused.shot_read(clean, levels, self._keys(params), white, with_variance)
+            if kernels.usable(clean):
+                return kernels.kernel_or(
+                    lambda: _gpu().shot_read(clean, levels, self._keys(params), white, with_variance),
+                    lambda: self._in_pytorch(clean, params, white, with_variance),
+                )
+            if clean.device.type == "cpu" and compiled.available():
+                from rawaug.noise import fused
+
+                return fused.shot_read(clean, levels, self._keys(params), white, with_variance)
+        return self._in_pytorch(clean, params, white, with_variance)
+
+    def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
         deviation = self.variance(clean, params).sqrt_()
         noisy = torch.addcmul(clean, self._normals(clean, params), deviation).clamp_(max=white)
         return noisy, self.variance(noisy, params) if with_variance else noisy[:, :, :0]
@@ -191,6 +200,12 @@ class ShotReadNoise(ShotReadModel):
 
     def _keys(self, params: Params) -> list[int]:
         return [derived_seed(seed, self.stream) for seed in params["seed"].tolist()]
+
+
+def _gpu() -> Any:
+    from rawaug.noise import gpu  # late, for Triton may be missing
+
+    return gpu
 
 
 class PoissonGaussianNoise(ShotReadModel):

@@ -1,0 +1,49 @@
+"""Whether Triton's kernels run on this machine's GPU, and what is done where they do not.
+
+PyTorch's builds for CUDA bring Triton along. Where it is missing, or a kernel cannot be compiled, the callers take the
+same pass in PyTorch: slower, and told once. With ``TRITON_INTERPRET=1`` in the environment the kernels run on tensors
+of the CPU, step by step: for tests.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import cache
+from typing import TypeVar
+
+from torch import Tensor
+
+Result = TypeVar("Result")
+
+_refused: list[str] = []
+
+
+@cache
+def _installed() -> bool:
+    try:
+        import triton  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def usable(image: Tensor) -> bool:
+    """Whether a kernel should be tried on ``image``."""
+    return image.device.type == "cuda" and not _refused and _installed()
+
+
+def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> Result:
+    """What ``kernel`` returns, or, from its first failure on, what ``fallback`` does; the failure is told.
+
+    Example:
+        >>> kernel_or(lambda: 1, lambda: 2)
+        1
+    """
+    try:
+        return kernel()
+    except Exception as error:  # whatever a compiler, its driver or its cache may raise
+        _refused.append(type(error).__name__)
+        reason = (str(error).splitlines() or [""])[-1]
+        warnings.warn(f"rawaug's GPU kernel cannot be used, PyTorch is: {type(error).__name__}: {reason}", stacklevel=3)
+        return fallback()
