@@ -1,0 +1,48 @@
+"""What a built wheel holds is enough: away from the repository, a recipe runs by its name."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LEFT_OUT = shutil.ignore_patterns(".*", "build", "runs", "site", "*.egg-info", "__pycache__", "tests", "benchmarks")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the installed wheel and nothing else; what the package requires comes from the test environment."""
+    place = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT, place / "source", ignore=LEFT_OUT)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    wheel = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(place / "dist"), str(place / "source")]
+    subprocess.run([*pip, *wheel], check=True, capture_output=True)
+    (built,) = (place / "dist").glob("rawaug-*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(place / "site"), str(built)], check=True)
+    return place / "site"
+
+
+def test_a_recipe_runs_by_its_name_from_any_folder(site: Path, tmp_path: Path) -> None:
+    script = "import rawaug, sys; from rawaug.cli import main; print(rawaug.__file__); sys.exit(main())"
+    command = [sys.executable, "-c", script, "run", "fewshot", "--smoke", "--classical", "[]"]
+    environment = {**os.environ, "PYTHONPATH": str(site), "PYTHONWARNINGS": "ignore"}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith(str(site)), "the repository was taken instead of the wheel"
+    assert (tmp_path / "runs" / "fewshot-smoke" / "report.html").is_file()
+
+
+def test_recipes_weights_and_tables_are_in_it(site: Path) -> None:
+    there = {file.relative_to(site).as_posix() for file in site.rglob("*") if file.is_file()}
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if tracked.returncode:
+        pytest.skip("not a git checkout")
+    names = tracked.stdout.split()
+    wanted = {name for name in names if name.startswith(("rawaug/", "denoisers/"))}
+    wanted |= {f"rawaug/{name}" for name in names if name.startswith("recipes/") and name.endswith(".yaml")}
+    assert wanted <= there, sorted(wanted - there)
