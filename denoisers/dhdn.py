@@ -15,9 +15,6 @@ from torch.nn import functional as F
 
 from denoisers.network import PACKED, Denoiser, conv, require_width
 
-PUBLISHED_WIDTH = 128
-"""Features of the first level in the paper."""
-
 LEVELS = 4
 
 

@@ -24,13 +24,16 @@ CAMERAS = ("canon", "nikon")
 _DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
 
-def fivek_pairs(path: str | Path, split: str, cameras: Sequence[str] = CAMERAS) -> RawFolder:
+def fivek_pairs(
+    path: str | Path, split: str, cameras: Sequence[str] = CAMERAS, adjust_maximum_thr: float = 0.0
+) -> RawFolder:
     """The pairs of a split, Canon before Nikon, each sorted by number.
 
     Args:
         path: contains the DNGs under their published names, ``a0016-jmac_MG_0795.dng``, at any depth.
         split: ``"train"`` or ``"test"``.
         cameras: some of :data:`CAMERAS`.
+        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum; InvISP's script leaves it at 0.75.
 
     Raises:
         FileNotFoundError: if there is no such folder, or one of the split's DNGs is missing.
@@ -52,7 +55,7 @@ def fivek_pairs(path: str | Path, split: str, cameras: Sequence[str] = CAMERAS) 
             f"{path}: {len(missing)} of the {len(wanted)} DNGs of fivek {'+'.join(cameras)}, {split}, are missing, "
             f"first a{missing[0]}-*.dng"
         )
-    return RawFolder([files[number] for number in wanted], camera_jpeg=False)
+    return RawFolder([files[number] for number in wanted], camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr)
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:
