@@ -56,7 +56,7 @@ def run(recipe: Recipe) -> Results:
 
 
 class _Run:
-    """One recipe on its data; everything that could be missing or wrong is opened or tried before anything is fitted."""
+    """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.data = recipe, recipe.data
