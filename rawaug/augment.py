@@ -26,7 +26,7 @@ from rawaug.isp.params import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.params import AugmentParams, RawPair
-from rawaug.seeding import keyed_generator
+from rawaug.seeding import keyed_generator, rank_key
 
 Sampling = Literal["convex", "perturb", "chosen"]
 
@@ -201,10 +201,10 @@ class RawAugment(nn.Module):
         return srgb
 
     def _own_generator(self) -> torch.Generator:
-        """A new one for each call; in a DataLoader's worker by its seed too, or all workers would draw the same."""
+        """A new one for each call; by worker and process too, or all of them would draw the same."""
         self._calls += 1
         worker = get_worker_info()
-        return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls)
+        return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
 
 
 def _float32(like: Tensor) -> torch.autocast:

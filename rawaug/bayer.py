@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.seeding import keyed_generator
+from rawaug.seeding import keyed_generator, rank_key
 
 N_VIEWS = 8
 """Number of flips and quarter turns of a picture (the dihedral group of the square)."""
@@ -221,7 +221,7 @@ class _Transform(nn.Module):
             return generator
         self._calls += 1
         worker = get_worker_info()
-        return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls)
+        return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls, *rank_key())
 
     def apply(self, raw: Any, params: Tensor | None = None) -> Any:
         return super().apply(raw) if params is None else self._apply_params(raw, params)

@@ -19,7 +19,7 @@ from rawaug.bayer import RandomCrop
 from rawaug.conform import even_sided, find_picture, is_picture, picked, replaced, stacked, to_rgb_batch, to_rgb_tensor
 from rawaug.pairs import placed, random_place
 from rawaug.params import RawPair
-from rawaug.seeding import keyed_generator
+from rawaug.seeding import keyed_generator, rank_key
 
 
 class WrappedLoader:
@@ -59,7 +59,7 @@ class WrappedLoader:
     def _pairs(self, epoch: int, start: int) -> Iterator[Any]:
         for number, batch in enumerate(self.loader, start):
             where = find_picture(batch, self.key, batched=True)
-            generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *_rank())
+            generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
             yield replaced(batch, where, self._pair(self._pictures(picked(batch, where)), generator))
 
     def _pictures(self, batch: Any) -> Any:
@@ -86,13 +86,6 @@ class WrappedLoader:
         if name == "loader":  # asked for before it is set, by copy and pickle
             raise AttributeError(name)
         return getattr(self.loader, name)
-
-
-def _rank() -> tuple[int, ...]:
-    """The key of a process in a distributed run; the first, and a process alone, have none."""
-    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-    rank = torch.distributed.get_rank() if distributed else 0
-    return (rank,) if rank else ()
 
 
 def wrap(

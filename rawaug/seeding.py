@@ -29,6 +29,18 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
     return torch.Generator(device).manual_seed(derived_seed(*keys))
 
 
+def rank_key() -> tuple[int, ...]:
+    """What tells the draws of a distributed run's processes apart; the first, and a process alone, have no key.
+
+    Example:
+        >>> rank_key()
+        ()
+    """
+    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+    rank = torch.distributed.get_rank() if distributed else 0
+    return (rank,) if rank else ()
+
+
 @contextmanager
 def initialised_from(seed: int) -> Iterator[None]:
     """Layers made inside draw their weights from ``seed``; PyTorch's global state is afterwards what it was.
