@@ -200,6 +200,8 @@ def _evaluate(arguments: Any) -> None:
     print_scores(result)
     if a.json:
         write_json(result, a.json)
+    if a.report:
+        print(f"page: {a.report}")
 
 
 def _preview(arguments: Any) -> None:

@@ -161,6 +161,8 @@ def print_scores(result: Mapping[str, Any]) -> None:
     for label, key in shown.items():
         if key.format("psnr") in result:
             table.add_row(label, *_cells(result, key, metrics))
+    if "plain" in result:
+        table.add_row("mean, without self-ensemble", *_cells(result["plain"], "{}", metrics))
     for name, scores in result.get("classical", {}).items():
         table.add_row(name, *_cells(scores, "{}", metrics))
     Console(width=100).print(table)
