@@ -19,7 +19,7 @@ class DataConfig:
         count: how many of them are used; all if null.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
         validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
-            watches it on RAW made from the pictures.
+            watches it on RAW made from the pictures, which chooses no weights: those of the end are kept.
         test: pairs on which the result is measured; no stage sees them before.
         test_count: how many of them are used; all if null.
     """
@@ -60,7 +60,7 @@ class TrainConfig:
         loss: l1, l2 or charbonnier.
         ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
-        validate_every: steps between two looks at the validation pairs; the best weights are kept.
+        validate_every: steps between two looks at the validation pairs, the best weights on which are kept.
         checkpoint_every: steps between two checkpoints (a killed run goes on from the last).
         workers: processes that prepare samples; 0 prepares them in the training process.
         precision: Fabric's, such as 32-true or bf16-mixed.

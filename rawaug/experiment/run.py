@@ -130,7 +130,8 @@ class _Run:
         stream = training_stream(recipe, recipe.arms[arm], self.pairs, self.pictures, isp, noise, seed)
         validation = validation_samples(recipe, self.validation, self.pictures, isp, noise)
         label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
-        model = train(stream, validation, network, config, place, seed, recipe.device, recipe.devices, label, estimator)
+        where, choose = (recipe.device, recipe.devices), bool(self.validation)
+        model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
         if not _leads():
             return model
         levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise

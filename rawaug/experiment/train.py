@@ -47,6 +47,7 @@ def train(
     devices: int = 1,
     label: str = "train",
     estimator: Supervised | None = None,
+    choose: bool = True,
 ) -> Denoiser:
     """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
 
@@ -59,9 +60,10 @@ def train(
         device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
         label: heads the progress bar.
         estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
+        choose: keep the averaged weights of the best validation; if not, those of the end.
 
     Returns:
-        The network with the averaged weights of the best validation, in eval mode, on the CPU.
+        The network with the weights that are kept, in eval mode, on the CPU.
 
     Raises:
         ValueError: if no validation score was a number: the training has diverged.
@@ -100,7 +102,7 @@ def train(
 
         if step % config.validate_every == 0 or step == config.steps:
             score = validate(estimator.corrected(trained), validation, fabric.device)
-            if score > best["psnr"]:
+            if score > best["psnr"] or not choose:
                 best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
             mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
             if journal is not None:
@@ -115,7 +117,7 @@ def train(
         bar.set_postfix_str(told, refresh=False)
     if journal is not None:
         journal.close()
-    if "net" not in best:
+    if not math.isfinite(best["psnr"]):
         raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
     trained.load_state_dict(best["net"])
     trained.cpu().to(memory_format=torch.contiguous_format)

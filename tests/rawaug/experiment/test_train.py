@@ -78,6 +78,21 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("choose", [True, False])
+def test_the_best_weights_are_kept_or_the_last(
+    choose: bool, stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores, seen = iter([40.0, 30.0]), []
+
+    def validate(net: torch.nn.Module, *_: object) -> float:
+        seen.append({key: value.clone() for key, value in net.state_dict().items()})
+        return next(scores)
+
+    monkeypatch.setattr(loop, "validate", validate)
+    kept = loop.train(stream, validation, NETWORK, CONFIG, tmp_path, device="cpu", choose=choose).state_dict()
+    assert all(torch.equal(kept[key], value) for key, value in seen[0 if choose else 1].items())
+
+
 def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Sample], tmp_path: Path) -> None:
     config = replace(CONFIG, learning_rate=1e30, clip_norm=0.0, warmup=0)
     with pytest.raises(ValueError, match="diverged"):
