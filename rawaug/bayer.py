@@ -13,6 +13,7 @@ splits in ``sample(...) -> params`` and a pure ``apply(raw, params)``.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from enum import Enum, IntEnum
 from typing import Any
 
@@ -206,7 +207,7 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     return raw[..., top : top + height, left : left + width]
 
 
-class _Transform(nn.Module):
+class _Transform(nn.Module, ABC):
     """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``.
 
     Without a generator, as in ``nn.Sequential``, it draws by ``seed``, the worker that it is in and the call's number.
@@ -226,8 +227,9 @@ class _Transform(nn.Module):
     def apply(self, raw: Any, params: Tensor | None = None) -> Any:
         return super().apply(raw) if params is None else self._apply_params(raw, params)
 
+    @abstractmethod
     def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
-        raise NotImplementedError
+        """``apply`` with parameters."""
 
 
 class RandomCrop(_Transform):

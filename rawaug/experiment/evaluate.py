@@ -175,36 +175,47 @@ def evaluate(
     require_classical(classical)
     weights = find_weights(weights)
     kind = read_header(weights)["kind"]
-    result: dict[str, Any] = {"kind": kind, "data": data}
     pairs = open_pairs(data, split="test")
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
             raise ValueError(f"{weights}: is an ISP; self-ensemble, noise, classical and report are for denoisers")
-        isp = DictionaryISP.from_pretrained(weights)
-        scores = [
-            Score(pair.name, psnr_r(isp, pair)) for pair in tqdm(pairs, desc="evaluate", unit="image", leave=False)
-        ]
+        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
+        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
     else:
         model, info = denoisers.load(weights)
-        levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
-        cfa = CFA(info.get("cfa", "RGGB"))
+        levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(device)
-        scores = [score for score, *_ in score_denoiser(model, pairs, levels, cfa, seed, False, "evaluate")]
-        result |= {"self_ensemble": self_ensemble, "seed": seed}
-        runs = {"plain": summary(scores)}
-        if self_ensemble:
-            scored = score_denoiser(model, pairs, levels, cfa, seed, True, "evaluate, self-ensemble")
-            scores = [score for score, *_ in scored]
-            result["plain"], runs["self_ensemble"] = runs["plain"], summary(scores)
-        if classical:
-            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
+        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
         if report is not None:
+            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             for pair in shown_on_page(pairs):
                 page.add_frame(row_of({"denoised": model}, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    return {**result, **summary(scores), "weights_sha256": digest, "version": __version__}
+    return {"kind": kind, "data": data, **result, "weights_sha256": digest, "version": __version__}
+
+
+def _denoiser_result(
+    model: Denoiser,
+    pairs: Sequence[Pair],
+    noise: NoiseModel,
+    cfa: CFA,
+    seed: int,
+    self_ensemble: bool,
+    classical: Sequence[str],
+) -> dict[str, Any]:
+    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
+    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
+    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
+    if self_ensemble:
+        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
+        result |= {"plain": plain, **summary([score for score, *_ in scored])}
+    else:
+        result |= plain
+    if classical:
+        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
+    return result
 
 
 CLASSICAL: dict[str, Callable[[], Classical]] = {

@@ -100,19 +100,18 @@ def train(
         schedule.step()
         average.update_parameters(net) if config.ema else trained.load_state_dict(net.state_dict())
 
+        rate = (step - start) * stream.batch / (time.perf_counter() - began)
         if step % config.validate_every == 0 or step == config.steps:
             score = validate(estimator.corrected(trained), validation, fabric.device)
             if score > best["psnr"] or not choose:
                 best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
             mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
             if journal is not None:
-                rate = (step - start) * stream.batch / (time.perf_counter() - began)
                 journal.log(step, loss=mean_loss, psnr=score, samples_per_second=rate)
         if journal is not None and (step % config.checkpoint_every == 0 or step == config.steps):
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
             write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
-        rate = (step - start) * stream.batch / (time.perf_counter() - began)
         told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
         bar.set_postfix_str(told, refresh=False)
     if journal is not None:

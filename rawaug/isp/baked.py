@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import Any
+from importlib import import_module
 
 import torch
 import torch.nn.functional as F
@@ -93,9 +93,10 @@ class BakedISP(nn.Module):
         camera = self._camera(srgb, params, place)
         if srgb.dtype != torch.uint8:
             srgb = srgb.float()
-        if kernels.usable(srgb):
+        if kernels.usable(srgb):  # imported late, for Triton may be missing
             return kernels.kernel_or(
-                lambda: _gpu().unprocess(srgb, camera, white), lambda: unprocess.unprocess(srgb, camera, white)
+                lambda: import_module("rawaug.isp.gpu").unprocess(srgb, camera, white),
+                lambda: unprocess.unprocess(srgb, camera, white),
             )
         if srgb.device.type != "cpu" or not compiled.available():
             return unprocess.unprocess(srgb, camera, white)
@@ -118,12 +119,6 @@ class BakedISP(nn.Module):
             shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
         return unprocess.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
-
-
-def _gpu() -> Any:
-    from rawaug.isp import gpu  # late, for Triton may be missing
-
-    return gpu
 
 
 def bakeable(order: Sequence[str]) -> bool:

@@ -19,7 +19,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, ClassVar
+from importlib import import_module
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -177,9 +178,11 @@ class ShotReadNoise(ShotReadModel):
         """The noisy RAW and, if asked for, its variance map."""
         if clean.dtype == torch.float32:
             levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-            if kernels.usable(clean):
+            if kernels.usable(clean):  # imported late, for Triton may be missing
                 return kernels.kernel_or(
-                    lambda: _gpu().shot_read(clean, levels, self._keys(params), white, with_variance),
+                    lambda: import_module("rawaug.noise.gpu").shot_read(
+                        clean, levels, self._keys(params), white, with_variance
+                    ),
                     lambda: self._in_pytorch(clean, params, white, with_variance),
                 )
             if clean.device.type == "cpu" and compiled.available():
@@ -200,12 +203,6 @@ class ShotReadNoise(ShotReadModel):
 
     def _keys(self, params: Params) -> list[int]:
         return [derived_seed(seed, self.stream) for seed in params["seed"].tolist()]
-
-
-def _gpu() -> Any:
-    from rawaug.noise import gpu  # late, for Triton may be missing
-
-    return gpu
 
 
 class PoissonGaussianNoise(ShotReadModel):
