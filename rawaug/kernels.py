@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 Result = TypeVar("Result")
@@ -42,6 +43,8 @@ def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> R
     """
     try:
         return kernel()
+    except torch.OutOfMemoryError:  # says nothing of the kernel
+        raise
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
         _refused.append(type(error).__name__)
         reason = (str(error).splitlines() or [""])[-1]

@@ -109,7 +109,9 @@ def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jp
     if isinstance(source[0], Pair):
         return source  # type: ignore[return-value]
     if not isinstance(source[0], (str, Path)):
-        raise ValueError(f"a fit takes files, folders or rawaug.Pair, got {type(source[0]).__name__}; see docs/fit.md")
+        raise ValueError(
+            f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
+        )
     opened = [open_pairs(str(item), split="train") for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]

@@ -49,8 +49,8 @@ def write_dng(
         baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own is kept in its place.
 
     Raises:
-        ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain, the
-            colour matrix or the ISO cannot be written.
+        ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain,
+            the colour matrix or the orientation cannot be written.
         FileNotFoundError: if the source or the folder does not exist.
         OSError: if tags of the source are damaged.
 
@@ -100,8 +100,6 @@ def _require_colour(frame: RawFrame, path: Path) -> None:
         raise ValueError(f"{path}: the colour matrix has no inverse, which a DNG needs")
     if frame.orientation not in _EXIF_ORIENTATIONS:
         raise ValueError(f"{path}: orientation is LibRaw's flip, one of 0 to 7, got {frame.orientation}")
-    if frame.iso is not None and not 0 <= frame.iso <= _LARGEST_ISO:
-        raise ValueError(f"{path}: EXIF holds an ISO of at most {_LARGEST_ISO}, got {frame.iso:g}; leave it out")
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
@@ -191,7 +189,10 @@ def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
         if value is not None
     ]
     if frame.iso is not None:
-        entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", round(frame.iso))))
+        entries.append(Entry(34855, SHORT, 1, struct.pack(byte_order + "H", min(round(frame.iso), _LARGEST_ISO))))
+        if frame.iso > _LARGEST_ISO:  # EXIF 2.3: the sensitivity is then the recommended exposure index
+            entries.append(Entry(34864, SHORT, 1, struct.pack(byte_order + "H", 2)))
+            entries.append(Entry(34866, LONG, 1, struct.pack(byte_order + "I", round(frame.iso))))
     if shot.date is not None:
         entries.append(Entry(36867, ASCII, len(shot.date) + 1, shot.date.encode() + b"\0"))
     return [*entries, Entry(36864, UNDEFINED, 4, b"0230")] if entries else []

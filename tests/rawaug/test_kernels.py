@@ -62,4 +62,10 @@ def test_a_kernel_that_fails_is_told_once_and_pytorch_goes_on(monkeypatch: pytes
     with pytest.warns(UserWarning, match="cannot be used, PyTorch is: RuntimeError: for this target"):
         assert kernels.kernel_or(fails, lambda: 2) == 2
     assert not kernels.usable(torch.zeros(1, device="meta"))
+
+    def has_no_room() -> int:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    with pytest.raises(torch.OutOfMemoryError):
+        kernels.kernel_or(has_no_room, lambda: 2)
     assert kernels._refused == ["RuntimeError"]

@@ -4,6 +4,7 @@ import dataclasses
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -203,3 +204,30 @@ def test_a_real_dng_written_again_is_the_same(tmp_path: Path, camera_files: Path
         assert (back.camera, back.iso, back.orientation) == (frame.camera, frame.iso, frame.orientation)
         assert back.noise_profile == frame.noise_profile and len(back.gain_maps) == len(frame.gain_maps)
         assert torch.allclose(back.color_matrix, frame.color_matrix, atol=2e-4)
+
+
+def test_an_iso_beyond_16_bits_is_the_recommended_exposure_index(
+    tmp_path: Path, bayer_dng: Callable[..., Path]
+) -> None:
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", np.arange(64 * 96, dtype=np.uint16).reshape(64, 96) % 4096))
+    write_dng(tmp_path / "b.dng", dataclasses.replace(frame, iso=102400.0))
+    with tifffile.TiffFile(tmp_path / "b.dng") as file:
+        exif = file.pages.first.tags["ExifTag"].value
+    assert exif["RecommendedExposureIndex"] == 102400 and exif["SensitivityType"] == 2
+    assert read_raw(tmp_path / "b.dng").iso == 65535
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"orientation": 9}, "orientation"),
+        ({"white_balance": (0.0, 1.0, 1.5)}, "positive"),
+        ({"color_matrix": torch.zeros(3, 3)}, "no inverse"),
+    ],
+)
+def test_what_no_dng_can_tell_is_refused(
+    tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], told: str
+) -> None:
+    frame = read_raw(bayer_dng(tmp_path / "a.dng", np.arange(64 * 96, dtype=np.uint16).reshape(64, 96) % 4096))
+    with pytest.raises(ValueError, match=told):
+        write_dng(tmp_path / "b.dng", dataclasses.replace(frame, **change))
