@@ -12,11 +12,14 @@ identity.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from denoisers.domains import DOMAINS, levels_of
 
 PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
@@ -25,10 +28,20 @@ LEAK = 0.2
 """Negative slope that the initialisation reckons with (the U-Net's own; the others' are near enough)."""
 
 
-def conv(inputs: int, outputs: int, size: int = 3, bias: bool = True) -> nn.Conv2d:
-    """A convolution that keeps the size, its weights not drawn yet: :meth:`Denoiser.initialise` does that."""
-    device = torch.get_default_device()
-    return nn.utils.skip_init(nn.Conv2d, inputs, outputs, size, padding=size // 2, bias=bias, device=device)
+def conv(
+    inputs: int,
+    outputs: int,
+    size: int = 3,
+    bias: bool = True,
+    stride: int = 1,
+    groups: int = 1,
+    padding: int | None = None,
+) -> nn.Conv2d:
+    """A convolution that keeps the size (or divides it by ``stride``), its weights drawn by :meth:`Denoiser.initialise`."""
+    settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
+    return nn.utils.skip_init(
+        nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings
+    )
 
 
 def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
@@ -58,16 +71,32 @@ class Denoiser(nn.Module, ABC):
         deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
         stride: sides are padded to multiples of this inside.
         config: the constructor's arguments, kept with the weights so that the same network can be built again.
+        domain: ``linear``, or a transform of :mod:`denoisers.domains`; calls must then pass ``variance``, a map
+            ``shot_var max(noisy, 0) + read_var``.
+
+    Raises:
+        ValueError: if there is no such domain.
     """
 
-    def __init__(self, channels: int, variance_map: bool, deviation: bool, stride: int, config: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        channels: int,
+        variance_map: bool,
+        deviation: bool,
+        stride: int,
+        config: dict[str, Any],
+        domain: str = "linear",
+    ) -> None:
         super().__init__()
+        if domain != "linear" and domain not in DOMAINS:
+            raise ValueError(f"domain {domain!r} is none of linear, {', '.join(DOMAINS)}")
+        self.domain = domain
         self.channels = channels
         self.variance_map = variance_map
         self.deviation = deviation
         self.stride = stride
         shared = {"channels": channels, "variance_map": variance_map, "deviation": deviation}
-        self.config: dict[str, Any] = {**config, **shared}
+        self.config: dict[str, Any] = {**config, **shared} | ({} if domain == "linear" else {"domain": domain})
 
     @property
     def inputs(self) -> int:
@@ -92,15 +121,24 @@ class Denoiser(nn.Module, ABC):
         name = type(self).__name__
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
-        features = noisy
-        if self.variance_map:
-            if variance is None:
-                raise ValueError(f"{name} was made with variance_map=True: pass the noise variance of each value")
-            if variance.shape != noisy.shape:
-                raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
-            features = torch.cat([noisy, variance.sqrt() if self.deviation else variance], dim=1)
-        correction = self.residual(pad_to_multiple(features, self.stride))
-        return noisy + correction[..., : noisy.shape[-2], : noisy.shape[-1]]
+        if not self.variance_map and self.domain == "linear":
+            return noisy + self._correction(noisy)
+        if variance is None:
+            needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
+            raise ValueError(f"{name} was made with {needed}: pass the noise variance of each value")
+        if variance.shape != noisy.shape:
+            raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
+        noise_map = (variance.sqrt() if self.deviation else variance) if self.variance_map else None
+        if self.domain == "linear":
+            return noisy + self._correction(noisy, noise_map)
+        domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
+        signal = domain.forward(noisy.float(), *levels)
+        denoised = domain.inverse(signal + self._correction(signal, noise_map), *levels)
+        return torch.where(variance > 0, denoised, noisy)
+
+    def _correction(self, signal: Tensor, noise_map: Tensor | None = None) -> Tensor:
+        features = signal if noise_map is None else torch.cat([signal, noise_map], dim=1)
+        return self.residual(pad_to_multiple(features, self.stride))[..., : signal.shape[-2], : signal.shape[-1]]
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d) -> None:
@@ -110,12 +148,16 @@ class Denoiser(nn.Module, ABC):
         """
         generator = torch.Generator("cpu").manual_seed(seed)
         for module in self.modules():
-            if not isinstance(module, nn.Conv2d) or module.weight.is_meta:
+            if not isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)) or module.weight.is_meta:
                 continue
             if module in zeros:
                 module.weight.zero_()
             else:
+                # Transposed convolutions here have as many taps as strides: each output has one of them.
+                upwards = isinstance(module, nn.ConvTranspose2d)
+                fan_in = module.in_channels if upwards else math.prod(module.weight.shape[1:])
                 draw = torch.empty(module.weight.shape, device="cpu")
-                module.weight.copy_(nn.init.kaiming_normal_(draw, a=LEAK, generator=generator))
+                deviation = nn.init.calculate_gain("leaky_relu", LEAK) / math.sqrt(fan_in)
+                module.weight.copy_(nn.init.normal_(draw, 0.0, deviation, generator=generator))
             if module.bias is not None:
                 module.bias.zero_()

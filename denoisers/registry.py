@@ -8,10 +8,12 @@ from typing import Any
 
 from denoisers.dhdn import DHDN
 from denoisers.dncnn import DnCNN
+from denoisers.nafnet import NAFNet
 from denoisers.network import Denoiser
+from denoisers.pmrid import PMRID
 from denoisers.unet import UNet
 
-DENOISERS = MappingProxyType({"UNet": UNet, "DHDN": DHDN, "DnCNN": DnCNN})
+DENOISERS = MappingProxyType({"UNet": UNet, "DHDN": DHDN, "DnCNN": DnCNN, "PMRID": PMRID, "NAFNet": NAFNet})
 """Name to class."""
 
 
@@ -32,6 +34,8 @@ def build(name: str, **config: Any) -> Denoiser:
         if key not in settings:
             raise ValueError(f"{name} has no setting {key!r}; it has {', '.join(settings)}")
         expected = type(settings[key].default)
+        if expected is tuple and isinstance(value, list):  # as JSON and YAML have it
+            config[key] = value = tuple(value)
         if type(value) is not expected:
             raise ValueError(f"{name}: {key} must be {expected.__name__}, got {value!r}")
     return DENOISERS[name](**config)

@@ -34,6 +34,7 @@ class UNet(Denoiser):
         channels: 4 for packed RAW.
         variance_map: take the noise map as ``channels`` more inputs.
         deviation: the map is sqrt(variance), of the size of the errors to remove; False: the variance, as published.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
         seed: of the initial weights.
 
     Example:
@@ -49,12 +50,14 @@ class UNet(Denoiser):
         channels: int = PACKED,
         variance_map: bool = True,
         deviation: bool = True,
+        domain: str = "linear",
         seed: int = 0,
     ) -> None:
         require_width(width)
         if scales < 1:
             raise ValueError(f"scales must be at least 1, got {scales}")
-        super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), {"width": width, "scales": scales})
+        config = {"width": width, "scales": scales}
+        super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), config, domain)
         sizes = [width * 2**k for k in range(scales)]
         self.encoder = nn.ModuleList(_block(a, b) for a, b in zip([self.inputs, *sizes], sizes, strict=False))
         self.decoder = nn.ModuleList(_block(3 * size, size) for size in reversed(sizes[:-1]))

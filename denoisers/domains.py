@@ -1,0 +1,120 @@
+r"""The domain in which a network meets noise of variance ``s y + r`` (s = ``shot_var``, r = ``read_var``).
+
+==========  =======================================================  ====================================================
+name        what the network sees                                    noise there
+==========  =======================================================  ====================================================
+linear      y                                                        as it comes; a noise map is the other input
+ksigma      :math:`u = y / s + r / s^2`, scaled to ISO 1600          variance u: one camera at one ISO, whatever it was
+anscombe    :math:`z = 2 \sqrt{u + 3/8}`                             variance 1 everywhere
+==========  =======================================================  ====================================================
+
+The two transforms need no noise map: after them every exposure of every camera is the same problem, and a network sees
+all of its training data at every noise level. A network is trained on the transformed *clean* signal, so the algebraic
+inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays invertible for any noise.
+
+Sources: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020 (k-sigma; its anchor is ISO 1600
+of a Reno-10x on a scale with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+_LEAST_SHOT = 1e-7
+_LEAST_RATIO = 1e-3
+"""Least shot_var, alone and as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
+
+
+def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """The levels behind a noise map ``shot_var max(noisy, 0) + read_var``, by least squares.
+
+    Args:
+        noisy, variance: ``(B, C, h, w)``.
+
+    Returns:
+        shot_var and read_var, ``(B, 1, 1, 1)``, not negative.
+
+    Example:
+        >>> noisy = torch.rand(1, 4, 8, 8) - 0.1
+        >>> shot, read = levels_of(noisy, 1e-3 * noisy.clamp_min(0) + 1e-5)
+        >>> round(shot.item(), 6), round(read.item(), 7)
+        (0.001, 1e-05)
+    """
+    light, axes = noisy.clamp_min(0.0), (1, 2, 3)
+    mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
+    spread = (light - mean).square().mean(axes, keepdim=True)
+    slope = ((light - mean) * (variance - level)).mean(axes, keepdim=True) / spread.clamp_min(1e-20)
+    shot = slope.clamp_min(0.0)
+    return shot, (level - shot * mean).clamp_min(0.0)
+
+
+class Domain(ABC):
+    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``."""
+
+    def forward(self, y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """RAW to what the network sees."""
+        return self.encode(_photons(y, *_bounded(shot, read)))
+
+    def inverse(self, z: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """What the network gives back to RAW."""
+        shot, read = _bounded(shot, read)
+        return shot * (self.decode(z) - read / shot.square())
+
+    @abstractmethod
+    def encode(self, u: Tensor) -> Tensor:
+        """Of a signal whose noise has the variance u."""
+
+    @abstractmethod
+    def decode(self, z: Tensor) -> Tensor:
+        """The inverse of :meth:`encode`."""
+
+
+class KSigma(Domain):
+    """PMRID's: noise as that of ISO 1600, in PMRID's units."""
+
+    shot = 5.995267e-4 * 1600 + 8.68861e-3
+    read = 7.11772e-7 * 1600**2 + 6.514934e-4 * 1600 + 0.11492713
+    scale = 256.0 / 959.0
+
+    def encode(self, u: Tensor) -> Tensor:
+        """Linear in u."""
+        return (u * self.shot - self.read / self.shot) * self.scale
+
+    def decode(self, z: Tensor) -> Tensor:
+        """Linear in z."""
+        return (z / self.scale + self.read / self.shot) / self.shot
+
+
+class Anscombe(Domain):
+    """The generalised Anscombe transform over 4: noise of deviation 1/4, whites at 5 (ISO 25,600) to 50 (ISO 100)."""
+
+    scale = 0.25
+    offset = 0.375
+
+    def encode(self, u: Tensor) -> Tensor:
+        """The root of u + 3/8, below u = 0 its tangent."""
+        root = 2.0 * (u.clamp_min(0.0) + self.offset).sqrt()
+        return self.scale * (root + u.clamp_max(0.0) / math.sqrt(self.offset))
+
+    def decode(self, z: Tensor) -> Tensor:
+        """The square, below the root's value at 0 the tangent's inverse."""
+        z, least = z / self.scale, 2.0 * math.sqrt(self.offset)
+        square = (z.clamp_min(least) / 2.0).square() - self.offset
+        return square + (z - least).clamp_max(0.0) * math.sqrt(self.offset)
+
+
+DOMAINS = MappingProxyType({"ksigma": KSigma(), "anscombe": Anscombe()})
+"""Name to transform; ``linear`` is none."""
+
+
+def _photons(y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    return y / shot + read / shot.square()
+
+
+def _bounded(shot: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.maximum(shot.clamp_min(_LEAST_SHOT), _LEAST_RATIO * read.sqrt()), read

@@ -1,0 +1,142 @@
+r"""PMRID: a U-Net of separable convolutions for phones; ``z + P(z)`` in the k-sigma domain.
+
+Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each stage
+at half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
+convolution 2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
+
+Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the
+published weights.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import torch
+from torch import Tensor, nn
+
+from denoisers.network import PACKED, Denoiser, conv, require_width
+
+PUBLISHED_WIDTH = 16
+BLOCKS = (2, 2, 4, 4)
+"""Of the encoder's stages."""
+
+
+class Separable(nn.Module):
+    """Depthwise ``size x size`` without bias, then pointwise."""
+
+    def __init__(self, inputs: int, outputs: int, size: int, stride: int = 1) -> None:
+        super().__init__()
+        self.depthwise = conv(inputs, inputs, size, bias=False, stride=stride, groups=inputs)
+        self.pointwise = conv(inputs, outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
+        y: Tensor = self.pointwise(self.depthwise(x))
+        return y
+
+
+class EncoderBlock(nn.Module):
+    """Two separable 5 x 5 convolutions through a quarter of the width, plus the input."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = Separable(inputs, outputs // 4, 5, stride)
+        self.conv2 = Separable(outputs // 4, outputs, 5)
+        self.proj = Separable(inputs, outputs, 3, stride) if stride > 1 or inputs != outputs else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
+        return torch.relu(self.conv2(torch.relu(self.conv1(x))) + self.proj(x))
+
+
+class Residual(nn.Module):
+    """Two separable 3 x 3 convolutions, plus the input."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv0 = Separable(width, width, 3)
+        self.conv1 = Separable(width, width, 3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Of any shape ``(B, width, h, w)``."""
+        y: Tensor = x + self.conv1(torch.relu(self.conv0(x)))
+        return y
+
+
+class DecoderStage(nn.Module):
+    """A residual, then twice the size, plus the encoder's features of that size."""
+
+    def __init__(self, inputs: int, outputs: int, skip: int) -> None:
+        super().__init__()
+        self.decode_conv = Residual(inputs)
+        self.upsample = nn.utils.skip_init(
+            nn.ConvTranspose2d, inputs, outputs, 2, stride=2, device=torch.get_default_device()
+        )
+        self.proj_conv = Separable(skip, outputs, 3)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        """``(B, inputs, h, w)`` and ``(B, skip, 2h, 2w)`` to ``(B, outputs, 2h, 2w)``."""
+        y: Tensor = self.upsample(self.decode_conv(x)) + torch.relu(self.proj_conv(skip))
+        return y
+
+
+class PMRID(Denoiser):
+    """See the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
+
+    Args:
+        width: features of the first convolution; the encoder has 4, 8, 16 and 32 times as many.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs.
+        deviation: the map is sqrt(variance).
+        domain: linear, ksigma (as published) or anscombe.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> PMRID(width=4)(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    def __init__(
+        self,
+        width: int = PUBLISHED_WIDTH,
+        channels: int = PACKED,
+        variance_map: bool = False,
+        deviation: bool = True,
+        domain: str = "ksigma",
+        seed: int = 0,
+    ) -> None:
+        require_width(width)
+        super().__init__(channels, variance_map, deviation, 16, {"width": width}, domain)
+        sizes = [width, 4 * width, 8 * width, 16 * width, 32 * width]
+        self.conv0 = _named(conv(self.inputs, width))
+        for k, blocks in enumerate(BLOCKS, start=1):
+            first = EncoderBlock(sizes[k - 1], sizes[k], stride=2)
+            rest = [EncoderBlock(sizes[k], sizes[k], stride=1) for _ in range(blocks - 1)]
+            self.add_module(f"enc{k}", nn.Sequential(first, *rest))
+        self.encdec = Separable(sizes[4], sizes[1], 3)
+        decoder = [(sizes[1], sizes[1]), (sizes[1], 2 * width), (2 * width, 2 * width), (2 * width, width)]
+        for k, ((inputs, outputs), skip) in enumerate(zip(decoder, reversed(sizes[:4]), strict=True), start=1):
+            self.add_module(f"dec{k}", DecoderStage(inputs, outputs, skip))
+        self.out0 = Residual(width)
+        self.out1 = _named(conv(width, channels))
+        self.initialise(seed, self.out1.conv)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of 16, to the correction ``(B, channels, h, w)``."""
+        x = torch.relu(self.conv0(features))
+        skips = []
+        for k in range(1, 5):
+            skips.append(x)
+            x = self.get_submodule(f"enc{k}")(x)
+        x = torch.relu(self.encdec(x))
+        for k in range(1, 5):
+            x = self.get_submodule(f"dec{k}")(x, skips[-k])
+        correction: Tensor = self.out1(self.out0(x))
+        return correction
+
+
+def _named(layer: nn.Conv2d) -> nn.Sequential:
+    """The layer under the name ``conv``, as the published file has it."""
+    return nn.Sequential(OrderedDict(conv=layer))
