@@ -10,10 +10,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, aligned
 from rawaug.data import RawFolder
-from rawaug.data.pairs import Pair
-from rawaug.experiment.stream import aligned
+from rawaug.data.pair import Pair
 from rawaug.io import read_raw
 from rawaug.noise import NoiseEstimate, estimate_noise, from_dark_frames
 

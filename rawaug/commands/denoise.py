@@ -23,11 +23,11 @@ import denoisers
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.commands.pair_files import sha256
+from rawaug.commands.synth import require_same_settings
 from rawaug.data.raw_folder import EXTENSIONS
-from rawaug.experiment.evaluate import denoise
-from rawaug.experiment.pair_files import sha256
-from rawaug.experiment.stream import Sample
-from rawaug.experiment.synth import require_same_settings
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import denoise
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.seeding import keyed_generator

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from rawaug.commands.camera_noise import as_info, measure_camera_noise
 from rawaug.data import RawFolder, open_pairs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.camera_noise import as_info, measure_camera_noise
-from rawaug.experiment.reconstruction import psnr_r
+from rawaug.data.pair import Pair
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseEstimate, plot_noise

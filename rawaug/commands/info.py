@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import denoisers
-from rawaug.experiment.evaluate import read_header
+from rawaug.evaluation.scores import read_header
 from rawaug.isp.model import DictionaryISP, find_weights
 
 

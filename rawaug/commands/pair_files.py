@@ -30,11 +30,11 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug._version import __version__
-from rawaug.augment import RawAugment
-from rawaug.conform import even_sided
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.isp.stages import place_in_frame
-from rawaug.params import RawPair, load_params
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import RawPair, load_params
+from rawaug.plugin.pictures import even_sided
 
 Format = Literal["dng", "npz", "tiff"]
 

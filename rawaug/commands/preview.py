@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
-from rawaug.conform import even_sided
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import place_in_frame
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.pictures import even_sided
 from rawaug.seeding import keyed_generator
 
 _STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}

@@ -24,10 +24,7 @@ from typing import NamedTuple
 import torch
 from tqdm.auto import tqdm
 
-from rawaug.augment import RawAugment, Sampling
-from rawaug.conform import even_sided
-from rawaug.data.picture_folder import EXTENSIONS
-from rawaug.experiment.pair_files import (
+from rawaug.commands.pair_files import (
     Format,
     Origin,
     augment_file,
@@ -37,7 +34,10 @@ from rawaug.experiment.pair_files import (
     sha256,
     write_pair,
 )
+from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.io import read_picture
+from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.pictures import even_sided
 from rawaug.seeding import keyed_generator
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
@@ -91,7 +91,7 @@ def synth(
 
     Args:
         source: the folder of sRGB pictures.
-        out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.experiment.pair_files`.
+        out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.commands.pair_files`.
         format: dng, npz or tiff.
         per_image: pairs a picture; may grow from run to run.
         isp: name of a shipped ISP, or an ISP's file.

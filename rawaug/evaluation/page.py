@@ -1,6 +1,6 @@
 """The page of a run: one HTML file that needs nothing beside it, with curves, tables and pictures.
 
-RAW is shown by the same fixed development as in :mod:`rawaug.experiment.report`. Of each frame the whole clean picture
+RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Of each frame the whole clean picture
 stands there once, and the window with most detail of it at twice its size: noisy, of every arm, clean.
 """
 
@@ -20,8 +20,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment.report import COLUMNS, QUARTERS, Row, Runs, developed, exposure_of, table_rows
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, table_rows
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -69,11 +70,11 @@ class Page:
         clean = list(row.panels.values())[-1]
         exposure = exposure_of(clean, row.pair)
         top, left = most_detailed(clean)
-        whole = developed(clean, cfa, row.pair, exposure)
+        whole = develop_packed(clean, cfa, row.pair, exposure)
         figures = []
         for name, packed in row.panels.items():
             window = packed[..., top : top + WINDOW, left : left + WINDOW]
-            png = encode_png(developed(window, cfa, row.pair, exposure))
+            png = encode_png(develop_packed(window, cfa, row.pair, exposure))
             caption = html.escape(name if name == "clean" else f"{name}, {row.captions.get(name, '')}")
             figures.append(f'<figure class="window">{_picture(png, name)}<figcaption>{caption}</figcaption></figure>')
         scale = min(1.0, WHOLE / whole.shape[-1])

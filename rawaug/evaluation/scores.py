@@ -2,7 +2,7 @@
 
 An ISP's PSNR_r is the mean over non-overlapping 256 x 256 mosaic patches of reconstruction against RAW. A denoiser's
 PSNR_d and SSIM are taken on the whole mosaic, on frozen noise: the captured one, or one keyed by (seed, name); and once
-more on sRGB, after one fixed development (:func:`rawaug.experiment.report.developed`) of result and clean frame alike.
+more on sRGB, after one fixed development (:func:`rawaug.data.development.develop_packed`) of result and clean frame.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from denoisers.classical import Classical, Stabilised
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug._version import __version__
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, aligned
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.page import Page, shown_on_page
-from rawaug.experiment.reconstruction import psnr_r
-from rawaug.experiment.report import METRICS, Row, developed, exposure_of
-from rawaug.experiment.stream import Sample, aligned
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.evaluation.page import Page, shown_on_page
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.evaluation.tables import METRICS, Row
 from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
-from rawaug.noise import NoiseModel, noise_model, stabilise
+from rawaug.noise import NoiseModel, anscombe, noise_model
 from rawaug.seeding import keyed_generator
 
 TILE, OVERLAP = 384, 64
@@ -141,7 +142,7 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
     """PSNR and SSIM on the mosaic and on sRGB of packed RAW ``(1, 4, h, w)`` against the clean one."""
     exposure = exposure_of(clean, pair)
     raw = [bayer.unpack(x, cfa) for x in (packed, clean)]
-    srgb = [developed(x, cfa, pair, exposure)[None] for x in (packed, clean)]
+    srgb = [develop_packed(x, cfa, pair, exposure)[None] for x in (packed, clean)]
     return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
@@ -248,7 +249,7 @@ def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
         if levels is None or not levels[0] > 0:
             return denoiser(sample.noisy, sample.variance)
         shot_var, read_var = (torch.tensor([level]) for level in levels)
-        return Stabilised(denoiser, stabilise)(sample.noisy, shot_var=shot_var, read_var=read_var)
+        return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
 
     return method
 

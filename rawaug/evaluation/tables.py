@@ -12,31 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.io import encode_srgb
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
-
-
-def developed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``."""
-    rgb = bayer.demosaic(bayer.unpack(packed, cfa), cfa)[0]
-    balanced = rgb * exposure * torch.tensor(pair.white_balance)[:, None, None]
-    linear = torch.einsum("ij,jhw->ihw", pair.color_matrix, balanced.clamp(max=1.0))
-    return encode_srgb(linear.clamp(0.0, 1.0))
-
-
-def exposure_of(packed: Tensor, pair: Pair) -> float:
-    """The factor that brings the brightest percent of a clean frame to white."""
-    green = packed[:, 1:3].flatten()
-    stride = max(1, green.numel() // 1_000_000)
-    return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
 
 
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
@@ -62,7 +45,7 @@ def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
     for line, row in zip(axes, rows, strict=True):
         exposure = exposure_of(list(row.panels.values())[-1], row.pair)
         for axis, (title, packed) in zip(line, row.panels.items(), strict=True):
-            panel = developed(_centre(packed), cfa, row.pair, exposure)
+            panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             axis.set_title(f"{title}\n{row.captions.get(title, '')}", fontsize=9)
             axis.set_axis_off()

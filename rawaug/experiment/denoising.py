@@ -17,13 +17,13 @@ import torch
 
 import denoisers
 from denoisers.network import Denoiser
-from rawaug.augment import noise_for
 from rawaug.bayer import CFA
+from rawaug.commands.fit import fit
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
-from rawaug.experiment.evaluate import (
+from rawaug.data.pair import Pair
+from rawaug.evaluation.page import Page, draw_curves, shown_on_page
+from rawaug.evaluation.scores import (
     require_classical,
     row_of,
     score_classical,
@@ -31,14 +31,14 @@ from rawaug.experiment.evaluate import (
     summary,
     write_json,
 )
-from rawaug.experiment.fitting import fit
-from rawaug.experiment.noisy_frames import noisy_only
-from rawaug.experiment.page import Page, draw_curves, shown_on_page
+from rawaug.evaluation.tables import Row, draw, print_table
+from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
-from rawaug.experiment.report import Row, draw, print_table
-from rawaug.experiment.train import train
 from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.augment import noise_for
+from rawaug.training.loop import train
+from rawaug.training.noisy_frames import noisy_only
 
 SHOWN = 3
 """Test frames in the picture."""

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
-from rawaug.experiment.comparison import Comparison, compare, smoke_comparison
+from rawaug.experiment.denoising import run
 from rawaug.experiment.recipe import Recipe, smoke
-from rawaug.experiment.run import run
+from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 
 
 class Kind(NamedTuple):

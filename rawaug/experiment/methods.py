@@ -16,15 +16,15 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment.reconstruction import block_psnr, psnr_r, windows_of, windows_psnr
+from rawaug.data.pair import Pair
+from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.isp import conditioning
 from rawaug.isp.baselines import BASELINES, ReverseISP, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPParams
-from rawaug.isp.samples import block_averages, sample_pixels
+from rawaug.isp.setting import ISPParams
 from rawaug.isp.stages import as_float
 from rawaug.metrics import PATCH, psnr
 from rawaug.seeding import keyed_generator
@@ -119,7 +119,7 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
         blind = isp.choose(pair.srgb[None])
         return {
             "blind": blind,
-            "as-shot": conditioning.on_gains(isp, blind, pair.white_balance, None),
+            "as-shot": conditioning.with_white_balance(isp, blind, pair.white_balance, None),
             "samples": _from_samples(isp, pair, blind),
             "oracle": _oracle(isp, pair),
         }
@@ -131,7 +131,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in (height, width))
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return conditioning.on_samples(isp, x, blind, readings, isp.place(x))
+    return conditioning.with_raw_samples(isp, x, blind, readings, isp.place(x))
 
 
 @torch.enable_grad()

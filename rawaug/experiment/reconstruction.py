@@ -20,10 +20,13 @@ from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.conform import even_sided
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.pairs import Pair
-from rawaug.experiment.contenders import (
+from rawaug.data.pair import Pair
+from rawaug.evaluation.scores import frozen_sample, write_json
+from rawaug.evaluation.tables import mean_and_spread
+from rawaug.experiment.denoising import fingerprint
+from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.methods import (
     FAMILIES,
     POINTWISE,
     ROWS,
@@ -32,13 +35,10 @@ from rawaug.experiment.contenders import (
     mosaic_only_psnr,
     score_rows,
 )
-from rawaug.experiment.downstream import DownstreamConfig, psnr_d
-from rawaug.experiment.evaluate import frozen_sample, write_json
-from rawaug.experiment.report import mean_and_spread
-from rawaug.experiment.run import fingerprint
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.pictures import even_sided
 
 
 @dataclass

@@ -20,13 +20,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rawaug import compiled, kernels
 from rawaug.bayer import CFA
-from rawaug.isp import stages, unprocess
+from rawaug.isp import stages
 from rawaug.isp.chooser import Chooser
+from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import POINTWISE_STAGES, ISPParams
-from rawaug.threads import one_thread
+from rawaug.isp.setting import ISPParams
+from rawaug.kernels import compiled, fallback, raw_torch
+from rawaug.kernels.threads import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
@@ -93,18 +94,18 @@ class BakedISP(nn.Module):
         camera = self._camera(srgb, params, place)
         if srgb.dtype != torch.uint8:
             srgb = srgb.float()
-        if kernels.usable(srgb):  # imported late, for Triton may be missing
-            return kernels.kernel_or(
-                lambda: import_module("rawaug.isp.gpu").unprocess(srgb, camera, white),
-                lambda: unprocess.unprocess(srgb, camera, white),
+        if fallback.usable(srgb):  # imported late, for Triton may be missing
+            return fallback.kernel_or(
+                lambda: import_module("rawaug.kernels.raw_triton").unprocess(srgb, camera, white),
+                lambda: raw_torch.unprocess(srgb, camera, white),
             )
         if srgb.device.type != "cpu" or not compiled.available():
-            return unprocess.unprocess(srgb, camera, white)
-        from rawaug.isp import fused
+            return raw_torch.unprocess(srgb, camera, white)
+        from rawaug.kernels import raw_numba
 
-        return fused.unprocess(srgb, camera, white)
+        return raw_numba.unprocess(srgb, camera, white)
 
-    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> unprocess.Camera:
+    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> raw_torch.Camera:
         batch, _, height, width = srgb.shape
         kept, table = self.config.stages, self.table
         matrix = params.matrix.to(table) if "colour" in kept else torch.eye(3).to(table).expand(batch, 3, 3)
@@ -114,11 +115,11 @@ class BakedISP(nn.Module):
         if "shading" in kept:
             centre = (float(self.shading.mean[0]), float(self.shading.mean[1]))
             places = [[0, 0, height, width]] * batch if place is None else place.tolist()
-            frame = table.new_tensor([unprocess.frame_of(p, height, width, centre) for p in places]).reshape(batch, 6)
+            frame = table.new_tensor([raw_torch.frame_of(p, height, width, centre) for p in places]).reshape(batch, 6)
             precision = self.shading.precision * (0.5 / math.log(2.0))
             shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
-        return unprocess.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
+        return raw_torch.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
 
 
 def bakeable(order: Sequence[str]) -> bool:

@@ -1,7 +1,7 @@
 """Shot and read noise in one pass over the picture, compiled: draw, scale, add, clip, and the variance map.
 
-``noisy = min(y + sqrt(shot_var max(y, 0) + read_var) n, white)`` with the normals n of :mod:`rawaug.noise.philox`; the
-logarithm and the sine that these take are polynomials here, within 1e-6 of the definition.
+``noisy = min(y + sqrt(shot_var max(y, 0) + read_var) n, white)`` with the normals n of :mod:`rawaug.kernels.philox`;
+the logarithm and the sine that these take are polynomials here, within 1e-6 of the definition.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.compiled import compiled, over_rows, part
-from rawaug.noise.philox import INCREMENTS, MULTIPLIERS, ROUNDS
+from rawaug.kernels.compiled import compiled, over_rows, part
+from rawaug.kernels.philox import INCREMENTS, MULTIPLIERS, ROUNDS
 
 _TILE = 512
 """Cells that are worked on at a time: what is kept of them stays in the fastest cache."""

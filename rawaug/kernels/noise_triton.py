@@ -1,6 +1,6 @@
-"""Shot and read noise as one kernel, drawn on the device: the pass of :mod:`rawaug.noise.fused` for a GPU.
+"""Shot and read noise as one kernel, drawn on the device: the pass of :mod:`rawaug.kernels.noise_numba` for a GPU.
 
-Triton's generator is the Philox4x32-10 of :mod:`rawaug.noise.philox`, with the cell as its counter: the noise is that
+Triton's generator is the Philox4x32-10 of :mod:`rawaug.kernels.philox`, with the cell as its counter: the noise is that
 of a CPU, but for the rounding of logarithms.
 """
 
@@ -17,7 +17,7 @@ _BLOCK = 512
 def shot_read(
     clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Noisy RAW and its variance map, float32 ``(B, 4, h, w)``; arguments of :func:`rawaug.noise.fused.shot_read`."""
+    """Noisy RAW and its variance map, ``(B, 4, h, w)``; arguments of :func:`rawaug.kernels.noise_numba.shot_read`."""
     clean = clean.detach().contiguous()
     batch, _, height, width = clean.shape
     noisy = torch.empty_like(clean)
@@ -43,7 +43,7 @@ def shot_read(
 
 @triton.jit
 def _sine(turn):  # type: ignore[no-untyped-def]
-    """As in :mod:`rawaug.noise.fused`: folded to a quarter turn about 0, then an odd polynomial."""
+    """As in :mod:`rawaug.kernels.noise_numba`: folded to a quarter turn about 0, then an odd polynomial."""
     folded = tl.where(turn > 1073741824, 2147483647 - turn + 1, turn)
     folded = tl.where(turn < -1073741824, -2147483647 - turn - 1, folded)
     x = folded.to(tl.float32) * 9.313225746154785e-10

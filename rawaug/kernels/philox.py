@@ -7,7 +7,7 @@ and likewise :math:`n_{2, 3}` from :math:`w_2, w_3` (Salmon et al., "Parallel ra
 2011; Box and Muller 1958). One call makes the four normals of a Bayer cell, up to 6.7 standard deviations. As nothing
 is carried from one cell to the next, pixels can be made in any order, on any number of threads.
 
-This is the definition in PyTorch, for where nothing can be compiled; :mod:`rawaug.noise.fused` is the fast form.
+This is the definition in PyTorch, for where nothing can be compiled; :mod:`rawaug.kernels.noise_numba` is fast.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The reverse pass of :mod:`rawaug.isp.unprocess` in one pass over the picture, compiled; and thumbnails.
+"""The reverse pass of :mod:`rawaug.kernels.raw_torch` in one pass over the picture, compiled; and thumbnails.
 
 A row is worked on in pieces that fit the fastest cache, each step a loop of its own that the compiler turns into vector
 instructions. :func:`_interpolate` spells these out for the table, four colours of two neighbouring nodes at a time,
@@ -16,8 +16,8 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from rawaug.compiled import compiled, over_rows, part
-from rawaug.isp.unprocess import Camera
+from rawaug.kernels.compiled import compiled, over_rows, part
+from rawaug.kernels.raw_torch import Camera
 
 _TILE = 256
 """Cells that are worked on at a time."""

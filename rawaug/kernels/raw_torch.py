@@ -6,7 +6,7 @@ r"""The reverse pass of a baked ISP, pixel by pixel: look-up, colour, gains, sha
 with :math:`floor = 1 / g` and :math:`rise = \max(1 - 1 / g, 0)`, which is Brooks' ``max(m + (1 - m) / g, 1 / g)``.
 Every site computes the one colour that its mosaic keeps.
 
-This is the pass in PyTorch, for any device; :mod:`rawaug.isp.fused` is the fast form for CPUs.
+This is the pass in PyTorch, for any device; :mod:`rawaug.kernels.raw_numba` is the fast form for CPUs.
 """
 
 from __future__ import annotations

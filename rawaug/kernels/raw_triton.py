@@ -1,4 +1,4 @@
-"""The pass of :mod:`rawaug.isp.unprocess` as one kernel: a program works on a block of Bayer cells of one picture.
+"""The pass of :mod:`rawaug.kernels.raw_torch` as one kernel: a program works on a block of Bayer cells of one picture.
 
 Every pixel is read once and every site written once: 3 bytes in and 4 out a pixel. The table, 4.4 MB at 65 nodes, stays
 in the GPU's cache.
@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from rawaug.isp.unprocess import Camera
+from rawaug.kernels.raw_torch import Camera
 
 _BLOCK = 256
 

@@ -5,8 +5,8 @@ r"""Online augmentation: sRGB pictures in, noisy/clean RAW pairs out.
 Augmentations").
 
 :class:`RawAugment` works on batches, on the device of the batch. It draws its parameters first and applies them after,
-and the parameters replay the pair bit for bit. :mod:`rawaug.pairs` puts it behind a Dataset, :mod:`rawaug.loader`
-behind a DataLoader.
+and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` puts it behind a Dataset,
+:mod:`rawaug.plugin.loader` behind a DataLoader.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.conform import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.isp.dictionary import convex_weights, perturb
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPParams
+from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.noise import NoiseModel, noise_model
-from rawaug.params import AugmentParams, RawPair
+from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
 Sampling = Literal["convex", "perturb", "chosen"]
@@ -159,8 +159,8 @@ class RawAugment(nn.Module):
         """Sample, then apply.
 
         Args:
-            batch: pictures ``(B, 3, H, W)`` in any form that :mod:`rawaug.conform` tells of, or a tuple or mapping that
-                has them. A single picture makes a single pair, without the leading B.
+            batch: pictures ``(B, 3, H, W)`` in any form that :mod:`rawaug.plugin.pictures` lists, or a tuple or mapping
+                that has them. A single picture makes a single pair, without the leading B.
             generator: of all that is drawn, on the CPU; the module's own by default.
             key: name or index of the pictures in a mapping or tuple.
 

@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
-from rawaug.conform import even_sided, find_picture, picked, replaced, to_rgb_tensor
-from rawaug.params import AugmentParams, RawPair
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_tensor
 from rawaug.seeding import keyed_generator
 
 
@@ -26,7 +26,7 @@ class RawPairs(Dataset[Any]):
 
     Args:
         dataset: yields pictures (tensor, NumPy array or PIL picture, HWC or CHW, grey or RGBA too: see
-            :mod:`rawaug.conform`), or tuples or mappings that have one. What else a sample holds is passed through.
+            :mod:`rawaug.plugin.pictures`), or tuples or mappings that have one. What else a sample holds passes.
         augment: makes the pair; on the CPU where workers are to run it.
         crop: side of the square crop in pixels, even; None keeps whole pictures (made even by dropping a line).
         seed: of all draws.

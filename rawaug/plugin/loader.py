@@ -14,11 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.augment import RawAugment
 from rawaug.bayer import RandomCrop
-from rawaug.conform import even_sided, find_picture, is_picture, picked, replaced, stacked, to_rgb_batch, to_rgb_tensor
-from rawaug.pairs import placed, random_place
-from rawaug.params import RawPair
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import placed, random_place
+from rawaug.plugin.params import RawPair
+from rawaug.plugin.pictures import (
+    even_sided,
+    find_picture,
+    is_picture,
+    picked,
+    replaced,
+    stacked,
+    to_rgb_batch,
+    to_rgb_tensor,
+)
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -99,7 +108,7 @@ def wrap(
 
     Args:
         loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that
-            :mod:`rawaug.conform` tells of, lists of pictures, or tuples or mappings that have these. The
+            :mod:`rawaug.plugin.pictures` tells of, lists of pictures, or tuples or mappings that have these. The
             :class:`RawPair` takes their place, all else passes.
         augment: moves to ``device``.
         device: where the pairs are made, by default where ``augment`` is. Pictures travel there as uint8, if they are.

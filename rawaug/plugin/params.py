@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from rawaug.isp.params import ISPParams
+from rawaug.isp.setting import ISPParams
 
 _KIND = "augment_params"
 

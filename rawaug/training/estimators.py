@@ -33,7 +33,7 @@ import torch
 from torch import Tensor, nn
 
 from denoisers.network import Denoiser
-from rawaug.experiment.stream import Sample
+from rawaug.data.sample import Sample
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
 

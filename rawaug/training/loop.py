@@ -23,11 +23,12 @@ from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
-from rawaug.experiment.estimators import Supervised
-from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
-from rawaug.experiment.stream import Sample, StepSampler, TrainingStream
+from rawaug.data.sample import Sample
 from rawaug.metrics import psnr
 from rawaug.seeding import derived_seed
+from rawaug.training.estimators import Supervised
+from rawaug.training.stream import StepSampler, TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "l1": nn.functional.l1_loss,

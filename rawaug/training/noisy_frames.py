@@ -15,15 +15,16 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
-from rawaug.bayer import CFA
-from rawaug.conform import even_sided, to_rgb_tensor
-from rawaug.data.pairs import Pair
-from rawaug.experiment.estimators import R2R, SelfSupervised
-from rawaug.experiment.report import developed
-from rawaug.experiment.stream import Sample, aligned, turned_crop
+from rawaug.bayer import CFA, aligned
+from rawaug.data.development import develop_packed
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
 from rawaug.noise import ShotReadModel
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.pictures import even_sided, to_rgb_tensor
 from rawaug.seeding import keyed_generator
+from rawaug.training.estimators import R2R, SelfSupervised
+from rawaug.training.stream import turned_crop
 
 CACHED = 64
 """Pictures whose frames are kept: more than this and frames are made when asked for."""
@@ -54,7 +55,7 @@ def noisy_only(pair: Pair) -> Pair:
     """
     if pair.noisy is None:
         return pair
-    srgb = developed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
+    srgb = develop_packed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
     return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
 
 

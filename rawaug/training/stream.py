@@ -7,7 +7,7 @@ captured; or of frames that are only known noisy), part RAW made from sRGB pictu
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -15,18 +15,11 @@ from torch.utils.data import Dataset, Sampler
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
 from rawaug.noise import NoiseModel
-from rawaug.pairs import RawPairs
+from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator
-
-
-class Sample(NamedTuple):
-    """What a denoiser is trained on, packed ``(4, h, w)`` (in a batch ``(B, 4, h, w)``)."""
-
-    noisy: Tensor
-    clean: Tensor
-    variance: Tensor
 
 
 class Source(Protocol):
@@ -59,7 +52,7 @@ class RealCrops:
         """One crop of a random frame."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
         images = pair.raw if pair.noisy is None else torch.cat([pair.raw, pair.noisy])
-        images = turned_crop(aligned(images, pair.cfa, self.cfa), self.crop, self.cfa, generator)
+        images = turned_crop(bayer.aligned(images, pair.cfa, self.cfa), self.crop, self.cfa, generator)
         packed = bayer.pack(images[:, None], self.cfa)
         params = self.noise.sample(1, generator)
         if pair.noisy is not None:
@@ -95,13 +88,6 @@ def turned_crop(images: Tensor, crop: int, cfa: CFA, generator: torch.Generator)
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
     turned = bayer.turn_keeping_cfa(bayer.crop(images, top, left, side, side), cfa, view)
     return bayer.crop(turned, 0, 0, crop, crop)
-
-
-def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
-    """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
-    rows, columns = cfa.shift_to(target)
-    height, width = mosaic.shape[-2:]
-    return mosaic[..., rows : height - rows, columns : width - columns]
 
 
 class TrainingStream(Dataset[Any]):

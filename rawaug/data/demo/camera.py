@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
 from rawaug.data.malvar import demosaic_malvar
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.io import decode_srgb, encode_srgb
 
 BLACK, WHITE = 512, 4095

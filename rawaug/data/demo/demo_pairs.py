@@ -12,9 +12,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rawaug.data.dead_leaves import dead_leaves
-from rawaug.data.demo_camera import NOISE_LEVELS, DemoCamera
-from rawaug.data.pairs import Pair
+from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
+from rawaug.data.demo.dead_leaves import dead_leaves
+from rawaug.data.pair import Pair
 from rawaug.io import read_picture
 from rawaug.seeding import keyed_generator
 

@@ -2,7 +2,7 @@
 
 ``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
 same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
-:data:`rawaug.data.sidd_scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, and tells the pattern
+:data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, and tells the pattern
 of each frame in a line of ``siddplus_*bayer_patterns.csv``.
 
 The blocks come without colour: it is read from the METADATA files of their scene instances where these lie below the
@@ -21,12 +21,12 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.captured_noise import captured_noise
-from rawaug.data.colour import rendered
+from rawaug.data.colour import develop_mosaic
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array
-from rawaug.data.pairs import Pair
-from rawaug.data.sidd import Colour, colour_of, indexed, noise_level_functions, normalised
-from rawaug.data.sidd_scenes import HELD_BACK, SiddScene
+from rawaug.data.pair import Pair
+from rawaug.data.sidd.frames import Colour, colour_of, indexed, noise_level_functions, normalised
+from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
 
 BLOCKS = 32
 """Blocks of a frame."""
@@ -190,7 +190,7 @@ def _pair(
 ) -> Pair:
     return Pair(
         name=name,
-        srgb=rendered(clean, cfa, colour.white_balance, colour.matrix),
+        srgb=develop_mosaic(clean, cfa, colour.white_balance, colour.matrix),
         raw=clean,
         cfa=cfa,
         white_balance=colour.white_balance,

@@ -3,7 +3,7 @@
 A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are MATLAB files
 of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black; METADATA are
 of version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not. The pattern goes by phone:
-see :mod:`rawaug.data.sidd_scenes`.
+see :mod:`rawaug.data.sidd.scenes`.
 
 Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
 the dataset's ``noise_level_functions.csv``.
@@ -23,13 +23,13 @@ from torch import Tensor
 
 from rawaug.bayer import turn_back
 from rawaug.data.captured_noise import measured_levels
-from rawaug.data.colour import color_matrix, rendered, white_balance
+from rawaug.data.colour import color_matrix, develop_mosaic, white_balance
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array, read_value
-from rawaug.data.pairs import Pair
-from rawaug.data.sidd_scenes import HELD_BACK, SiddScene, is_scene
+from rawaug.data.pair import Pair
+from rawaug.data.sidd.scenes import HELD_BACK, SiddScene, is_scene
 from rawaug.io import read_picture
-from rawaug.io.pictures import view_of_orientation
+from rawaug.io.picture_files import view_of_orientation
 
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
 
@@ -38,7 +38,7 @@ class SiddFrames(LazyPairs):
     """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set too where it lies there.
 
     Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
-    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is rendered as the dataset's makers did.
+    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is develop_mosaic as the dataset's makers did.
 
     Args:
         path: contains the folders of the scene instances, at any depth. Those of validation and benchmark are left out.
@@ -81,7 +81,7 @@ class SiddFrames(LazyPairs):
         if "GT_SRGB" in files:
             srgb = _even(turn_back(read_picture(files["GT_SRGB"]), view))
         else:
-            srgb = rendered(clean, scene.cfa, gains, matrix)
+            srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
         shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
         return Pair(
             name=self.names[index],

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from rawaug.data.mat import read_array
-from rawaug.data.sidd_blocks import BLOCKS
-from rawaug.data.sidd_scenes import HELD_BACK
+from rawaug.data.sidd.blocks import BLOCKS
+from rawaug.data.sidd.scenes import HELD_BACK
 
 SIDE = 256
 COUNT = len(HELD_BACK) * BLOCKS

@@ -20,7 +20,7 @@ from tqdm.auto import tqdm
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, ReverseISP
 from rawaug.isp.baselines.upi_tuned import TunedUPI
-from rawaug.isp.samples import FramePair
+from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 from rawaug.seeding import keyed_generator
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from rawaug.isp import stages
 from rawaug.isp.dictionary import l1_normalised
-from rawaug.isp.params import ISPParams
-from rawaug.isp.samples import PixelSamples, Shot
+from rawaug.isp.fit.samples import PixelSamples, Shot
+from rawaug.isp.setting import ISPParams
 
 TIE = 1e-1
 """Weight of the deviations; the squared errors of a good fit are near 1e-6."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from rawaug.isp.params import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 
 _SWITCH = ("auto", "on", "off")
 
@@ -33,7 +33,7 @@ class FitConfig:
             and else 0. Kept only as far as frames left out of it gain.
         noisy: fit on the captured noisy RAW of the pairs.
         seed: of the pixels drawn and of the networks' start.
-        isp: further keys of :class:`rawaug.isp.params.ISPConfig`, such as ``encoder_widths``.
+        isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
     """
 
     size: Literal["default", "small"] = "default"

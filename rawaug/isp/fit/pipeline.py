@@ -28,18 +28,18 @@ from tqdm.auto import tqdm
 
 from rawaug._version import __version__
 from rawaug.isp import stages
+from rawaug.isp.config import SMALL, ISPConfig
 from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
-from rawaug.isp.fit.colour import FrameColour, Tie, fall_off, least_squares
-from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.colour_fit import FrameColour, Tie, fall_off, least_squares
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.fit.encoders import train_encoders
+from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.joint import train_jointly
 from rawaug.isp.fit.losses import cycle_error, reading_error
+from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import SMALL, ISPConfig
-from rawaug.isp.samples import FramePair, PixelSamples, Shot, sample_pixels
+from rawaug.kernels.threads import one_thread
 from rawaug.seeding import derived_seed
-from rawaug.threads import one_thread
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""

@@ -12,9 +12,9 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment.camera_noise import measure_camera_noise
-from rawaug.experiment.fitting import fit
+from rawaug.commands.camera_noise import measure_camera_noise
+from rawaug.commands.fit import fit
+from rawaug.data.pair import Pair
 from rawaug.noise import NoiseEstimate, estimate_noise, noise_model
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
@@ -90,7 +90,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
     assert noisy_pair.noisy is not None
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
-    monkeypatch.setattr("rawaug.experiment.camera_noise.estimate_noise", estimate)
+    monkeypatch.setattr("rawaug.commands.camera_noise.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair]).shot_var == shot_var
     else:

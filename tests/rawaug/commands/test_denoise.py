@@ -16,7 +16,7 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.experiment.denoise import denoise_file, denoise_folder, denoise_mosaic, levels_of
+from rawaug.commands.denoise import denoise_file, denoise_folder, denoise_mosaic, levels_of
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import noise_levels
 

@@ -11,7 +11,7 @@ import torch
 
 import rawaug
 from rawaug.cli import main
-from rawaug.experiment.reconstruction import psnr_r
+from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
@@ -24,7 +24,7 @@ Shoot = Callable[..., Path]
 
 @pytest.fixture(autouse=True)
 def short_first_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.fit.CURVE_STEPS", 10)
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 10)
 
 
 @pytest.fixture

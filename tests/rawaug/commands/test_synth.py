@@ -14,8 +14,8 @@ import torch
 from rawaug import DictionaryISP, ISPConfig, RawAugment
 from rawaug.bayer import pack
 from rawaug.cli import main
-from rawaug.experiment.pair_files import camera_frames, replay
-from rawaug.experiment.synth import synth
+from rawaug.commands.pair_files import camera_frames, replay
+from rawaug.commands.synth import synth
 from rawaug.io import read_raw, write_picture
 from rawaug.noise import estimate_noise
 
@@ -86,7 +86,7 @@ def test_a_killed_run_with_a_worker_goes_on_without_and_leaves_no_process(tmp_pa
     many.mkdir()
     for k in range(60):
         (many / f"{k}.png").write_bytes((pictures / "a.png").read_bytes())
-    code = f"from rawaug.experiment.synth import synth; synth({str(many)!r}, {str(out)!r}, workers=1)"
+    code = f"from rawaug.commands.synth import synth; synth({str(many)!r}, {str(out)!r}, workers=1)"
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, start_new_session=True) as process:
         while len(list(out.glob("*.safetensors"))) < 5 and process.poll() is None:
             time.sleep(0.01)

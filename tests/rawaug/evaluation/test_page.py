@@ -15,9 +15,9 @@ from PIL import Image
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment.page import WINDOW, Page, draw_curves, encode_png, most_detailed
-from rawaug.experiment.report import Row
+from rawaug.data.pair import Pair
+from rawaug.evaluation.page import WINDOW, Page, draw_curves, encode_png, most_detailed
+from rawaug.evaluation.tables import Row
 
 VOID = {"img", "meta", "br"}
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from rawaug.data import demo_pairs
-from rawaug.experiment.reconstruction import mosaic_of, psnr_r
+from rawaug.evaluation.psnr_r import mosaic_of, psnr_r
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
 
 
 def test_strips_give_the_whole_mosaic() -> None:

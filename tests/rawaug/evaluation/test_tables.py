@@ -10,8 +10,9 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment.report import Row, developed, draw, exposure_of, mean_and_spread, print_table
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.evaluation.tables import Row, draw, mean_and_spread, print_table
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def grey_pair() -> Pair:
 
 
 def test_grey_is_developed_to_grey(grey_pair: Pair) -> None:
-    panel = developed(bayer.pack(grey_pair.raw[None], "GBRG"), CFA.GBRG, grey_pair)
+    panel = develop_packed(bayer.pack(grey_pair.raw[None], "GBRG"), CFA.GBRG, grey_pair)
     assert panel.shape == (3, 32, 32)
     torch.testing.assert_close(panel, panel[:1].expand(3, -1, -1), atol=1e-5, rtol=0)
     assert panel.mean().item() == pytest.approx(0.665, abs=0.002)  # the sRGB value of linear 0.4

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from rawaug.cli import _parser
-from rawaug.experiment.comparison import Comparison
-from rawaug.experiment.contenders import FAMILIES, ROWS
-from rawaug.experiment.experiments import KINDS, kind_of
+from rawaug.experiment.kinds import KINDS, kind_of
+from rawaug.experiment.methods import FAMILIES, ROWS
 from rawaug.experiment.recipe import find_recipe
+from rawaug.experiment.reconstruction import Comparison
 from rawaug.isp.baselines import BASELINES
-from rawaug.isp.samples import BLOCK
+from rawaug.isp.fit.samples import BLOCK
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.data.pairs import Pair
-from rawaug.experiment import contenders
-from rawaug.experiment.contenders import (
+from rawaug.data.pair import Pair
+from rawaug.experiment import methods
+from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
     Fitted,
@@ -24,10 +24,10 @@ from rawaug.experiment.contenders import (
     score_rows,
 )
 from rawaug.isp.baselines import BASELINES, UPI
-from rawaug.isp.baselines.unet import UNetISP
+from rawaug.isp.baselines.plain_unet import UNetISP
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
 from rawaug.metrics import PATCH
 
 FrameOf = Callable[..., Pair]
@@ -42,7 +42,7 @@ def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, flo
 @pytest.fixture
 def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(contenders, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
@@ -92,7 +92,7 @@ def test_the_speed_counts_every_row_and_every_pixel(
     ):
         frame = pair if pixels == PATCH**2 else frame_of("small", size=(64, 96))
         ticks = iter((10.0, 12.0))
-        monkeypatch.setattr(contenders, "time", SimpleNamespace(perf_counter=lambda ticks=ticks: next(ticks)))
+        monkeypatch.setattr(methods, "time", SimpleNamespace(perf_counter=lambda ticks=ticks: next(ticks)))
         windows = min(patches or 3, frame.raw.shape[-1] // PATCH or 1)
         speed = score_rows(Fitted(model, 0.0, 0), frame, patches)["mpix_s"]
         assert speed == pytest.approx(rows * windows * pixels / 2.0 / 1e6)
@@ -117,8 +117,8 @@ def unfitted(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         asked.update(pairs=pairs, config=config)
         return DictionaryISP(ISPConfig(encoders=config.encoders == "on", encoder_widths=(4, 4, 4)))
 
-    monkeypatch.setattr(contenders, "fit_baseline", baseline)
-    monkeypatch.setattr(contenders, "fit_isp", dictionary)
+    monkeypatch.setattr(methods, "fit_baseline", baseline)
+    monkeypatch.setattr(methods, "fit_isp", dictionary)
     return asked
 
 

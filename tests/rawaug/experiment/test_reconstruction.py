@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
-from rawaug.experiment import comparison, contenders
-from rawaug.experiment.comparison import Comparison, compare, smoke_comparison
+from rawaug.data.pair import Pair
+from rawaug.experiment import methods, reconstruction
 from rawaug.experiment.downstream import DownstreamConfig
+from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 from rawaug.isp.baselines import BASELINES
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig
@@ -36,7 +36,7 @@ class Laboratory:
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
         for name in ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d"):
-            monkeypatch.setattr(comparison, name, getattr(self, name))
+            monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
     def open_pairs(self, spec: str, split: str) -> list[Pair]:
         srgb, raw = torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2)
@@ -111,7 +111,7 @@ def test_table_and_file_say_the_same(
 
 
 def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_path: Path) -> None:
-    rows = compare(settings(tmp_path, methods=list(contenders.FAMILIES), seconds=3.0, longer=10.0, longer_frames=3))
+    rows = compare(settings(tmp_path, methods=list(methods.FAMILIES), seconds=3.0, longer=10.0, longer_frames=3))
     networks = {name for name, method in BASELINES.items() if issubclass(method, CropTrainedISP)}
     longer = {name.split(",")[0] for name in rows if "times as long" in name}
     assert longer == networks == {"unet", "cycleisp", "invisp", "invgrey"}
@@ -183,7 +183,7 @@ def test_frames_that_cannot_make_a_table_are_refused(
         (replace(pairs[1], cfa=CFA.BGGR), "f1 has another CFA"),
         (replace(pairs[1], name="f0"), "several frames are named f0"),
     ):
-        monkeypatch.setattr(comparison, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
+        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
         with pytest.raises(ValueError, match=told):
             compare(settings(tmp_path, methods=["unet"]))
     assert laboratory.folds == []
@@ -194,9 +194,9 @@ def test_blocks_of_unregistered_frames_make_a_table_of_pointwise_methods(
 ) -> None:
     laboratory.frames = 3
     pairs = [replace(pair, registered=False) for pair in laboratory.open_pairs("", "")]
-    monkeypatch.setattr(comparison, "open_pairs", lambda spec, split: pairs)
+    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: pairs)
     monkeypatch.setattr(
-        comparison, "score_rows", lambda fitted, pair, patches: {"rows": {"blind": 40.0}, "mpix_s": None}
+        reconstruction, "score_rows", lambda fitted, pair, patches: {"rows": {"blind": 40.0}, "mpix_s": None}
     )
     rows = compare(settings(tmp_path, methods=["dictionary"]))
     assert rows["dictionary"]["psnr_r"][0] == 40.0 and rows["dictionary"]["mpix_s"] is None
@@ -219,9 +219,9 @@ def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
         scored.append(pair)
         return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
 
-    monkeypatch.setattr(comparison, "open_pairs", lambda spec, split: clean)
-    monkeypatch.setattr(comparison, "fit_family", fit)
-    monkeypatch.setattr(comparison, "score_rows", score)
+    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: clean)
+    monkeypatch.setattr(reconstruction, "fit_family", fit)
+    monkeypatch.setattr(reconstruction, "score_rows", score)
     compare(settings(tmp_path, methods=["dictionary"], noise="cycleisp_sidd"))
     assert all(noisy for _, noisy in seen)
     for pair, _ in seen:
@@ -243,7 +243,7 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 
 def test_the_smoke_form_keeps_what_is_quick() -> None:
-    whole = Comparison(name="a", methods=list(contenders.FAMILIES), longer=10.0, downstream=DownstreamConfig())
+    whole = Comparison(name="a", methods=list(methods.FAMILIES), longer=10.0, downstream=DownstreamConfig())
     quick = smoke_comparison(whole)
     assert quick.methods == ["dictionary", "upi", "upi-tuned"] and quick.name == "a-smoke" and quick.longer == 0
     assert quick.downstream is not None and quick.downstream.train.steps == 2 and quick.downstream.methods
@@ -254,11 +254,11 @@ def test_the_smoke_form_keeps_what_is_quick() -> None:
 def test_a_fit_never_sees_the_frame_that_is_left_out(
     frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.fit.CURVE_STEPS", 2)
-    monkeypatch.setattr(contenders, "ORACLE_STEPS", 1)
-    monkeypatch.setattr(comparison, "open_pictures", lambda spec, min_side: [])
-    monkeypatch.setattr(comparison, "mosaic_only_psnr", lambda pictures, cfa: 0.0)
-    monkeypatch.setattr(comparison._Comparison, "_whole", lambda self, family: {})
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 2)
+    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(reconstruction, "open_pictures", lambda spec, min_side: [])
+    monkeypatch.setattr(reconstruction, "mosaic_only_psnr", lambda pictures, cfa: 0.0)
+    monkeypatch.setattr(reconstruction._Comparison, "_whole", lambda self, family: {})
     frames = [frame_of(name) for name in "abc"]
     noise = torch.rand(1, 256, 256, generator=torch.Generator().manual_seed(0))
     poisoned = replace(frames[0], srgb=(255 * noise).byte().expand(3, -1, -1), raw=noise, white_balance=(9.0, 1.0, 9.0))
@@ -268,13 +268,13 @@ def test_a_fit_never_sees_the_frame_that_is_left_out(
         found = {}
 
         def fit(name: str, pairs: Sequence[Pair], *rest: Any) -> Any:
-            fitted = contenders.fit_family(name, pairs, *rest)
+            fitted = methods.fit_family(name, pairs, *rest)
             (left_out,) = {"a", "b", "c"} - {pair.name for pair in pairs}
             found[left_out] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
             return fitted
 
-        monkeypatch.setattr(comparison, "fit_family", fit)
-        monkeypatch.setattr(comparison, "open_pairs", lambda spec, split: [first, *frames[1:]])
+        monkeypatch.setattr(reconstruction, "fit_family", fit)
+        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: [first, *frames[1:]])
         folder = tmp_path / str(first is poisoned)
         compare(settings(folder, methods=[family], seeds=1, patches=1, fit=TINY))
         return found

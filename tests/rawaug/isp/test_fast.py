@@ -5,12 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug import bayer, compiled
-from rawaug.isp.baked import BakedISP
+from rawaug import bayer
+from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
+from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import POINTWISE_STAGES, ISPConfig
 from rawaug.isp.stages import place_in_frame
 from rawaug.isp.unbaked import UnbakedISP, reverse_pass
+from rawaug.kernels import compiled
 from rawaug.metrics import psnr
 
 

@@ -8,21 +8,19 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug import kernels
-from rawaug.isp import gpu as raw_kernel
-from rawaug.isp import unprocess
-from rawaug.isp.baked import BakedISP
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
-from rawaug.noise import fused
-from rawaug.noise import gpu as noise_kernel
+from rawaug.kernels import fallback, noise_numba, raw_torch
+from rawaug.kernels import noise_triton as noise_kernel
+from rawaug.kernels import raw_triton as raw_kernel
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
 
 assert os.environ["TRITON_INTERPRET"] == "1"
 
 
-def camera_of(srgb: torch.Tensor, **settings: Any) -> unprocess.Camera:
+def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
     """Of an ISP in which every stage does something."""
     generator = torch.Generator().manual_seed(0)
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings)).requires_grad_(False)
@@ -41,7 +39,7 @@ def test_the_raw_is_that_of_pytorch(settings: dict[str, Any], dtype: torch.dtype
     srgb = srgb if dtype == torch.uint8 else srgb / 255.0
     camera = camera_of(srgb, **settings)
     raw = raw_kernel.unprocess(srgb, camera, 0.3)
-    torch.testing.assert_close(raw, unprocess.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
+    torch.testing.assert_close(raw, raw_torch.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
     assert raw.max() == torch.tensor(0.3)
 
 
@@ -50,7 +48,7 @@ def test_the_noise_is_that_of_the_cpu(white: float) -> None:
     clean = 1.3 * torch.rand(2, 4, 40, 70, generator=torch.Generator().manual_seed(0)) - 0.1
     levels, keys = torch.tensor([[1e-2, 1e-3], [1e-3, 0.0]]), [2**64 - 5, 123456789012345]
     ours = noise_kernel.shot_read(clean, levels, keys, white, True)
-    for a, b in zip(ours, fused.shot_read(clean, levels, keys, white, True), strict=True):
+    for a, b in zip(ours, noise_numba.shot_read(clean, levels, keys, white, True), strict=True):
         torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)
     assert noise_kernel.shot_read(clean, levels, keys, white, False)[1].numel() == 0
 
@@ -66,7 +64,7 @@ def test_noise_and_raw_take_the_kernels_where_they_are_usable(monkeypatch: pytes
         asked.append(image.shape)
         return True
 
-    monkeypatch.setattr(kernels, "usable", usable)
+    monkeypatch.setattr(fallback, "usable", usable)
     torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
     torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
-    assert asked == [clean.shape, srgb.shape] and not kernels._refused
+    assert asked == [clean.shape, srgb.shape] and not fallback._refused

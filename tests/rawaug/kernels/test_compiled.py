@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader, Dataset
 
-from rawaug import compiled
-from rawaug.augment import RawAugment
 from rawaug.isp.model import DictionaryISP
+from rawaug.kernels import compiled
+from rawaug.plugin.augment import RawAugment
 
 PICTURE = torch.randint(256, (1, 3, 512, 512), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 

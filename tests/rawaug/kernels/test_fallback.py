@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug import kernels
+from rawaug.kernels import fallback
 
 triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
 
@@ -26,7 +26,7 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
 
 @pytest.mark.parametrize("told", [True, False])
 def test_the_noise_compiles_for_a_gpu(told: bool) -> None:
-    from rawaug.noise import gpu as noise
+    from rawaug.kernels import noise_triton as noise
 
     names = ("clean", "levels", "keys", "noisy", "variance", "cells", "white")
     types = dict(zip(names, ("*fp32", "*fp32", "*i64", "*fp32", "*fp32", "i32", "fp32"), strict=True))
@@ -35,7 +35,7 @@ def test_the_noise_compiles_for_a_gpu(told: bool) -> None:
 
 @pytest.mark.parametrize(("pixels", "all_stages"), [("*u8", True), ("*fp32", False)])
 def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
-    from rawaug.isp import gpu as raw
+    from rawaug.kernels import raw_triton as raw
 
     types = {"srgb": pixels, **dict.fromkeys(("table", "attention", "colour", "frame", "shading", "raw"), "*fp32")}
     types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
@@ -54,18 +54,18 @@ def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, 
 
 
 def test_a_kernel_that_fails_is_told_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernels, "_refused", [])
+    monkeypatch.setattr(fallback, "_refused", [])
 
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
     with pytest.warns(UserWarning, match="cannot be used, PyTorch is: RuntimeError: for this target"):
-        assert kernels.kernel_or(fails, lambda: 2) == 2
-    assert not kernels.usable(torch.zeros(1, device="meta"))
+        assert fallback.kernel_or(fails, lambda: 2) == 2
+    assert not fallback.usable(torch.zeros(1, device="meta"))
 
     def has_no_room() -> int:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     with pytest.raises(torch.OutOfMemoryError):
-        kernels.kernel_or(has_no_room, lambda: 2)
-    assert kernels._refused == ["RuntimeError"]
+        fallback.kernel_or(has_no_room, lambda: 2)
+    assert fallback._refused == ["RuntimeError"]

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
-from rawaug.params import AugmentParams, RawPair
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import AugmentParams, RawPair
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
-from rawaug.pairs import RawPairs, RawPairStream
-from rawaug.params import RawPair
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.params import RawPair
 
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")  # more workers than cores, on purpose
 

@@ -13,11 +13,11 @@ from lightning_fabric import Fabric
 from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
-from rawaug.augment import RawAugment
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
-from rawaug.loader import wrap
-from rawaug.params import RawPair
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.loader import wrap
+from rawaug.plugin.params import RawPair
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,12 @@ import torch
 from safetensors.torch import save_file
 from torch.utils.data import default_collate
 
-from rawaug.augment import RawAugment
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig, ISPParams
-from rawaug.pairs import RawPairs
-from rawaug.params import AugmentParams, load_params, save_params
+from rawaug.isp.setting import ISPParams
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.params import AugmentParams, load_params, save_params
 
 
 @pytest.fixture(scope="module")

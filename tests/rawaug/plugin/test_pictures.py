@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from rawaug.conform import even_sided, find_picture, picked, replaced, to_rgb_batch, to_rgb_tensor
+from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_batch, to_rgb_tensor
 
 ARRAY = np.random.default_rng(0).integers(256, size=(6, 8, 3), dtype=np.uint8)
 RGB = torch.from_numpy(ARRAY).permute(2, 0, 1)

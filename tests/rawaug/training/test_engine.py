@@ -28,11 +28,11 @@ warnings.filterwarnings("ignore")
 torch.set_num_threads(1)
 from safetensors.torch import save_file
 from rawaug.bayer import CFA
-from rawaug.experiment.noisy_frames import NoisyCrops, NoisyFrame, held_out
-from rawaug.experiment.estimators import Noisier, Neighbor2Neighbor
-from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
-from rawaug.experiment.stream import TrainingStream
-from rawaug.experiment.train import train
+from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, held_out
+from rawaug.training.estimators import Noisier, Neighbor2Neighbor
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.stream import TrainingStream
+from rawaug.training.loop import train
 
 folder, steps, devices, name = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 generator = torch.Generator().manual_seed(0)

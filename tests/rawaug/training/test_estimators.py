@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import denoisers
-from rawaug.experiment.estimators import (
+from rawaug.training.estimators import (
     NEIGHBOURS,
     R2R,
     Neighbor2Neighbor,

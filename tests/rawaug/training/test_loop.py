@@ -15,12 +15,13 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.experiment import train as loop
-from rawaug.experiment.evaluate import frozen_sample
-from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
-from rawaug.experiment.stream import RealCrops, Sample, TrainingStream
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import frozen_sample
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
+from rawaug.training import loop
+from rawaug.training.stream import RealCrops, TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
 CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
@@ -107,7 +108,7 @@ def test_the_rate_of_the_step_schedule_halves() -> None:
 def test_torchrun_s_processes_count(tmp_path: Path) -> None:
     script = tmp_path / "meet.py"
     script.write_text(
-        "from rawaug.experiment.train import launched\n"
+        "from rawaug.training.loop import launched\n"
         "fabric = launched('cpu', 1, '32-true')\n"
         "print(f'{fabric.global_rank} of {fabric.world_size}', flush=True)\n"
     )

@@ -10,19 +10,21 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
 from rawaug.experiment.arms import training_stream, validation_samples
-from rawaug.experiment.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, variance_of
-from rawaug.experiment.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
-from rawaug.experiment.recipe import ArmConfig, DataConfig, DenoiserConfig, Recipe, TrainConfig
-from rawaug.experiment.stream import Sample, TrainingStream
-from rawaug.experiment.train import train, validate
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, variance_of
+from rawaug.training.loop import train, validate
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
+from rawaug.training.stream import TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 LEVELS = (0.01, 1e-3)
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, aligned
 from rawaug.data import demo_pairs, demo_photographs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.stream import RealCrops, StepSampler, TrainingStream, aligned
+from rawaug.data.pair import Pair
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.pairs import RawPairs
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.training.stream import RealCrops, StepSampler, TrainingStream
 
 
 def colour_pair(cfa: CFA) -> Pair:

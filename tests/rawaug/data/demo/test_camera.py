@@ -8,7 +8,7 @@ import torch
 
 from rawaug.bayer import CFA, pack
 from rawaug.data import DemoCamera
-from rawaug.data.demo_camera import BLACK, NOISE_LEVELS, WHITE, Shot, _shading, _tone
+from rawaug.data.demo.camera import BLACK, NOISE_LEVELS, WHITE, Shot, _shading, _tone
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -10,10 +10,10 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.isp.baselines import UPI, CycleISP, InvertibleGrey, InvISP, TunedUPI, UNetISP, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
-from rawaug.isp.baselines.fit import _CropDrawer
+from rawaug.isp.baselines.training import _CropDrawer
 from rawaug.metrics import psnr
 
 SMALL: list[tuple[type[CropTrainedISP], dict[str, Any]]] = [

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.colour import TIE, TIE_RANGE, FrameColour, Tie, fall_off, least_squares
+from rawaug.isp.fit.colour_fit import TIE, TIE_RANGE, FrameColour, Tie, fall_off, least_squares
+from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.samples import sample_pixels
 from rawaug.metrics import psnr
 
 CURVE = FitConfig(steps=0, pixels=4096, batch=512)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
-from rawaug.isp.samples import BLOCK, block_averages, find_shift, sample_pixels
+from rawaug.data.pair import Pair
+from rawaug.isp.fit.samples import BLOCK, block_averages, find_shift, sample_pixels
 from rawaug.isp.stages import place_in_frame
 
 WB = (1.6, 1.0, 1.5)
