@@ -27,11 +27,11 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
-from rawaug.data.demo import demo_photographs
+from rawaug.data.demo.demo_pairs import demo_photographs
 from rawaug.isp.baselines.cycleisp import CycleISP
 from rawaug.isp.baselines.upi import UPI, unprocess_pixels
 from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
 
 NETWORK_CROP = 64
 UNBAKED_CROP = 256

@@ -129,7 +129,7 @@ def _make_safetensors(folder: Path) -> list[Path]:
 
     import denoisers
     from rawaug import DictionaryISP, ISPConfig, RawAugment
-    from rawaug.params import save_params
+    from rawaug.plugin.params import save_params
 
     isp = DictionaryISP(ISPConfig(colour_atoms=4, gain_atoms=4, encoder_widths=(4, 4, 4)))
     isp.save(folder / "isp.safetensors")

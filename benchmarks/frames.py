@@ -16,7 +16,7 @@ import torch
 from tqdm.auto import tqdm
 
 from rawaug.data import open_pairs
-from rawaug.experiment.contenders import ROWS, fit_family, score_rows
+from rawaug.experiment.methods import ROWS, fit_family, score_rows
 from rawaug.isp.fit import FitConfig
 from rawaug.seeding import keyed_generator
 

@@ -55,11 +55,11 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 
     import denoisers
     from rawaug import DictionaryISP
+    from rawaug.commands.info import describe
     from rawaug.data.mat import read_value
-    from rawaug.data.sidd import colour_of, mosaic_of
-    from rawaug.experiment.info import describe
+    from rawaug.data.sidd.frames import colour_of, mosaic_of
     from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
-    from rawaug.params import load_params
+    from rawaug.plugin.params import load_params
 
     def frame_of() -> RawFrame:
         frame = read_raw(path)

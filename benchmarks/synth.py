@@ -24,9 +24,9 @@ from typing import Any
 
 import torch
 
+from rawaug.commands import synth
+from rawaug.commands.pair_files import augment_file, sha256
 from rawaug.data import demo_pictures
-from rawaug.experiment import synth
-from rawaug.experiment.pair_files import augment_file, sha256
 from rawaug.io import read_picture, write_picture
 
 COPIES = 8

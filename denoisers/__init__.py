@@ -1,17 +1,43 @@
 """RAW denoisers: networks, classical methods, self-ensemble, tiles, files of weights.
 
 Every one is called as ``model(noisy, variance=None) -> denoised``, all ``(B, 4, h, w)`` packed RAW (R, Gr, Gb, B).
+The names load their modules on first use (PEP 562).
 """
 
-from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.dhdn import DHDN
-from denoisers.dncnn import DnCNN
-from denoisers.ensemble import SelfEnsemble
-from denoisers.network import Denoiser
-from denoisers.registry import DENOISERS, build
-from denoisers.tiling import tiled
-from denoisers.unet import UNet
-from denoisers.weights import load, save
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from denoisers.catalogue import DENOISERS, build
+    from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
+    from denoisers.dhdn import DHDN
+    from denoisers.dncnn import DnCNN
+    from denoisers.ensemble import SelfEnsemble
+    from denoisers.network import Denoiser
+    from denoisers.tiling import tiled
+    from denoisers.unet import UNet
+    from denoisers.weights import load, save
+
+_MODULES = {
+    "BM3D": "denoisers.classical",
+    "DENOISERS": "denoisers.catalogue",
+    "DHDN": "denoisers.dhdn",
+    "Denoiser": "denoisers.network",
+    "DnCNN": "denoisers.dncnn",
+    "NonLocalMeans": "denoisers.classical",
+    "SelfEnsemble": "denoisers.ensemble",
+    "Stabilised": "denoisers.classical",
+    "TotalVariation": "denoisers.classical",
+    "UNet": "denoisers.unet",
+    "Wavelet": "denoisers.classical",
+    "build": "denoisers.catalogue",
+    "load": "denoisers.weights",
+    "save": "denoisers.weights",
+    "tiled": "denoisers.tiling",
+}
+"""Public name to the module that defines it."""
 
 __all__ = [
     "BM3D",
@@ -30,3 +56,14 @@ __all__ = [
     "save",
     "tiled",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -157,7 +157,7 @@ class Stabilised:
 
     Args:
         denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
-        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.stabilise``: the generalised Anscombe
+        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``: the generalised Anscombe
             transform with its exact unbiased inverse.
 
     Example:

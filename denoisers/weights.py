@@ -2,7 +2,7 @@ r"""Files of weights: safetensors, with what is needed to build the network agai
 
 ``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
 "info": <JSON: anything the writer wants to tell>}``. Nothing in such a file is code; only the classes in
-:data:`denoisers.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
+:data:`denoisers.catalogue.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from denoisers.catalogue import DENOISERS, build
 from denoisers.network import Denoiser
-from denoisers.registry import DENOISERS, build
 
 FORMAT, KIND = "rawaug", "denoiser"
 

@@ -21,8 +21,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.seeding import keyed_generator, rank_key
-
 N_VIEWS = 8
 """Number of flips and quarter turns of a picture (the dihedral group of the square)."""
 
@@ -207,6 +205,13 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     return raw[..., top : top + height, left : left + width]
 
 
+def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
+    """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
+    rows, columns = cfa.shift_to(target)
+    height, width = mosaic.shape[-2:]
+    return mosaic[..., rows : height - rows, columns : width - columns]
+
+
 class _Transform(nn.Module, ABC):
     """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``.
 
@@ -220,6 +225,8 @@ class _Transform(nn.Module, ABC):
     def _own(self, generator: torch.Generator | None) -> torch.Generator:
         if generator is not None:
             return generator
+        from rawaug.seeding import keyed_generator, rank_key  # late: what only turns mosaics, denoisers, needs no seeds
+
         self._calls += 1
         worker = get_worker_info()
         return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls, *rank_key())

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(argv: list[str]) -> int:
     kind = "training"
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
-        from rawaug.experiment.experiments import kind_of
+        from rawaug.experiment.kinds import kind_of
         from rawaug.experiment.recipe import find_recipe
 
         recipe = find_recipe(argv[1])
@@ -67,7 +67,7 @@ def _dispatch(argv: list[str]) -> int:
 def _parser(kind: str) -> Any:
     from jsonargparse import ArgumentParser
 
-    from rawaug.experiment.experiments import KINDS
+    from rawaug.experiment.kinds import KINDS
     from rawaug.isp.fit import FitConfig
 
     def new(description: str) -> Any:
@@ -135,8 +135,8 @@ def _parser(kind: str) -> Any:
 
 
 def _add_synth(synth: Any) -> None:
-    from rawaug.augment import Sampling
-    from rawaug.experiment.pair_files import Format
+    from rawaug.commands.pair_files import Format
+    from rawaug.plugin.augment import Sampling
 
     synth.add_argument("pictures", type=str, help="folder of sRGB pictures")
     synth.add_argument("out", type=str, help="folder to write")
@@ -160,7 +160,7 @@ def _add_denoise(denoise: Any) -> None:
 
 
 def _run(kind: str, arguments: Any) -> None:
-    from rawaug.experiment.experiments import KINDS
+    from rawaug.experiment.kinds import KINDS
 
     experiment, settings = KINDS[kind], vars(arguments)
     settings.pop("recipe")
@@ -170,7 +170,7 @@ def _run(kind: str, arguments: Any) -> None:
 
 
 def _fit(arguments: Any) -> None:
-    from rawaug.experiment.fitting import fit
+    from rawaug.commands.fit import fit
 
     settings = vars(arguments)
     data, out = settings.pop("data"), settings.pop("out")
@@ -192,8 +192,8 @@ def _fit(arguments: Any) -> None:
 
 
 def _evaluate(arguments: Any) -> None:
-    from rawaug.experiment.evaluate import evaluate, write_json
-    from rawaug.experiment.report import print_scores
+    from rawaug.evaluation.scores import evaluate, write_json
+    from rawaug.evaluation.tables import print_scores
 
     a = arguments
     result = evaluate(a.weights, a.data, a.self_ensemble, a.noise, a.seed, a.classical, a.device, a.report)
@@ -205,7 +205,7 @@ def _evaluate(arguments: Any) -> None:
 
 
 def _preview(arguments: Any) -> None:
-    from rawaug.experiment.preview import preview
+    from rawaug.commands.preview import preview
 
     a = arguments
     for path in preview(a.picture, a.isp, a.out, a.count, a.seed):
@@ -213,14 +213,14 @@ def _preview(arguments: Any) -> None:
 
 
 def _synth(arguments: Any) -> None:
-    from rawaug.experiment.synth import print_synthesis, synth
+    from rawaug.commands.synth import print_synthesis, synth
 
     settings = vars(arguments)
     print_synthesis(synth(settings.pop("pictures"), settings.pop("out"), **settings))
 
 
 def _denoise(arguments: Any) -> None:
-    from rawaug.experiment.denoise import DenoisedFolder, denoise_file, denoise_folder, print_denoised
+    from rawaug.commands.denoise import DenoisedFolder, denoise_file, denoise_folder, print_denoised
 
     a = arguments
     if Path(a.source).is_dir():
@@ -230,7 +230,7 @@ def _denoise(arguments: Any) -> None:
 
 
 def _info(arguments: Any) -> None:
-    from rawaug.experiment.info import describe
+    from rawaug.commands.info import describe
 
     print(describe(arguments.weights))
 

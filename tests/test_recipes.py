@@ -14,7 +14,7 @@ import yaml
 from rawaug.cli import main
 from rawaug.data import demo_pictures, open_pairs, open_pictures
 from rawaug.experiment.ablation import LEFT_OUT, SPACES, TITLES
-from rawaug.experiment.experiments import kind_of
+from rawaug.experiment.kinds import kind_of
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, smoke
 
 FOLDER = Path(__file__).parents[1] / "recipes"
@@ -33,8 +33,8 @@ def name(request: pytest.FixtureRequest) -> str:
 def data_made_once() -> Iterator[None]:
     """The demo's scenes take longer to make than a smoke run takes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rawaug.experiment.run.open_pictures", cache(open_pictures))
-        patch.setattr("rawaug.experiment.run.open_pairs", cache(open_pairs))
+        patch.setattr("rawaug.experiment.denoising.open_pictures", cache(open_pictures))
+        patch.setattr("rawaug.experiment.denoising.open_pairs", cache(open_pairs))
         yield
 
 
@@ -93,8 +93,8 @@ def two_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the demo's frames and pictures only two, and few steps to the best weights: the same code in less time."""
     for module in ("ablation", "comparison", "downstream"):
         monkeypatch.setattr(f"rawaug.experiment.{module}.open_pairs", lambda spec, split: open_pairs(spec, split)[:2])
-    monkeypatch.setattr("rawaug.experiment.comparison.open_pictures", lambda spec, min_side: demo_pictures(9)[-2:])
-    monkeypatch.setattr("rawaug.experiment.contenders.ORACLE_STEPS", 10)
+    monkeypatch.setattr("rawaug.experiment.reconstruction.open_pictures", lambda spec, min_side: demo_pictures(9)[-2:])
+    monkeypatch.setattr("rawaug.experiment.methods.ORACLE_STEPS", 10)
 
 
 @pytest.mark.usefixtures("two_frames")

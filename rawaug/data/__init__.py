@@ -11,18 +11,18 @@ from collections.abc import Callable, Sequence
 from torch import Tensor
 
 from rawaug.data.check import DataReport, check
-from rawaug.data.dead_leaves import dead_leaves
-from rawaug.data.demo import demo_pairs, demo_photographs, demo_pictures
-from rawaug.data.demo_camera import DemoCamera
+from rawaug.data.demo.camera import DemoCamera
+from rawaug.data.demo.dead_leaves import dead_leaves
+from rawaug.data.demo.demo_pairs import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
 from rawaug.data.fivek import fivek_pairs
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.rawir import Rawir
-from rawaug.data.sidd import SiddFrames
-from rawaug.data.sidd_blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
-from rawaug.data.sidd_submission import check_submission, write_submission
+from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd.frames import SiddFrames
+from rawaug.data.sidd.submission import check_submission, write_submission
 from rawaug.data.zurich import Zurich
 
 __all__ = [

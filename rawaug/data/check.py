@@ -24,13 +24,13 @@ from torch.utils.data import DataLoader, Dataset
 from rawaug.data import picture_folder, raw_folder
 from rawaug.data.dnd import Dnd
 from rawaug.data.fivek import CAMERAS, fivek_numbers
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.rawir import Rawir
-from rawaug.data.sidd import SiddFrames
-from rawaug.data.sidd_blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
-from rawaug.data.sidd_scenes import is_scene
-from rawaug.data.sidd_submission import check_submission
+from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd.frames import SiddFrames
+from rawaug.data.sidd.scenes import is_scene
+from rawaug.data.sidd.submission import check_submission
 from rawaug.data.zurich import Zurich
 from rawaug.io import RawFrame, read_raw
 

@@ -1,4 +1,4 @@
-r"""Colour of frames whose files tell it as a DNG does, and a plain rendering of them.
+r"""Colour of frames whose files tell it as a DNG does, and their plain development.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
@@ -44,7 +44,7 @@ def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
     return green / red, 1.0, green / blue
 
 
-def rendered(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
+def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
     """A mosaic ``(1, H, W)`` as a picture, uint8 ``(3, H, W)``."""
     balanced = (demosaic_malvar(raw, cfa) * torch.tensor(gains).reshape(3, 1, 1)).clamp_(0, 1)
     linear = torch.einsum("ij,jhw->ihw", matrix, balanced).clamp_(0, 1)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import overload
 
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 
 
 class LazyPairs(Sequence[Pair], ABC):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
-from rawaug.io.pictures import MAX_PIXELS, read_picture
+from rawaug.io.picture_files import MAX_PIXELS, read_picture
 
 EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
 _COUNTERS = 64

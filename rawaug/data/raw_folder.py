@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rawaug.bayer import turn_back
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 
 EXTENSIONS = (

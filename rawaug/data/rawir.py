@@ -19,7 +19,7 @@ import torch
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.io import read_picture
 
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}

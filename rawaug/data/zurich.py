@@ -20,9 +20,9 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.io import read_picture
-from rawaug.io.pictures import read_plane
+from rawaug.io.picture_files import read_plane
 
 BLACK, WHITE = 63, 1020
 _BITS = 10

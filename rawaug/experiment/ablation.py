@@ -18,14 +18,14 @@ from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.evaluate import write_json
-from rawaug.experiment.reconstruction import psnr_r
+from rawaug.data.pair import Pair
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.evaluation.scores import write_json
 from rawaug.isp import conditioning
+from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import POINTWISE_STAGES
-from rawaug.isp.samples import block_averages
 from rawaug.isp.stages import as_float, place_in_frame
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
@@ -97,7 +97,7 @@ def ablate(ablation: Ablation) -> dict[str, Any]:
 def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list[float]]:
     """PSNR of x, x1 ... x5 (a stage that is left out repeats the one before) in RGB, Y and UV: 6 rows of 3."""
     srgb, raw, place, known = _comparable(pair)
-    params = conditioning.on_gains(
+    params = conditioning.with_white_balance(
         isp, isp.choose(pair.srgb[None]), pair.white_balance if white_balance else None, None
     )
     seen: dict[str, Tensor] = {}

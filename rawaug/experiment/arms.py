@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rawaug.augment import RawAugment
-from rawaug.data.pairs import Pair
-from rawaug.experiment.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
-from rawaug.experiment.evaluate import frozen_sample
-from rawaug.experiment.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
-from rawaug.experiment.stream import PictureCrops, RealCrops, Sample, Source, TrainingStream
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
-from rawaug.pairs import RawPairs
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 
 WATCHED = 16
 """Samples made from pictures on which a training without validation pairs is watched."""
@@ -51,7 +52,7 @@ def training_stream(
     """The training samples of one arm.
 
     Args:
-        pairs: the real frames, as :func:`rawaug.experiment.noisy_frames.noisy_only` leaves them if the arm is
+        pairs: the real frames, as :func:`rawaug.training.noisy_frames.noisy_only` leaves them if the arm is
             self-supervised.
         pictures: the sRGB pictures.
         isp, noise: make RAW of them.

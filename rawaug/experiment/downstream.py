@@ -14,20 +14,21 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.augment import RawAugment
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.pairs import Pair
-from rawaug.experiment.evaluate import score_denoiser
-from rawaug.experiment.recipe import DenoiserConfig, TrainConfig
-from rawaug.experiment.stream import PictureCrops, Sample, Source, TrainingStream
-from rawaug.experiment.train import train
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import score_denoiser
 from rawaug.isp.baselines import UPI, ReverseISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
-from rawaug.pairs import RawPairs
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.training.loop import train
+from rawaug.training.stream import PictureCrops, Source, TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 WATCHED = 16
 """Samples made from the pictures on which training is watched."""

@@ -1,87 +1,281 @@
-"""PSNR_r of an ISP: how well it makes the RAW of frames from their sRGB."""
+"""The reconstruction table: every method fitted on the same pairs, measured on frames left out.
+
+PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. PSNR_d is that of a
+denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
+fit's figures go into a file of their own, so that a stopped run goes on where it was.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import statistics
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from rawaug import bayer
-from rawaug.data.pairs import Pair
-from rawaug.isp import conditioning
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPParams
-from rawaug.isp.samples import block_averages
-from rawaug.isp.stages import as_float, place_in_frame
-from rawaug.metrics import PATCH, patch_psnr, psnr
-from rawaug.seeding import keyed_generator
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs, open_pictures
+from rawaug.data.pair import Pair
+from rawaug.evaluation.scores import frozen_sample, write_json
+from rawaug.evaluation.tables import mean_and_spread
+from rawaug.experiment.denoising import fingerprint
+from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.methods import (
+    FAMILIES,
+    POINTWISE,
+    ROWS,
+    cycle_psnr,
+    fit_family,
+    mosaic_only_psnr,
+    score_rows,
+)
+from rawaug.isp.fit import FitConfig
+from rawaug.metrics import worst_and_best_quarter
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.pictures import even_sided
 
-STRIP = 256
 
-
-@torch.no_grad()
-def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches: int | None = None) -> float:
-    """PSNR_r of one frame; of an unregistered pair at the resolution of block averages.
+@dataclass
+class Comparison:
+    """A table of methods.
 
     Args:
-        isp: the ISP.
-        pair: the frame.
-        white_balance: give the frame's as-shot white balance.
-        patches: score so many patches of a registered frame (:func:`windows_of`); None scores all.
+        experiment: "reconstruction".
+        name: of the folder in ``out`` that it writes.
+        data: the pairs, of one CFA; methods that train on crops need them registered.
+        noise: preset that is added to every frame once and for all; the dictionary ISP is then fitted to these noisy
+            frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
+        methods: families to fit: dictionary, dictionary-encoders and the baselines.
+        seconds: budget of methods that learn by descent, reading not counted.
+        crop, batch: of these methods' training: small ones give more steps to a short budget.
+        longer: a second budget for them, as a factor; 0 leaves it out.
+        longer_frames: left-out frames on which the longer budget is tried (first seed).
+        patches: random patches of each left-out frame that are scored; null scores all.
+        pictures: sRGB pictures for the cycle and for PSNR_d.
+        fit: of the dictionary ISP.
+        downstream: PSNR_d; null leaves it out.
+        seed: of the first run.
+        seeds: how many runs.
+        out: folder of all runs.
     """
-    given = pair.white_balance if white_balance else None
-    if pair.registered:
-        params = conditioning.on_gains(isp, isp.choose(pair.srgb[None]), given, None)
-        if patches is not None:
-            return windows_psnr(lambda patch, place: isp.reverse(patch, params, place=place).raw, pair, patches)
-        return patch_psnr(mosaic_of(isp, pair, params), pair.raw[None]).item()
-    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-    params = conditioning.on_gains(isp, isp.choose(blocks.srgb[None]), given, None)
-    made = isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0]
-    return block_psnr(made, blocks.raw, blocks.clipped)
+
+    experiment: str = "reconstruction"
+    name: str = "reconstruction"
+    data: str = "demo:train"
+    noise: str | None = None
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
+    seconds: float = 20.0
+    crop: int = 64
+    batch: int = 2
+    longer: float = 0.0
+    longer_frames: int = 2
+    patches: int | None = 8
+    pictures: str = "demo:"
+    fit: FitConfig = field(default_factory=FitConfig)
+    downstream: DownstreamConfig | None = None
+    seed: int = 0
+    seeds: int = 3
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        unknown = [method for method in self.methods if method not in FAMILIES]
+        if unknown or not self.methods:
+            raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
+        if self.seeds < 1:
+            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+        if self.patches is not None and self.patches < 1:
+            raise ValueError(f"patches is at least 1, or null for all, got {self.patches}")
+        if self.noise and any(not method.startswith("dictionary") for method in self.methods):
+            raise ValueError("noise: only the dictionary ISP is fitted to noisy frames; leave the other methods out")
 
 
-def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
-    """PSNR between block averages ``(3, h, w)``, blocks with a clipped reading ``(h, w)`` left out."""
-    error = (made.clamp(0.0, 1.0) - raw) ** 2
-    return -10.0 * error[:, ~clipped].mean().log10().item()
+def smoke_comparison(comparison: Comparison) -> Comparison:
+    """The comparison in seconds, on the demo camera."""
+    downstream = comparison.downstream and comparison.downstream.smoke()
+    tiny = replace(comparison.fit, steps=2, pixels=512, batch=128)
+    quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
+    return replace(
+        comparison,
+        name=f"{comparison.name}-smoke",
+        data="demo:validation",
+        pictures="demo:",
+        methods=quick or ["dictionary"],
+        longer=0.0,
+        patches=1,
+        seeds=1,
+        fit=tiny,
+        downstream=downstream,
+    )
 
 
-@torch.no_grad()
-def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
-    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, within [0, 1], in the pattern of the pair.
-
-    Strip by strip, to bound memory.
-    """
-    height, width = pair.raw.shape[-2:]
-    strips = []
-    for top in range(0, height, STRIP):
-        strip = as_float(pair.srgb[None, :, top : top + STRIP])
-        place = place_in_frame(strip.shape[-2], width, (top, 0), (height, width))
-        strips.append(bayer.mosaic(isp.reverse_pixels(strip, params, place), pair.cfa).clamp_(0.0, 1.0))
-    return torch.cat(strips, dim=-2)
+def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
+    """Run a comparison; the rows as they stand in ``table.json``."""
+    return _Comparison(comparison).table()
 
 
-def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
-    """Corners of ``count`` random non-overlapping patches of the frame, keyed by its name; all if None.
+class _Comparison:
+    def __init__(self, settings: Comparison) -> None:
+        self.settings, self.folder = settings, Path(settings.out) / settings.name
+        self.pairs = list(open_pairs(settings.data, split="train"))
+        if len(self.pairs) < 2:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leaving one out needs two or more")
+        exact = any(method not in POINTWISE for method in settings.methods)
+        for pair in self.pairs:
+            if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
+                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has another CFA"
+                raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
+        if settings.noise:
+            noise = noise_model(settings.noise)
+            self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
+        self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
+        names = [pair.name for pair in self.pairs]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"data: several frames are named {twice[0]}; give each file a name of its own")
+        if settings.longer and not 1 <= settings.longer_frames <= len(names):
+            raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
+        side = settings.downstream.train.crop if settings.downstream else 2
+        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
 
-    As in :func:`rawaug.metrics.patch_psnr`, a side shorter than a patch is the patch's side.
-    """
-    rows, columns = (range(0, max(side - PATCH, 0) + 1, PATCH) for side in pair.raw.shape[-2:])
-    every = [(top, left) for top in rows for left in columns]
-    if count is None or count >= len(every):
-        return every
-    order = torch.randperm(len(every), generator=keyed_generator("windows", pair.name)).tolist()
-    return [every[k] for k in sorted(order[:count])]
+    def table(self) -> dict[str, dict[str, Any]]:
+        """All rows; printed, and written with every single figure."""
+        rows: dict[str, dict[str, Any]] = {}
+        for family, scale in self._families():
+            rows |= self._rows(family, scale)
+        ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
+        write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
+        _print(rows, self.settings, ceiling)
+        return rows
+
+    def _families(self) -> Iterator[tuple[str, float]]:
+        for family in self.settings.methods:
+            yield family, 1.0
+            if self.settings.longer and family in ("unet", "cycleisp", "invisp", "invgrey"):
+                yield family, self.settings.longer
+
+    def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
+        settings, longer = self.settings, scale != 1.0
+        seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
+        frames = range(settings.longer_frames if longer else len(self.pairs))
+        bar = tqdm([(s, k) for s in seeds for k in frames], desc=f"{family} x{scale:g}", unit="fit", leave=False)
+        folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
+        whole = {} if longer else self._whole(family)
+        rows = {}
+        for row in folds[0][2]["rows"]:
+            by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+            quarters = [worst_and_best_quarter(values) for values in by_seed]
+            name = family if row == "blind" else f"{family}, {ROWS[row]}"
+            rows[f"{name}, {scale:g} times as long" if longer else name] = {
+                "psnr_r": [statistics.fmean(values) for values in by_seed],
+                "frames": {self.pairs[k].name: [values[k] for values in by_seed] for k in frames},
+                "worst25": [worst for worst, _ in quarters],
+                "best25": [best for _, best in quarters],
+                "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
+                "mpix_s": _median([fold["mpix_s"] for *_, fold in folds]),
+                "parameters": folds[0][2]["parameters"],
+                **(whole if row == "blind" else {}),
+            }
+        return rows
+
+    def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
+        """Fitted without one frame, scored on it."""
+        settings, left_out = self.settings, self.pairs[frame]
+        seconds = settings.seconds * scale
+        budget = (seconds, settings.crop, settings.batch)
+        key = fingerprint(family, budget, seed, settings.patches, *self._frames())
+        path = self._path(f"{family}-x{scale:g}-without-{left_out.name}-seed{seed}")
+        if (known := _read(path, key)) is not None:
+            return known
+        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], self.fit, budget, seed)
+        result = score_rows(fitted, left_out, settings.patches)
+        result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
+        write_json(result, path)
+        return result
+
+    def _whole(self, family: str) -> dict[str, Any]:
+        """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
+        settings = self.settings
+        downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
+        seeds = range(settings.seed, settings.seed + settings.seeds)
+        budget = (settings.seconds, settings.crop, settings.batch)
+        parts = (
+            asdict(self.fit),
+            settings.noise,
+            downstream and asdict(downstream),
+            settings.data,
+            [p.name for p in self.pairs],
+        )
+        key = fingerprint(family, budget, list(seeds), settings.pictures, *parts)
+        path = self._path(f"{family}-all-frames")
+        if (known := _read(path, key)) is not None:
+            return known
+        fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
+        result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
+        if downstream:
+            place = self.folder / f"{family}-denoisers-{key}"  # a checkpoint of other settings is not gone on from
+            result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
+        write_json(result, path)
+        return result
+
+    def _frames(self) -> tuple[Any, ...]:
+        """What a fit depends on besides its family, budget and seed."""
+        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
+
+    def _path(self, stem: str) -> Path:
+        return self.folder / f"{stem}.json"
 
 
-@torch.no_grad()
-def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
-    """Mean PSNR over windows of what ``make`` makes of an sRGB patch ``(1, 3, h, w)`` and its place in the frame."""
-    values, (height, width) = [], pair.raw.shape[-2:]
-    for top, left in windows_of(pair, count):
-        window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
-        place = place_in_frame(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
-        values.append(psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]).item())
-    return sum(values) / len(values)
+def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
+    """The frame with noise keyed by its name, as a noisy capture."""
+    cfa = CFA(pair.cfa)
+    noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
+    return replace(pair, noisy=noisy)
+
+
+def _each(pictures: Any) -> Iterator[Tensor]:
+    for index in range(len(pictures)):
+        yield pictures[index]
+
+
+def _read(path: Path, key: str) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    known: dict[str, Any] = json.loads(path.read_text())
+    return known if known.get("key") == key else None
+
+
+def _median(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    def figures(name: str) -> str:
+        value = row.get(name)
+        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
+
+    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "cycle_without_mosaic", "psnr_d")]
+    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
+
+
+def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    frames = len(next(iter(rows.values()))["frames"])
+    table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
+    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
+    for k, head in enumerate(("method", *heads)):
+        table.add_column(head, justify="right" if k else "left")
+    for name, row in rows.items():
+        table.add_row(name, *_cells(row))
+    console = Console()
+    (console if console.is_terminal else Console(width=140)).print(table)
+    threads = torch.get_num_threads()
+    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

@@ -7,16 +7,15 @@ weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) agains
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.isp.params import ISPParams
-
-if TYPE_CHECKING:
-    from rawaug.isp.model import DictionaryISP
+from rawaug.bayer import CFA
+from rawaug.isp.dictionary import ColourDictionary
+from rawaug.isp.setting import ISPParams
 
 CLIPPED = 0.98
 SHADOW = 0.01
@@ -24,8 +23,19 @@ SHADOW = 0.01
 ROUNDS = 4
 
 
-def on_gains(
-    isp: DictionaryISP,
+class Camera(Protocol):
+    """What is used of an ISP: its pattern, its colour atoms and its reverse pass."""
+
+    colour: ColourDictionary
+
+    @property
+    def cfa(self) -> CFA: ...
+
+    def reverse_pixels(self, x: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor: ...
+
+
+def with_white_balance(
+    isp: Camera,
     params: ISPParams,
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
@@ -64,14 +74,14 @@ def _require_factor(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} is positive, got {value.flatten().tolist()}")
 
 
-def _in_light(isp: DictionaryISP, params: ISPParams, balance: Tensor) -> ISPParams:
+def _in_light(isp: Camera, params: ISPParams, balance: Tensor) -> ISPParams:
     weights = isp.colour.weights_for(balance)
     return params._replace(
         colour_weights=weights, matrix=isp.colour.combine(weights), gains=isp.colour.gains_for(balance, weights)
     )
 
 
-def on_samples(isp: DictionaryISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
+def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
     """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
 
     Readings at or above 0.98 are left out (clipped); a channel without any reading keeps its gain.
@@ -110,9 +120,7 @@ def _require_places(raw_samples: Tensor, x: Tensor) -> None:
         raise ValueError(f"raw_samples: a row or column lies outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
-def _solve(
-    isp: DictionaryISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
-) -> ISPParams:
+def _solve(isp: Camera, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
     unit = params._replace(gains=torch.ones_like(params.gains))
     x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
     y = value[:, None].expand_as(x5)

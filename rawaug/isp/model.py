@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import conditioning, stages
+from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
 from rawaug.isp.dictionary import ColourDictionary, GainDictionary
 from rawaug.isp.encoder import Encoder, thumbnail
-from rawaug.isp.params import POINTWISE_STAGES, ISPConfig, ISPParams, Pass
+from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.seeding import initialised_from
 
 WEIGHTS_DIR = Path(__file__).parents[1] / "weights"
@@ -123,7 +124,7 @@ class DictionaryISP(nn.Module):
         raw_samples: Tensor | None = None,
         place: Tensor | None = None,
         intermediates: bool = False,
-    ) -> Pass:
+    ) -> ISPResult:
         """sRGB to RAW.
 
         Args:
@@ -133,13 +134,13 @@ class DictionaryISP(nn.Module):
                 choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
-                (:func:`rawaug.isp.conditioning.on_samples`).
+                (:func:`rawaug.isp.conditioning.with_raw_samples`).
             place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
                 (:func:`rawaug.isp.stages.place_in_frame`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
 
         Returns:
-            A :class:`Pass` whose ``raw`` is the mosaic ``(B, 1, H, W)`` with the ISP's CFA, white at 1.
+            A :class:`ISPResult` whose ``raw`` is the mosaic ``(B, 1, H, W)`` with the ISP's CFA, white at 1.
 
         Raises:
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, the picture or a gain is out of range, or
@@ -148,14 +149,14 @@ class DictionaryISP(nn.Module):
         if srgb.ndim != 4 or srgb.shape[1] != 3:
             raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
         x = stages.display_referred(srgb)
-        params = conditioning.on_gains(self, params or self.choose(x), white_balance, digital_gain)
+        params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
         if len(params.gains) != len(x):
             raise ValueError(f"the parameters are those of {len(params.gains)} pictures, the batch has {len(x)}")
         if raw_samples is not None:
-            params = conditioning.on_samples(self, x, params, raw_samples, self.place(x, place))
+            params = conditioning.with_raw_samples(self, x, params, raw_samples, self.place(x, place))
         seen: dict[str, Tensor] = {}
         x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
-        return Pass(bayer.mosaic(x5, self.cfa), params, seen)
+        return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
 
     def reverse_pixels(
         self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
@@ -186,16 +187,16 @@ class DictionaryISP(nn.Module):
         white_balance: Tensor | tuple[float, ...] | None = None,
         place: Tensor | None = None,
         intermediates: bool = False,
-    ) -> Pass:
+    ) -> ISPResult:
         """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
         x5 = bayer.demosaic(raw, self.cfa)
         if params is None:
             x4 = self._correct_shading(x5, place) if "shading" in self.config.stages else x5
             params = self.choose_forward(x4)
-        params = conditioning.on_gains(self, params, white_balance, None)
+        params = conditioning.with_white_balance(self, params, white_balance, None)
         seen: dict[str, Tensor] = {"x5": x5}
         srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
-        return Pass(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
+        return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
 
     def forward_pixels(
         self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None

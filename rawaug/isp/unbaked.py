@@ -1,6 +1,6 @@
 """The reverse pass of an ISP whose stages stand in an order of their own, which no table can hold.
 
-Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.baked.BakedISP`; dozens of times slower.
+Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.fast.BakedISP`; dozens of times slower.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from rawaug import bayer
-from rawaug.isp.baked import BakedISP, bakeable, require_batch
+from rawaug.isp.fast import BakedISP, bakeable, require_batch
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPParams
+from rawaug.isp.setting import ISPParams
 from rawaug.isp.stages import as_float
-from rawaug.isp.unprocess import frame_of
+from rawaug.kernels.raw_torch import frame_of
 
 
 class UnbakedISP(nn.Module):
@@ -43,7 +43,7 @@ def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
     """The fastest form that the ISP's stages allow.
 
     Example:
-        >>> from rawaug.isp.params import ISPConfig
+        >>> from rawaug.isp.config import ISPConfig
         >>> type(reverse_pass(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))).__name__
         'UnbakedISP'
     """

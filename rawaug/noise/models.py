@@ -25,9 +25,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from rawaug import compiled, kernels
+from rawaug.kernels import compiled, fallback
+from rawaug.kernels.philox import normals
 from rawaug.noise.levels import NoiseLevels
-from rawaug.noise.philox import normals
 from rawaug.noise.poisson import poisson
 from rawaug.seeding import derived_seed, keyed_generator
 
@@ -178,17 +178,17 @@ class ShotReadNoise(ShotReadModel):
         """The noisy RAW and, if asked for, its variance map."""
         if clean.dtype == torch.float32:
             levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-            if kernels.usable(clean):  # imported late, for Triton may be missing
-                return kernels.kernel_or(
-                    lambda: import_module("rawaug.noise.gpu").shot_read(
+            if fallback.usable(clean):  # imported late, for Triton may be missing
+                return fallback.kernel_or(
+                    lambda: import_module("rawaug.kernels.noise_triton").shot_read(
                         clean, levels, self._keys(params), white, with_variance
                     ),
                     lambda: self._in_pytorch(clean, params, white, with_variance),
                 )
             if clean.device.type == "cpu" and compiled.available():
-                from rawaug.noise import fused
+                from rawaug.kernels import noise_numba
 
-                return fused.shot_read(clean, levels, self._keys(params), white, with_variance)
+                return noise_numba.shot_read(clean, levels, self._keys(params), white, with_variance)
         return self._in_pytorch(clean, params, white, with_variance)
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:

@@ -18,10 +18,10 @@ from types import MappingProxyType
 
 from rawaug.isp.baselines.base import ReverseISP
 from rawaug.isp.baselines.cycleisp import CycleISP
-from rawaug.isp.baselines.fit import fit_baseline
 from rawaug.isp.baselines.invgrey import InvertibleGrey
 from rawaug.isp.baselines.invisp import InvISP
-from rawaug.isp.baselines.unet import UNetISP
+from rawaug.isp.baselines.plain_unet import UNetISP
+from rawaug.isp.baselines.training import fit_baseline
 from rawaug.isp.baselines.upi import UPI
 from rawaug.isp.baselines.upi_tuned import TunedUPI
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.samples import FramePair
+from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 
 
@@ -57,10 +57,9 @@ class ReverseISP(nn.Module, ABC):
 
     def render(self, raw: Tensor) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; overridden where the method has it."""
-        from rawaug.isp.baselines import BASELINES  # late, for it imports this module
-
-        others = ", ".join(name for name, method in BASELINES.items() if method.bidirectional)
-        raise ValueError(f"{self.name} goes from sRGB to RAW only; those that also render RAW are {others}")
+        raise ValueError(
+            f"{self.name} goes from sRGB to RAW only; rawaug.isp.baselines lists the methods that render RAW"
+        )
 
     def reverse(self, srgb: Tensor) -> Tensor:
         """sRGB to RAW.

@@ -21,7 +21,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
-from rawaug.isp.samples import FramePair
+from rawaug.isp.fit.samples import FramePair
 from rawaug.seeding import derived_seed, initialised_from
 
 SCALE_CLAMP = 0.8

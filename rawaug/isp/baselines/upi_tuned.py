@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.upi import GAMMA, SmoothstepISP, UPIParams, inverse_smoothstep
-from rawaug.isp.samples import FramePair, PixelSamples, sample_pixels
+from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
 
 Criterion = Literal["log", "mse", "mean"]
 

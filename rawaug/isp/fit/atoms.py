@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.dictionary import log_light
-from rawaug.isp.fit.colour import FrameColour
-from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.colour_fit import FrameColour
+from rawaug.isp.fit.fit_config import FitConfig
+from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.samples import PixelSamples, Shot
 from rawaug.seeding import derived_seed
 
 LOG_MSE_EPS = 1e-5

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.fit.atoms import LOG_MSE_EPS, set_priors
-from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.losses import apart, decibels, mean_square
+from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.samples import PixelSamples, Shot
 
 FEWEST_FRAMES = 12
 FOLDS = 4

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.losses import apart, cycle_error, decibels, mean_square
+from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.samples import PixelSamples, Shot
 
 MANY_FRAMES = 50
 STEPS = 1000

@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPParams
-from rawaug.isp.samples import PixelSamples, Shot
+from rawaug.isp.setting import ISPParams
 
 INTERMEDIATE_WEIGHT = 0.1
 

@@ -14,7 +14,7 @@ from scipy.io import savemat
 
 from rawaug.cli import main
 from rawaug.data import PictureFolder, check
-from rawaug.data.sidd_scenes import HELD_BACK
+from rawaug.data.sidd.scenes import HELD_BACK
 from rawaug.io import write_picture
 
 Writer = Callable[[Path, dict[str, Any]], Path]

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
 
 LIGHTS = ((2.0, 1.0, 1.5), (1.2, 1.0, 2.6))
 """The camera's two atoms of gains, digital gain 1: daylight and lamps."""

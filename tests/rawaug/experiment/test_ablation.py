@@ -14,12 +14,12 @@ import torch
 from skimage.color import rgb2yuv
 
 from rawaug import bayer
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.experiment import ablation
 from rawaug.experiment.ablation import LEFT_OUT, SPACES, TITLES, Ablation, ablate, smoke_ablation, stage_psnr
+from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import POINTWISE_STAGES
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)
@@ -85,7 +85,7 @@ def frames(frame_of: FrameOf, monkeypatch: pytest.MonkeyPatch) -> list[Pair]:
     """Three shots, two of them in one light, which the ablation opens."""
     found = [frame_of("a"), frame_of("b", LAMPS), frame_of("c")]
     monkeypatch.setattr(ablation, "open_pairs", lambda spec, split: found)
-    monkeypatch.setattr("rawaug.isp.fit.fit.CURVE_STEPS", 8)
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 8)
     return found
 
 

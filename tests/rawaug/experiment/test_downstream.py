@@ -14,14 +14,14 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
+from rawaug.evaluation.scores import score_denoiser
 from rawaug.experiment import downstream
 from rawaug.experiment.downstream import DownstreamConfig, MadeCrops, psnr_d
-from rawaug.experiment.evaluate import score_denoiser
 from rawaug.isp.baselines import UPI
-from rawaug.isp.baselines.unet import UNetISP
+from rawaug.isp.baselines.plain_unet import UNetISP
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
 from rawaug.noise import NoiseModel, noise_model
 
 SILENT = noise_model((0.0, 0.0))

@@ -1,23 +1,285 @@
-"""PSNR_r of an ISP."""
+"""The table: what its figures are the means of, what a fit may see, and what a stopped run finds again."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 import torch
 
-from rawaug.data import demo_pairs
-from rawaug.experiment.reconstruction import mosaic_of, psnr_r
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import ISPConfig
+from rawaug.bayer import CFA
+from rawaug.data.pair import Pair
+from rawaug.experiment import methods, reconstruction
+from rawaug.experiment.downstream import DownstreamConfig
+from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
+from rawaug.isp.baselines import BASELINES
+from rawaug.isp.baselines.base import CropTrainedISP
+from rawaug.isp.fit import FitConfig
+
+FrameOf = Callable[..., Pair]
+TINY = FitConfig(steps=1, pixels=256, batch=64)
 
 
-def test_strips_give_the_whole_mosaic() -> None:
-    pair = demo_pairs("validation", count=1)[0]
-    isp = DictionaryISP(ISPConfig(cfa="GRBG"))
-    isp.shading.set(torch.zeros(2), torch.eye(2))
-    assert pair.raw.shape[-2] >= 256
-    tall = type(pair)(**{**vars(pair), **{k: torch.cat([getattr(pair, k)] * 2, 1) for k in ("srgb", "raw", "noisy")}})
-    with torch.no_grad():
-        whole = isp.reverse(tall.srgb[None])
-        torch.testing.assert_close(mosaic_of(isp, tall, whole.params), whole.raw.clamp(0.0, 1.0))
-    assert psnr_r(isp, tall) > 5.0
-    assert abs(psnr_r(isp, tall, patches=10**6) - psnr_r(isp, tall)) < 1e-3
+class Laboratory:
+    """Stands in for fits and scores: frame k of n under seed s scores ``10 (k + 1) + s`` dB, and all is noted."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.frames = 8
+        self.folds: list[tuple[str, str, tuple[float, int, int], int]] = []
+        self.wholes: list[tuple[str, int]] = []
+        self.denoisers: list[Path] = []
+        self.stop_after = 10**6
+        self.cameras = self.min_side = 0
+        for name in ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d"):
+            monkeypatch.setattr(reconstruction, name, getattr(self, name))
+
+    def open_pairs(self, spec: str, split: str) -> list[Pair]:
+        srgb, raw = torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2)
+        return [Pair(f"f{k}", srgb, raw, CFA.RGGB, (1.0, 1.0, 1.0), torch.eye(3)) for k in range(self.frames)]
+
+    def open_pictures(self, spec: str, min_side: int) -> list[torch.Tensor]:
+        self.min_side = min_side
+        return [torch.full((3, 8, 8), 100, dtype=torch.uint8)]
+
+    def fit_family(
+        self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
+    ) -> Any:
+        names = [pair.name for pair in pairs]
+        left_out = [f"f{k}" for k in range(self.frames) if f"f{k}" not in names]
+        if not left_out:
+            self.wholes.append((family, seed))
+        else:
+            if len(self.folds) == self.stop_after:
+                raise KeyboardInterrupt
+            self.folds.append((family, left_out[0], budget, seed))
+        self.cameras += 1
+        model = SimpleNamespace(info={"frames": names}, cfa=CFA.RGGB, number=self.cameras)
+        return SimpleNamespace(model=model, seconds=budget[0] + len(self.folds) % 2, parameters=1234, seed=seed)
+
+    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
+        return {"rows": {"blind": value, "as-shot": value + 1}, "mpix_s": 2.0 ** int(pair.name[1:])}
+
+    def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
+        return {"cycle": 33.0}
+
+    def psnr_d(self, model: Any, pictures: Any, config: DownstreamConfig, place: Path, seed: int) -> float:
+        self.denoisers.append(place / f"seed{seed}")
+        return 40.0 + seed
+
+
+@pytest.fixture
+def laboratory(monkeypatch: pytest.MonkeyPatch) -> Laboratory:
+    return Laboratory(monkeypatch)
+
+
+def settings(folder: Path, **changes: Any) -> Comparison:
+    return Comparison(**{"methods": ["dictionary"], "data": "known", "out": str(folder), "seeds": 2, **changes})
+
+
+def test_every_figure_is_the_mean_that_its_name_says(laboratory: Laboratory, tmp_path: Path) -> None:
+    rows = compare(settings(tmp_path))
+    assert list(rows) == ["dictionary", "dictionary, as-shot gains"]
+    row = rows["dictionary"]
+    assert row["psnr_r"] == [45.0, 46.0]  # frames 10 ... 80 dB, one more under the second seed
+    assert row["worst25"] == [15.0, 16.0] and row["best25"] == [75.0, 76.0]
+    assert row["frames"] == {f"f{k}": [10.0 * (k + 1), 10.0 * (k + 1) + 1] for k in range(8)}
+    assert rows["dictionary, as-shot gains"]["worst25"] == [16.0, 17.0]
+    assert row["seconds"] == 20.5 and row["mpix_s"] == 12.0 and row["parameters"] == 1234
+    assert row["cycle"] == 33.0 and "cycle" not in rows["dictionary, as-shot gains"]
+    assert [frame for _, frame, _, seed in laboratory.folds if seed == 0] == [f"f{k}" for k in range(8)]
+    assert laboratory.wholes == [("dictionary", 0)] and laboratory.denoisers == [] and laboratory.min_side == 2
+
+
+def test_table_and_file_say_the_same(
+    laboratory: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = compare(settings(tmp_path, downstream=DownstreamConfig(methods=["dictionary"])))
+    stored = json.loads((tmp_path / "reconstruction" / "table.json").read_text())
+    assert stored["rows"] == rows and stored["settings"]["data"] == "known"
+    assert rows["dictionary"]["psnr_d"] == [40.0, 41.0]
+    assert laboratory.min_side == DownstreamConfig().train.crop  # no picture is too small for a crop
+    said = capsys.readouterr().out
+    for figure in ("45.50 ± 0.71", "15.50 ± 0.71", "75.50 ± 0.71", "33.00", "40.50 ± 0.71", "one of 8 frames left out"):
+        assert figure in said
+    assert f"{stored['mosaic_only_psnr']:.2f} dB (ceiling" in said
+
+
+def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_path: Path) -> None:
+    rows = compare(settings(tmp_path, methods=list(methods.FAMILIES), seconds=3.0, longer=10.0, longer_frames=3))
+    networks = {name for name, method in BASELINES.items() if issubclass(method, CropTrainedISP)}
+    longer = {name.split(",")[0] for name in rows if "times as long" in name}
+    assert longer == networks == {"unet", "cycleisp", "invisp", "invgrey"}
+    row = rows["unet, 10 times as long"]
+    assert row["psnr_r"] == [20.0] and list(row["frames"]) == ["f0", "f1", "f2"]  # the first seed alone
+    assert "cycle" not in row and row["seconds"] == pytest.approx(30.0, abs=1.0)
+    asked = {budget for family, _, budget, _ in laboratory.folds if family == "unet"}
+    assert asked == {(3.0, 64, 2), (30.0, 64, 2)}
+    with pytest.raises(ValueError, match="longer_frames is 9; known has 8 frames"):
+        compare(settings(tmp_path, longer=10.0, longer_frames=9))
+
+
+def test_a_stopped_run_goes_on_from_its_files(laboratory: Laboratory, tmp_path: Path) -> None:
+    laboratory.stop_after = 5
+    with pytest.raises(KeyboardInterrupt):
+        compare(settings(tmp_path))
+    done = tmp_path / "reconstruction" / "dictionary-x1-without-f2-seed0.json"
+    figures = json.loads(done.read_text())
+    assert figures["frames"] == [f"f{k}" for k in range(8) if k != 2]
+    figures["rows"]["blind"] = 99.0
+    done.write_text(json.dumps(figures))
+    laboratory.stop_after = 10**6
+    rows = compare(settings(tmp_path))
+    assert len(laboratory.folds) == len(set(laboratory.folds)) == 16  # none fitted twice
+    assert rows["dictionary"]["frames"]["f2"] == [99.0, 31.0]  # what the file says
+    assert compare(settings(tmp_path)) == rows and len(laboratory.folds) == 16
+    assert laboratory.wholes == [("dictionary", 0)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "folds", "wholes"),
+    [
+        ({"seconds": 9.0}, 16, 1),
+        ({"crop": 32}, 16, 1),
+        ({"batch": 1}, 16, 1),
+        ({"patches": None}, 16, 0),
+        ({"data": "other"}, 16, 1),
+        ({"fit": FitConfig(steps=7)}, 16, 1),
+        ({"seed": 1}, 8, 1),  # the second seed of the first run is there
+        ({"seeds": 3}, 8, 1),
+        ({"pictures": "other"}, 0, 1),
+        ({"downstream": DownstreamConfig(methods=["dictionary"], noise="cycleisp_dnd")}, 0, 1),
+        ({"methods": ["upi", "dictionary"]}, 16, 1),
+        ({"name": "elsewhere"}, 16, 1),
+    ],
+)
+def test_files_of_other_settings_are_not_used(
+    changes: dict[str, Any], folds: int, wholes: int, laboratory: Laboratory, tmp_path: Path
+) -> None:
+    first = settings(tmp_path, downstream=DownstreamConfig(methods=["dictionary"]))
+    compare(first)
+    before = len(laboratory.folds), len(laboratory.wholes), set(laboratory.denoisers)
+    compare(replace(first, **changes))
+    assert (len(laboratory.folds) - before[0], len(laboratory.wholes) - before[1]) == (folds, wholes)
+    if wholes and "methods" not in changes:  # another camera's denoiser is not trained on from this one's checkpoint
+        assert not before[2] & set(laboratory.denoisers[len(before[2]) :])
+
+
+def test_frames_that_cannot_make_a_table_are_refused(
+    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laboratory.frames = 1
+    with pytest.raises(ValueError, match="data: known has 1 frame; leaving one out needs two"):
+        compare(settings(tmp_path))
+    laboratory.frames = 3
+    pairs = laboratory.open_pairs("", "")
+    for odd, told in (
+        (replace(pairs[1], registered=False), "f1 is not registered pixel by pixel; unet cannot share"),
+        (replace(pairs[1], cfa=CFA.BGGR), "f1 has another CFA"),
+        (replace(pairs[1], name="f0"), "several frames are named f0"),
+    ):
+        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
+        with pytest.raises(ValueError, match=told):
+            compare(settings(tmp_path, methods=["unet"]))
+    assert laboratory.folds == []
+
+
+def test_blocks_of_unregistered_frames_make_a_table_of_pointwise_methods(
+    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laboratory.frames = 3
+    pairs = [replace(pair, registered=False) for pair in laboratory.open_pairs("", "")]
+    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: pairs)
+    monkeypatch.setattr(
+        reconstruction, "score_rows", lambda fitted, pair, patches: {"rows": {"blind": 40.0}, "mpix_s": None}
+    )
+    rows = compare(settings(tmp_path, methods=["dictionary"]))
+    assert rows["dictionary"]["psnr_r"][0] == 40.0 and rows["dictionary"]["mpix_s"] is None
+
+
+def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
+    frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laboratory = Laboratory(monkeypatch)
+    laboratory.frames = 2
+    clean = [frame_of(f"f{k}") for k in range(2)]
+    seen: list[tuple[Pair, bool]] = []
+    scored: list[Pair] = []
+
+    def fit(family: str, pairs: Sequence[Pair], config: FitConfig, budget: Any, seed: int) -> Any:
+        seen.extend((pair, config.noisy) for pair in pairs)
+        return laboratory.fit_family(family, pairs, config, budget, seed)
+
+    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        scored.append(pair)
+        return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
+
+    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: clean)
+    monkeypatch.setattr(reconstruction, "fit_family", fit)
+    monkeypatch.setattr(reconstruction, "score_rows", score)
+    compare(settings(tmp_path, methods=["dictionary"], noise="cycleisp_sidd"))
+    assert all(noisy for _, noisy in seen)
+    for pair, _ in seen:
+        assert pair.noisy is not None and 1e-4 < (pair.noisy - pair.raw).std() < 0.1
+    assert all(torch.equal(pair.raw, clean[int(pair.name[1])].raw) for pair in scored)
+    with pytest.raises(ValueError, match="only the dictionary ISP is fitted to noisy frames"):
+        Comparison(noise="cycleisp_sidd")
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    for wrong, told in (
+        ({"methods": ["unett"]}, r"methods: \['unett'\]; choose from dictionary, .*invgrey"),
+        ({"methods": []}, "methods: none; choose from"),
+        ({"seeds": 0}, "seeds is at least 1, got 0"),
+        ({"patches": 0}, "patches is at least 1, or null for all, got 0"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Comparison(**wrong)
+
+
+def test_the_smoke_form_keeps_what_is_quick() -> None:
+    whole = Comparison(name="a", methods=list(methods.FAMILIES), longer=10.0, downstream=DownstreamConfig())
+    quick = smoke_comparison(whole)
+    assert quick.methods == ["dictionary", "upi", "upi-tuned"] and quick.name == "a-smoke" and quick.longer == 0
+    assert quick.downstream is not None and quick.downstream.train.steps == 2 and quick.downstream.methods
+    assert smoke_comparison(Comparison()).downstream is None
+    assert smoke_comparison(Comparison(methods=["unet"])).methods == ["dictionary"]
+
+
+def test_a_fit_never_sees_the_frame_that_is_left_out(
+    frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 2)
+    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(reconstruction, "open_pictures", lambda spec, min_side: [])
+    monkeypatch.setattr(reconstruction, "mosaic_only_psnr", lambda pictures, cfa: 0.0)
+    monkeypatch.setattr(reconstruction._Comparison, "_whole", lambda self, family: {})
+    frames = [frame_of(name) for name in "abc"]
+    noise = torch.rand(1, 256, 256, generator=torch.Generator().manual_seed(0))
+    poisoned = replace(frames[0], srgb=(255 * noise).byte().expand(3, -1, -1), raw=noise, white_balance=(9.0, 1.0, 9.0))
+
+    def cameras(first: Pair, family: str) -> dict[str, dict[str, torch.Tensor]]:
+        """By the frame that was left out, all tensors of the camera that was fitted."""
+        found = {}
+
+        def fit(name: str, pairs: Sequence[Pair], *rest: Any) -> Any:
+            fitted = methods.fit_family(name, pairs, *rest)
+            (left_out,) = {"a", "b", "c"} - {pair.name for pair in pairs}
+            found[left_out] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
+            return fitted
+
+        monkeypatch.setattr(reconstruction, "fit_family", fit)
+        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: [first, *frames[1:]])
+        folder = tmp_path / str(first is poisoned)
+        compare(settings(folder, methods=[family], seeds=1, patches=1, fit=TINY))
+        return found
+
+    for family in ("dictionary", "upi-tuned"):
+        clean, other = cameras(frames[0], family), cameras(poisoned, family)
+        same = {k: all(torch.equal(clean[k][key], other[k][key]) for key in clean[k]) for k in clean}
+        assert same == {"a": True, "b": False, "c": False}

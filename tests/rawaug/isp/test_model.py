@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
+from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.params import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stages import place_in_frame
 from rawaug.metrics import psnr
 

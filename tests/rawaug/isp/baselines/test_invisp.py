@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
+from rawaug.data.pair import Pair
 from rawaug.isp.baselines.base import Crops
 from rawaug.isp.baselines.invisp import InvISP
 

@@ -8,10 +8,9 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from rawaug.data.pairs import Pair
-from rawaug.isp.conditioning import on_gains
-from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit import fit as stages_of_a_fit
+from rawaug.data.pair import Pair
+from rawaug.isp.conditioning import with_white_balance
+from rawaug.isp.fit import FitConfig, fit_isp, pipeline
 from rawaug.isp.fit.atoms import best_constants, reach_atoms
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
@@ -30,7 +29,7 @@ def oracle_gains(isp: DictionaryISP, gains: tuple[float, float, float]) -> torch
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 20)  # the curve of these frames is where the fit starts
+    monkeypatch.setattr(pipeline, "CURVE_STEPS", 20)  # the curve of these frames is where the fit starts
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +71,7 @@ def test_two_cameras_in_one_fit_are_told_apart_by_their_light(
         known = isp.reverse(unseen.srgb[None], white_balance=light)
         isp_of_all = isp.colour.spread.clone()
         isp.colour.spread.fill_(torch.inf)
-        alike = isp.reverse(unseen.srgb[None], on_gains(isp, isp.choose(unseen.srgb[None]), light, None))
+        alike = isp.reverse(unseen.srgb[None], with_white_balance(isp, isp.choose(unseen.srgb[None]), light, None))
         isp.colour.spread.copy_(isp_of_all)
         scores = [psnr(result.raw, unseen.raw[None]).item() for result in (known, alike)]
         assert scores[0] > 48.0 and scores[0] > scores[1] + 10.0

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp
-from rawaug.isp.fit import fit as stages_of_a_fit
+from rawaug.data.pair import Pair
+from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp, pipeline
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
@@ -22,7 +21,7 @@ TINY = FitConfig(steps=12, pixels=512, batch=128)
 def save_and_report_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(descent, "SAVE_SECONDS", -1.0)
     monkeypatch.setattr(descent, "REPORT_STEPS", 5)
-    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 12)
+    monkeypatch.setattr(pipeline, "CURVE_STEPS", 12)
     monkeypatch.setattr(atoms, "PRIOR_STEPS", 20)
 
 

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp
-from rawaug.isp.fit import fit as stages_of_a_fit
+from rawaug.data.pair import Pair
+from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp, pipeline
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
@@ -17,7 +16,7 @@ SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 20)
+    monkeypatch.setattr(pipeline, "CURVE_STEPS", 20)
     monkeypatch.setattr(encoders, "STEPS", 40)
     monkeypatch.setattr(encoders, "FOLDS", 2)
     monkeypatch.setattr(encoders, "FRAMES_A_STEP", 2)

@@ -8,11 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pairs import Pair
-from rawaug.isp.fit import FitConfig, descent, fit_isp, joint
-from rawaug.isp.fit import fit as stages_of_a_fit
+from rawaug.data.pair import Pair
+from rawaug.isp.fit import FitConfig, descent, fit_isp, joint, pipeline
 from rawaug.isp.fit.losses import decibels
-from rawaug.isp.samples import sample_pixels
+from rawaug.isp.fit.samples import sample_pixels
 
 CONFIG = FitConfig(steps=5, pixels=512, batch=128, shading="off", joint_steps=0)
 
@@ -25,7 +24,7 @@ def frames(exact_pair: Callable[..., Pair]) -> list[Pair]:
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(descent, "REPORT_STEPS", 5)
-    monkeypatch.setattr(stages_of_a_fit, "CURVE_STEPS", 20)
+    monkeypatch.setattr(pipeline, "CURVE_STEPS", 20)
 
 
 def test_the_watched_frame_gains(frames: list[Pair], monkeypatch: pytest.MonkeyPatch) -> None:

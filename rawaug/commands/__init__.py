@@ -1,0 +1,1 @@
+"""What the subcommands of ``rawaug`` do, one file a command."""

@@ -1,0 +1,244 @@
+r"""``rawaug denoise``: RAW files in, denoised DNGs out.
+
+    x = f(y, shot_var max(y, 0) + read_var),    d = round(clip(x, 0 <= d, x <= 1) (white - black) + black)
+
+on the mosaic as the sensor gave it, before any gain map, in tiles. The result has the source's levels, colour, lens
+corrections, orientation and EXIF and differs from it by noise alone; its NoiseProfile tag is gone with the noise, so
+that a RAW developer does not smooth once more. A mosaic of another pattern than the network's is continued by a
+mirrored line on the sides where the patterns differ, and cropped after.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from torch import Tensor
+from torch.nn import functional as F
+from tqdm.auto import tqdm
+
+import denoisers
+from denoisers.network import Denoiser
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.commands.pair_files import sha256
+from rawaug.commands.synth import require_same_settings
+from rawaug.data.raw_folder import EXTENSIONS
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import denoise
+from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.seeding import keyed_generator
+
+Noise = str | Sequence[float]
+"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name (taken at the file's ISO), or two variances."""
+
+_NO_NOISE = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Denoised:
+    """What was done to a file.
+
+    Attributes:
+        source, out: the files.
+        shot_var, read_var: the noise that was reckoned with.
+        told_by: ``"profile"``, ``"estimate"``, or what was asked for.
+        below_zero: share of sites whose result was below the digital number 0, and became 0.
+        seconds: reading and writing included.
+    """
+
+    source: Path
+    out: Path
+    shot_var: float
+    read_var: float
+    told_by: str
+    below_zero: float
+    seconds: float
+
+
+@dataclass
+class DenoisedFolder:
+    """What a run over a folder did."""
+
+    files: list[Denoised] = field(default_factory=list)
+    there: int = 0
+    broken: dict[str, str] = field(default_factory=dict)
+
+
+def denoise_mosaic(
+    model: Denoiser, cfa: CFA, frame: RawFrame, levels: tuple[float, float], self_ensemble: bool = False
+) -> Tensor:
+    """The frame's mosaic denoised, float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black.
+
+    Args:
+        model: a network for packed RAW, on any device.
+        cfa: the pattern of the mosaics that it was trained on.
+        frame: what to denoise.
+        levels: (shot_var, read_var).
+        self_ensemble: average eight views.
+    """
+    height, width = frame.mosaic.shape[-2:]
+    rows, columns = frame.cfa.shift_to(cfa)
+    packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
+    shot_var, read_var = levels
+    variance = packed.clamp(min=0).mul_(shot_var).add_(read_var)
+    denoised = denoise(model, Sample(packed, packed, variance), cfa, self_ensemble)
+    mosaic = bayer.unpack(denoised, cfa)[0]
+    return mosaic[..., rows : rows + height, columns : columns + width].clamp(max=1.0)
+
+
+def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
+    """(shot_var, read_var) of a frame, and what told them; ``auto`` is the profile, else the estimate.
+
+    Raises:
+        ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or wants an ISO.
+    """
+    if not isinstance(noise, str):
+        fixed = FixedLevels(*noise)
+        return fixed.shot_var, fixed.read_var, "given"
+    if noise == "profile" or (noise == "auto" and frame.noise_profile is not None):
+        if frame.noise_profile is None:
+            raise ValueError(f"{frame.name}: has no NoiseProfile tag; give --noise estimate, or the two variances")
+        return *frame.noise_profile, "profile"
+    if noise in ("auto", "estimate"):
+        try:
+            estimate = estimate_noise(frame.mosaic, frame.cfa)
+        except ValueError as error:
+            raise ValueError(f"{frame.name}: {error}; or give --noise as two variances, or a camera's name") from None
+        return estimate.shot_var, estimate.read_var, "estimate"
+    if noise not in camera_names():
+        raise ValueError(f"noise {noise!r} is none of auto, profile, estimate, two variances, {camera_names()}")
+    if frame.iso is None:
+        raise ValueError(f"{frame.name}: does not tell its ISO, which the levels of {noise} need; give two variances")
+    try:
+        levels = noise_levels(noise, iso=frame.iso)
+    except ValueError as error:
+        raise ValueError(f"{frame.name}: {error}") from None
+    if isinstance(levels, EldLevels):
+        return *levels.typical(), noise
+    shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # one ISO: nothing is left to chance
+    return float(shot_var), float(read_var), noise
+
+
+def denoise_file(
+    source: str | Path,
+    out: str | Path,
+    weights: str | Path,
+    noise: Noise = "auto",
+    self_ensemble: bool = False,
+) -> Denoised:
+    """Denoise one RAW file of any kind that :func:`rawaug.io.read_raw` reads, to a DNG.
+
+    Args:
+        source: the RAW file.
+        out: the DNG to write; its folder is made.
+        weights: a denoiser's file.
+        noise: see :data:`Noise`; a network without a noise map does not ask.
+        self_ensemble: average eight flips and turns, eight times the work.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or cannot be read.
+        ValueError: if the source is no Bayer RAW, its noise is unknown, or ``out`` is no DNG or the source itself.
+
+    Example:
+        >>> denoise_file("shot.dng", "shot-denoised.dng", "denoiser.safetensors")  # doctest: +SKIP
+    """
+    return _denoise_file(Path(source), Path(out), _load(weights), noise, self_ensemble)
+
+
+def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
+    model, info = denoisers.load(weights)
+    return model, CFA(info.get("cfa", "RGGB"))
+
+
+def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
+    start = time.perf_counter()
+    if out.suffix.lower() != ".dng":
+        raise ValueError(f"{out}: the result is a DNG; give a name that ends in .dng")
+    if out.resolve() == source.resolve():
+        raise ValueError(f"{out}: is the file to denoise; give another name")
+    model, cfa = loaded
+    frame = read_raw(source)
+    shot_var, read_var, told_by = levels_of(frame, noise) if model.variance_map else (*_NO_NOISE, "not needed")
+    mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
+    below = _clip_below_zero(mosaic, frame)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_dng(out, replace(frame, mosaic=mosaic, noise_profile=None), source)
+    return Denoised(source, out, shot_var, read_var, told_by, below, time.perf_counter() - start)
+
+
+def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
+    """Clip, in place, what a digital number cannot hold; its share of the sites. It is none where black is high enough.
+
+    A camera with black level 0 has clipped its noise there already: nothing that the source told is lost.
+    """
+    below = 0
+    for (i, j), black in zip(frame.cfa.sites, frame.black, strict=True):
+        plane = mosaic[0, i::2, j::2]
+        lowest = -black / (frame.white - black)
+        below += int((plane < lowest - 0.5 / (frame.white - black)).sum())
+        plane.clamp_(min=lowest)
+    return below / mosaic.numel()
+
+
+def denoise_folder(
+    source: str | Path,
+    out: str | Path,
+    weights: str | Path,
+    noise: Noise = "auto",
+    self_ensemble: bool = False,
+) -> DenoisedFolder:
+    """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; what is there is skipped.
+
+    Raises:
+        FileNotFoundError: if there is no such file of weights.
+        ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
+            of another denoiser or other settings.
+    """
+    source, out = Path(source), Path(out)
+    targets = _targets(source, out)
+    loaded = _load(weights)
+    settings = {"denoiser_sha256": sha256(Path(weights)), "self_ensemble": self_ensemble}
+    require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
+    result = DenoisedFolder()
+    for file, target in tqdm(targets.items(), desc="denoise", unit="file"):
+        if target.exists():
+            result.there += 1
+            continue
+        try:
+            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble))
+        except (OSError, ValueError) as error:
+            result.broken[str(file)] = str(error)
+    if len(result.broken) == len(targets):
+        raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
+    return result
+
+
+def _targets(source: Path, out: Path) -> dict[Path, Path]:
+    if out.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"{out}: the results would lie among the files of {source}; choose a folder outside")
+    files = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
+    if not files:
+        raise ValueError(f"{source}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
+    targets: dict[Path, Path] = {}
+    for file in files:
+        target = (out / file.relative_to(source)).with_suffix(".dng")
+        if target in targets.values():
+            raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")
+        targets[file] = target
+    return targets
+
+
+def print_denoised(result: DenoisedFolder) -> None:
+    """A line a file, and the broken ones by name."""
+    for done in result.files:
+        levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.told_by})"
+        clipped = f"; {done.below_zero:.2%} below the digital number 0, written as 0" if done.below_zero else ""
+        print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
+    if result.there or result.broken:
+        print(f"{len(result.files)} denoised, {result.there} there already, {len(result.broken)} broken")
+    for file, reason in result.broken.items():
+        print(f"broken: {reason}" if Path(file).stem in reason else f"broken: {file}: {reason}")

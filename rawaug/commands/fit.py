@@ -1,0 +1,123 @@
+"""``rawaug.fit``: files, folders or pairs in, a camera out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from rawaug.commands.camera_noise import as_info, measure_camera_noise
+from rawaug.data import RawFolder, open_pairs
+from rawaug.data.pair import Pair
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import NoiseEstimate, plot_noise
+
+WATCHED_PATCHES = 4
+
+
+def fit(
+    source: str | Path | Sequence[str | Path] | Sequence[Pair],
+    progress: bool = True,
+    noise: Literal["auto", "on", "off"] = "auto",
+    dark: str | Path | None = None,
+    noise_figure: str | Path | None = None,
+    camera_jpeg: bool = True,
+    held_out: str | Path | Sequence[Pair] | None = None,
+    state: str | Path | None = None,
+    **settings: Any,
+) -> DictionaryISP:
+    """Fit a camera of one's own.
+
+    Args:
+        source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
+        progress: show progress bars.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" goes on
+            without where the frames do not show them, and says why in ``isp.info["noise_not_measured"]``.
+        dark: folder of dark frames, which then tell the read variance.
+        noise_figure: where to draw the measured points and the line.
+        camera_jpeg: take the camera's JPEG of the same stem for the sRGB; False takes LibRaw's rendering always.
+        held_out: frames that the fit does not see; their PSNR_r while it runs goes to the progress bar and into
+            ``isp.info["held_out"]``.
+        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        settings: of :class:`rawaug.isp.fit.FitConfig`.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or not a Bayer RAW file.
+
+    Example:
+        >>> isp = fit("demo:train", steps=2, pixels=512, progress=False)
+        >>> isp.info["frames"][0]
+        'train_00_astronaut'
+    """
+    if noise not in ("auto", "on", "off"):
+        raise ValueError(f"noise is auto, on or off, got {noise!r}")
+    start = time.perf_counter()
+    pairs = _pairs(source, camera_jpeg)
+    watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
+    estimate = _measured_noise(pairs, noise, dark)  # before the fit: what fails here fails early
+    isp = fit_isp(pairs, FitConfig(**settings), progress, state, watch)
+    if watch is not None:
+        watch(isp)
+        isp.info["held_out"] = watch.scores
+    if isinstance(estimate, str):
+        isp.info["noise_not_measured"] = estimate
+    elif estimate is not None:
+        isp.info["noise"] = as_info(estimate)
+        if noise_figure is not None:
+            plot_noise(estimate, noise_figure, title=", ".join(isp.info["frames"][:4]))
+    isp.info["seconds"] = round(time.perf_counter() - start, 2)
+    return isp
+
+
+def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> NoiseEstimate | str | None:
+    """The levels, or why they are not known."""
+    if noise == "off":
+        return None
+    try:
+        return measure_camera_noise(pairs, dark)
+    except ValueError as error:
+        if noise == "on":
+            raise
+        return str(error)
+
+
+class _Watch:
+    """PSNR_r of frames that the fit does not see, on a few patches of each."""
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = pairs
+        self.scores: list[dict[str, float]] = []
+
+    def __call__(self, isp: DictionaryISP) -> str:
+        blind, given = (
+            sum(psnr_r(isp, self.pairs[k], white_balance, WATCHED_PATCHES) for k in range(len(self.pairs)))
+            / len(self.pairs)
+            for white_balance in (False, True)
+        )
+        self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
+        return f"held out {blind:.2f} dB, {given:.2f} with its gains"
+
+
+def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
+    if isinstance(source, (str, Path)):
+        source = [source]
+    if not hasattr(source, "__getitem__") or not len(source):
+        raise ValueError("a fit takes files, folders or pairs, in a sequence of one or more")
+    if isinstance(source[0], Pair):
+        return source  # type: ignore[return-value]
+    if not isinstance(source[0], (str, Path)):
+        raise ValueError(
+            f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
+        )
+    opened = [open_pairs(str(item), split="train") for item in source]
+    if len(opened) == 1 and not isinstance(opened[0], RawFolder):
+        return opened[0]
+    files: list[Path] = []
+    for item, pairs in zip(source, opened, strict=True):
+        if not isinstance(pairs, RawFolder):
+            raise ValueError(f"{item}: a known dataset is fitted alone; name it without other files")
+        files += pairs.files
+    return RawFolder(files, camera_jpeg=camera_jpeg)

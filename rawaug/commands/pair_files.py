@@ -1,0 +1,230 @@
+r"""A RAW pair on disk, in one of three formats, and what replays it.
+
+======  =====================================  ====================================================================
+format  files                                  content
+======  =====================================  ====================================================================
+dng     ``NAME_clean.dng NAME_noisy.dng``      16 bits, as a camera would; opens in a RAW developer
+npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, ``shot_var``, ...
+tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1
+======  =====================================  ====================================================================
+
+``NAME.safetensors`` is written last: a pair is there when its parameters are. A DNG's black level is as high as the
+darkest noisy value needs, so that nothing is clipped at black; the clean file has the same levels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug._version import __version__
+from rawaug.io import GainMap, RawFrame, read_picture, write_dng
+from rawaug.isp.stages import place_in_frame
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import RawPair, load_params
+from rawaug.plugin.pictures import even_sided
+
+Format = Literal["dng", "npz", "tiff"]
+
+_WHITE = 65535
+_BLACK_STEP = 256
+_SHADING_NODES = (25, 33)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a pair was made from; with its parameters it replays the pair."""
+
+    picture: str
+    picture_sha256: str
+    isp: str
+    isp_sha256: str
+    noise: str | list[float]
+    version: str = __version__
+
+
+def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
+    """Write a pair ``(4, h, w)`` and its parameters to files whose names begin with ``stem``."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    if format == "dng":
+        _write_dngs(stem, pair, augment)
+    elif format == "npz":
+        _write_npz(stem, pair, augment)
+    else:
+        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment)
+        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment)
+    tensors = {name: value.contiguous() for name, value in pair.params.tensors().items()}
+    header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
+    _whole(params_file(stem), lambda file: file.write(_in_one_order(save(tensors, header))))
+
+
+def params_file(stem: Path) -> Path:
+    """Where the parameters of the pair are."""
+    return _beside(stem, ".safetensors")
+
+
+def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
+    """The pair ``(4, h, w)`` that a file of parameters tells, bit for bit what was written.
+
+    Args:
+        params: ``NAME.safetensors`` of a pair.
+        picture: the sRGB picture, where it is no longer in the place that the file tells.
+        isp: the ISP's file, likewise.
+
+    Raises:
+        FileNotFoundError: if picture or ISP are not there.
+        ValueError: if they have changed since, or the file is no pair's.
+
+    Example:
+        >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
+    """
+    drawn = load_params(params)
+    with safe_open(str(params), framework="pt") as file:
+        header = file.metadata()
+    if "origin" not in header:
+        raise ValueError(f"{params}: parameters of a pair that rawaug synth did not write; use RawAugment.apply")
+    origin = Origin(**json.loads(header["origin"]))
+    augment = augmentation(str(isp or origin.isp), origin.noise)
+    found = Path(picture or origin.picture)
+    if sha256(augment_file(str(isp or origin.isp))) != origin.isp_sha256:
+        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one that made this pair")
+    srgb = even_sided(read_picture(found))
+    if sha256(found) != origin.picture_sha256:
+        raise ValueError(f"{params}: the picture {found} has changed since this pair was made")
+    pair: RawPair = augment.apply(srgb, drawn)
+    return pair
+
+
+def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
+    """The augmentation of these names, as a file can tell them."""
+    return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)
+
+
+def augment_file(isp: str) -> Path:
+    """The file of an ISP's weights."""
+    from rawaug.isp.model import find_weights
+
+    return find_weights(isp)
+
+
+def sha256(path: Path) -> str:
+    """Of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _beside(stem: Path, ending: str) -> Path:
+    return stem.with_name(stem.name + ending)
+
+
+def _whole(path: Path, write: Callable[[Any], Any]) -> None:
+    """Write a file whole or not at all."""
+    partial = _beside(path, ".partial")
+    with partial.open("wb") as file:
+        write(file)
+    partial.replace(path)
+
+
+def _in_one_order(safetensors: bytes) -> bytes:
+    """The same file with its header sorted: the library writes metadata in an order that changes from run to run."""
+    end = 8 + int.from_bytes(safetensors[:8], "little")
+    header = json.dumps(json.loads(safetensors[8:end]), sort_keys=True).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + safetensors[end:]
+
+
+def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
+    import tifffile
+
+    mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
+    _whole(path, lambda file: tifffile.imwrite(file, mosaic, photometric="minisblack", metadata=None))
+
+
+def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    noise = pair.params.noise
+    arrays: dict[str, Any] = {key: noise[key].numpy() for key in ("shot_var", "read_var") if key in noise}
+    arrays |= {"clean": pair.clean.numpy(), "noisy": pair.noisy.numpy(), "cfa": np.array(str(augment.isp.cfa))}
+    _whole(_beside(stem, ".npz"), lambda file: np.savez(file, **arrays))
+
+
+def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    clean, noisy, stops = camera_frames(pair, augment)
+    write_dng(_beside(stem, "_clean.dng"), clean, baseline_exposure=stops)
+    write_dng(_beside(stem, "_noisy.dng"), noisy, baseline_exposure=stops)
+
+
+def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFrame, float]:
+    """A pair ``(4, h, w)`` as a camera would hand it over: clean, noisy, and the stops that it is underexposed by."""
+    white_balance, color_matrix, stops = _color(pair, augment)
+    told: dict[str, Any] = {
+        "cfa": augment.isp.cfa,
+        "black": (_black(float(pair.noisy.min())),) * 4,
+        "white": float(_WHITE),
+        "white_balance": white_balance,
+        "daylight": white_balance,
+        "color_matrix": color_matrix,
+        "camera": "rawaug dictionary ISP",
+        "iso": None,
+        "orientation": 0,
+        "name": "",
+        "gain_maps": (_shading_map(augment, pair),) if "shading" in augment.isp.config.stages else (),
+    }
+    noise = pair.params.noise
+    levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
+    clean, noisy = (bayer.unpack(raw, augment.isp.cfa) for raw in (pair.clean, pair.noisy))
+    return (
+        RawFrame(mosaic=clean, noise_profile=None, **told),
+        RawFrame(mosaic=noisy, noise_profile=levels, **told),
+        stops,
+    )
+
+
+def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, float], Tensor, float]:
+    """White balance, the matrix from white-balanced camera colour to linear sRGB, and the stops of underexposure.
+
+    With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
+    white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
+    """
+    stages, isp = augment.isp.config.stages, pair.params.isp
+    matrix = isp.matrix if "colour" in stages else torch.eye(3)
+    grey = matrix.sum(1)
+    balance = (isp.gains if "gains" in stages else torch.ones(3)) / grey
+    if not balance.min() > 0:
+        raise ValueError(f"this camera setting has no positive grey, {balance.tolist()}; a DNG cannot tell it")
+    red, green, blue = balance.tolist()
+    return (red / green, 1.0, blue / green), torch.linalg.inv(matrix / grey[:, None]), math.log2(green)
+
+
+def _black(darkest: float) -> float:
+    """The lowest multiple of 256 at which ``darkest`` is a digital number: d = y (white - black) + black >= 0."""
+    needed = max(0.0, -darkest) / (1 + max(0.0, -darkest)) * _WHITE
+    return float(_BLACK_STEP * max(1, math.ceil(needed / _BLACK_STEP)))
+
+
+def _shading_map(augment: RawAugment, pair: RawPair) -> GainMap:
+    """What corrects the Gaussian part of the shading."""
+    height, width = (2 * side for side in pair.clean.shape[-2:])
+    rows, columns = _SHADING_NODES
+    y = torch.linspace(0, height, rows) - height / 2
+    x = torch.linspace(0, width, columns) - width / 2
+    place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
+    mask = augment.isp.shading(place.to(place_in_frame(1, 1)))[0]
+    return GainMap(
+        area=(0, 0, height, width),
+        pitch=(1, 1),
+        planes=(0, 1),
+        origin=(0.0, 0.0),
+        spacing=(1 / (rows - 1), 1 / (columns - 1)),
+        gains=1 / mask.detach(),
+    )

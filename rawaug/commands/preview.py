@@ -1,0 +1,134 @@
+"""``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and what the dictionaries hold.
+
+Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
+sensor sees.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.io import encode_srgb, read_picture
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import place_in_frame
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.pictures import even_sided
+from rawaug.seeding import keyed_generator
+
+_STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}
+_MAXIMUM = 768
+"""Largest side of a previewed picture: larger ones are cropped at the centre."""
+
+
+def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 4, seed: int = 0) -> list[Path]:
+    """Draw both figures.
+
+    Args:
+        picture: an sRGB picture.
+        weights: an ISP, shipped or a path.
+        out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
+        count: augmented RAWs to draw.
+        seed: of these.
+
+    Returns:
+        The two paths.
+    """
+    if count < 0:
+        raise ValueError(f"count is at least 0, got {count}")
+    isp = DictionaryISP.from_pretrained(weights)
+    whole = even_sided(read_picture(picture))
+    out = Path(out) if Path(out).suffix else Path(f"{out}.png")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")
+    _draw_stages(isp, whole, count, seed).savefig(out, dpi=130)
+    _draw_atoms(isp).savefig(atoms, dpi=130)
+    return [out, atoms]
+
+
+def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
+    """Top, left, height and width of what is shown."""
+    height, width = (min(side, _MAXIMUM) for side in srgb.shape[-2:])
+    top, left = ((side - size) // 4 * 2 for side, size in zip(srgb.shape[-2:], (height, width), strict=True))
+    return top, left, height, width
+
+
+@torch.no_grad()
+def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
+    from matplotlib.figure import Figure
+
+    top, left, height, width = _centre(whole)
+    srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
+    reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
+    panels = {"sRGB x": srgb[0] / 255.0}
+    for name, image in reverse.intermediates.items():
+        shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
+        panels[f"{name}: {_STAGE_TITLES[name]}"] = shown.clamp(0, 1)
+    panels["RAW y"] = encode_srgb(bayer.demosaic(reverse.raw, isp.cfa)[0].clamp(0, 1))
+    augment = RawAugment(isp)
+    generator = keyed_generator(seed, "preview")
+    for k in range(count):
+        pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
+        title = f"noisy RAW {k + 1}\nshot {pair.params.noise['shot_var'].item():.1e}"
+        panels[title] = encode_srgb(bayer.demosaic(bayer.unpack(pair.noisy, isp.cfa), isp.cfa)[0].clamp(0, 1))
+    columns = len(panels) - count
+    rows = 1 + -(-count // columns)
+    figure = Figure(figsize=(2.6 * columns, 2.6 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, (title, image) in zip(axes, panels.items(), strict=False):
+        axis.imshow(image.permute(1, 2, 0).numpy())
+        axis.set_title(title, fontsize=9)
+    return figure
+
+
+@torch.no_grad()
+def _draw_atoms(isp: DictionaryISP) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 3.6), layout="constrained")
+    colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])
+    _swatches(colour, isp)
+    _gain_swatches(gains, isp)
+    mask = isp.shading(place_in_frame(75, 100))[0, 0] if "shading" in isp.config.stages else torch.ones(75, 100)
+    image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
+    figure.colorbar(image, ax=shading, shrink=0.6)
+    shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)
+    shading.set(xticks=[], yticks=[])
+    grey = torch.linspace(0, 1, 256)
+    curve = isp.reverse_networks.tone(grey.expand(1, 3, 1, 256))[0, :, 0]
+    for line, name in zip(curve, ("tab:red", "tab:green", "tab:blue"), strict=True):
+        tone.plot(grey.numpy(), line.numpy(), color=name)
+    tone.set(xlabel="sRGB grey", ylabel="x1", aspect="equal")
+    tone.set_title(f"inverse tone curve, then gamma {isp.reverse_networks.gamma.item():.2f}", fontsize=9)
+    return figure
+
+
+def _swatches(axis: Any, isp: DictionaryISP) -> None:
+    """One row an atom: what it makes of sRGB red, green, blue, white, skin and sky."""
+    tones = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])
+    patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
+    axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")
+    axis.set_xticks(range(6), ["red", "green", "blue", "white", "skin", "sky"], fontsize=8)
+    axis.yaxis.get_major_locator().set_params(integer=True)
+    axis.set(ylabel="atom")
+    axis.set_title("colour atoms: sRGB as the camera sees it", fontsize=9)
+
+
+def _gain_swatches(axis: Any, isp: DictionaryISP) -> None:
+    """One row an atom, in the colour of its light: white as it comes back, with the three gains and the weight."""
+    atoms, channels = isp.gain.atoms(), isp.gain.channel_gains()
+    light = channels.amin(1, keepdim=True) / channels
+    axis.imshow(encode_srgb(light)[:, None].numpy(), aspect="auto", extent=(0, 1, len(atoms) - 0.5, -0.5))
+    weight = isp.reverse_networks.gain_encoder.prior.softmax(0)
+    for row, ((digital, red, blue), share) in enumerate(zip(atoms.tolist(), weight.tolist(), strict=True)):
+        text = f"{digital:.2f}   {red:.2f}   {blue:.2f}   {share:.0%}"
+        axis.text(0.5, row, text, ha="center", va="center", fontsize=min(8, 120 / len(atoms)), color="black")
+    axis.set(ylabel="atom", xticks=[])
+    axis.yaxis.get_major_locator().set_params(integer=True)
+    axis.set_title("gain atoms: digital, red, blue, constant weight", fontsize=9)

@@ -1,0 +1,260 @@
+"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, many processes at work.
+
+What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
+run is stopped and started again, and with however many workers, the same files come out, each made once.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from tqdm.auto import tqdm
+
+from rawaug.commands.pair_files import (
+    Format,
+    Origin,
+    augment_file,
+    augmentation,
+    params_file,
+    replay,
+    sha256,
+    write_pair,
+)
+from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.io import read_picture
+from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.pictures import even_sided
+from rawaug.seeding import keyed_generator
+
+__all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """What the files depend on, besides the pictures; stands in ``synth.json`` beside them."""
+
+    format: Format
+    isp: str
+    isp_sha256: str
+    noise: str | list[float]
+    sampling: Sampling
+    seed: int
+
+
+class _Task(NamedTuple):
+    """A picture, its name as the key of its draws, where its pairs go, and the numbers of those that are missing."""
+
+    picture: Path
+    key: str
+    stem: Path
+    numbers: tuple[int, ...]
+
+
+@dataclass
+class Synthesis:
+    """What a run did: pairs made, pairs that were there already, and the pictures that could not be read, with why."""
+
+    out: Path
+    pictures: int = 0
+    made: int = 0
+    there: int = 0
+    broken: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def synth(
+    source: str | Path,
+    out: str | Path,
+    format: Format = "dng",
+    per_image: int = 1,
+    isp: str = "universal",
+    noise: str | Sequence[float] = "cycleisp_sidd",
+    sampling: Sampling = "convex",
+    seed: int = 0,
+    workers: int | None = None,
+) -> Synthesis:
+    """Make ``per_image`` pairs of every picture of a folder and its subfolders; pairs that are there stay as they are.
+
+    Args:
+        source: the folder of sRGB pictures.
+        out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.commands.pair_files`.
+        format: dng, npz or tiff.
+        per_image: pairs a picture; may grow from run to run.
+        isp: name of a shipped ISP, or an ISP's file.
+        noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
+        sampling: of camera settings, as in :class:`rawaug.RawAugment`.
+        seed: of all draws.
+        workers: processes; as many as cores by default, 0 for none but this one. They start by forkserver or spawn: a
+            script guards its main part by ``if __name__ == "__main__":``.
+
+    Raises:
+        FileNotFoundError: if there is no such folder or ISP.
+        ValueError: if the folder holds no picture or none that can be read, or ``out`` holds pairs of other settings.
+        OSError: if a worker dies.
+    """
+    start = time.perf_counter()
+    weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
+    levels = noise if isinstance(noise, str) else list(noise)
+    settings = _Settings(format, weights, sha256(augment_file(weights)), levels, sampling, seed)
+    source, out = Path(source).resolve(), Path(out)
+    pictures = _pictures(source, out)
+    if format not in ("dng", "npz", "tiff") or per_image < 1:
+        raise ValueError(f"format is dng, npz or tiff, and per_image at least 1; got {format} and {per_image}")
+    if workers is not None and workers < 0:
+        raise ValueError(f"workers is at least 0, got {workers}")
+    augmentation(weights, levels, sampling)  # a wrong name is told here, not by a worker
+    require_same_settings(out / "synth.json", vars(settings))
+    result = Synthesis(out, pictures=len(pictures))
+    tasks = list(_tasks(pictures, source, out, per_image))
+    result.there = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
+    todo = [task for task in tasks if task.numbers]
+    for task, error in tqdm(_done(todo, settings, workers), total=len(todo), desc="synth", unit="picture"):
+        if error is None:
+            result.made += len(task.numbers)
+        else:
+            result.broken[task.key] = error
+    result.broken = dict(sorted(result.broken.items()))
+    result.seconds = time.perf_counter() - start
+    if len(result.broken) == len(pictures):
+        raise ValueError(f"{source}: none of its {len(pictures)} pictures can be read; {min(result.broken.values())}")
+    return result
+
+
+def _pictures(source: Path, out: Path) -> list[Path]:
+    if not source.is_dir():
+        raise FileNotFoundError(f"{source}: no such folder of pictures")
+    if out.resolve().is_relative_to(source):
+        raise ValueError(f"{out}: the pairs would lie among the pictures of {source}; choose a folder outside")
+    pictures = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
+    if not pictures:
+        raise ValueError(f"{source}: holds no picture; known are {', '.join(EXTENSIONS)}")
+    return pictures
+
+
+def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Iterator[_Task]:
+    """Pictures that differ in their extension alone keep it in the names of their pairs."""
+    stems = Counter(picture.with_suffix("") for picture in pictures)
+    taken: dict[Path, Path] = {}
+    for picture in pictures:
+        bare = picture.with_suffix("")
+        own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
+        if taken.setdefault(own, picture) != picture:
+            raise ValueError(f"{picture}: its pairs would have the names of those of {taken[own].name}; rename one")
+        stem = out / own.relative_to(source)
+        missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
+        yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
+
+
+def _numbered(stem: Path, number: int) -> Path:
+    return stem.with_name(f"{stem.name}_{number}")
+
+
+def require_same_settings(path: Path, settings: dict[str, object]) -> None:
+    """Write the settings of a folder's files to ``path``, or compare them with what is there.
+
+    Raises:
+        ValueError: if the files that are there were made with others.
+    """
+    if path.is_file():
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+        for key, value in known.items():
+            if settings.get(key) != value:
+                raise ValueError(f"{path}: made with {key} {value}, not {settings.get(key)}; choose another folder")
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(settings, indent=1) + "\n")
+    partial.replace(path)
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+_augment: RawAugment
+_settings: _Settings
+
+
+def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Iterator[tuple[_Task, str | None]]:
+    """Every task as it is finished, with why it could not be, if so."""
+    workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    if workers < 1:
+        _prepare(settings)
+        yield from ((task, _make(task)) for task in tasks)
+        return
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings,))
+    try:
+        futures = {pool.submit(_make, task): task for task in tasks}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool:
+        raise OSError("a worker died, for lack of memory?; the same command goes on; try fewer --workers") from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker(settings: _Settings) -> None:
+    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent is no more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    torch.set_num_threads(1)
+    _prepare(settings)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _prepare(settings: _Settings) -> None:
+    global _augment, _settings
+    _settings = settings
+    _augment = augmentation(settings.isp, settings.noise, settings.sampling)
+
+
+def _make(task: _Task) -> str | None:
+    """Make the missing pairs of a picture; why it cannot be read, if so."""
+    try:
+        srgb = even_sided(read_picture(task.picture))
+    except (OSError, ValueError) as error:
+        return str(error)
+    s = _settings
+    origin = Origin(str(task.picture), sha256(task.picture), s.isp, s.isp_sha256, s.noise)
+    for number in task.numbers:
+        params = _augment.sample(srgb, keyed_generator(s.seed, "synth", task.key, number))
+        write_pair(_numbered(task.stem, number), _augment.apply(srgb, params), _augment, s.format, origin)
+    return None
+
+
+def print_synthesis(result: Synthesis) -> None:
+    """A short table, and the broken pictures by name."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=str(result.out))
+    for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
+        table.add_column(column, justify="right")
+    numbers = (result.pictures, result.made, result.there, len(result.broken))
+    table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
+    Console(width=100).print(table)
+    for reason in result.broken.values():
+        print(f"broken: {reason}")

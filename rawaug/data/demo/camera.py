@@ -1,0 +1,159 @@
+r"""The demo camera: makes RAW and sRGB of the same shot from any picture, so that everything can be tried without data.
+
+    clean = Q(y),  noisy = Q(shot_var Poisson(y / shot_var) + N(0, read_var)),   y = mosaic(e s diag(g)^-1 M^-1 B L(x))
+    srgb  = tone(M diag(g) demosaic(clean / s))
+
+The picture x is the scene, linearised by L (IEC 61966-2-1); B is the blur of lens and optical low-pass filter. A shot
+has an illuminant (gains g), an exposure e and an ISO (noise levels); the camera has a colour matrix M, lens shading s
+that falls off like cos^4 around a point off centre, a GRBG sensor of 12 bits with a black level (Q), and a film-like
+tone curve. It shares no code with the ISPs that are fitted to it: other noise (Poisson counts), other demosaicing
+(Malvar, He and Cutler), another tone curve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA, mosaic
+from rawaug.data.malvar import demosaic_malvar
+from rawaug.data.pair import Pair
+from rawaug.io import decode_srgb, encode_srgb
+
+BLACK, WHITE = 512, 4095
+
+NOISE_LEVELS = {
+    100: (7.5e-4, 3.9e-6),
+    200: (1.5e-3, 1.1e-5),
+    400: (3.0e-3, 4.8e-5),
+    800: (6.0e-3, 1.4e-4),
+    1600: (1.2e-2, 6.1e-4),
+    2500: (1.9e-2, 1.2e-3),
+}
+"""ISO: (shot_var, read_var)."""
+
+_COLOR_MATRIX = ((1.66, -0.53, -0.13), (-0.21, 1.55, -0.34), (0.02, -0.47, 1.45))
+_ILLUMINANTS = ((2.25, 1.32), (2.10, 1.41), (1.98, 1.52), (1.85, 1.66), (1.72, 1.84), (1.55, 2.15))
+"""Gains of red and blue from open shade over daylight to tungsten."""
+_EXPOSURE = (0.75, 1.0)
+_BLUR = 0.7
+"""Standard deviation in pixels of the point spread: no lens is as sharp as a picture that was scaled down."""
+_SHADING_CENTRE = (0.06, -0.04)
+_SHADING_FOCAL_LENGTH = 1.85
+_SHOULDER, _CONTRAST = 1.2, 0.4
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What changes from shot to shot: gains of R, G, B; exposure; ISO, a key of NOISE_LEVELS; the noise's seed."""
+
+    white_balance: tuple[float, float, float]
+    exposure: float
+    iso: int
+    noise_seed: int
+
+
+@dataclass(frozen=True)
+class DemoCamera:
+    """A camera with a sensor of pattern ``cfa``.
+
+    Example:
+        >>> picture = torch.randint(0, 256, (3, 64, 96), dtype=torch.uint8)
+        >>> pair = DemoCamera().capture(picture, torch.Generator().manual_seed(0))
+        >>> pair.raw.shape, pair.noisy.shape, pair.srgb.shape
+        (torch.Size([1, 64, 96]), torch.Size([1, 64, 96]), torch.Size([3, 64, 96]))
+    """
+
+    cfa: CFA = CFA.GRBG
+
+    def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
+        """Draw the parameters of a shot; the ISO too, unless it is given."""
+        place, red, blue, exposure, level = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
+        position = place * (len(_ILLUMINANTS) - 1)
+        k = int(position)
+        (red0, blue0), (red1, blue1) = _ILLUMINANTS[k : k + 2]
+        t = position - k
+        return Shot(
+            # real light leaves the line from daylight to tungsten by a few percent
+            white_balance=(
+                (red0 + t * (red1 - red0)) * (0.98 + 0.04 * red),
+                1.0,
+                (blue0 + t * (blue1 - blue0)) * (0.98 + 0.04 * blue),
+            ),
+            exposure=_EXPOSURE[0] + exposure * (_EXPOSURE[1] - _EXPOSURE[0]),
+            iso=iso if iso is not None else list(NOISE_LEVELS)[int(level * len(NOISE_LEVELS))],
+            noise_seed=int(torch.randint(2**62, (), generator=generator)),
+        )
+
+    def apply(self, picture: Tensor, shot: Shot, name: str = "demo") -> Pair:
+        """Take the shot of ``picture``, uint8 ``(3, H, W)``, as the scene.
+
+        Raises:
+            ValueError: if the picture is not uint8 ``(3, H, W)`` with even sides of at least 4.
+        """
+        if picture.ndim != 3 or picture.shape[0] != 3 or picture.dtype != torch.uint8 or min(picture.shape[1:]) < 4:
+            raise ValueError(f"{name}: a scene is uint8 (3, H, W) of 4 x 4 or more, got {tuple(picture.shape)}")
+        exposed = self._expose(picture, shot)
+        clean = _digitise(exposed)
+        shot_var, read_var = NOISE_LEVELS[shot.iso]
+        generator = torch.Generator().manual_seed(shot.noise_seed)
+        electrons = torch.poisson(exposed / shot_var, generator=generator)
+        read_noise = torch.randn(exposed.shape, generator=generator) * read_var**0.5
+        return Pair(
+            name=name,
+            srgb=self._render(clean, shot),
+            raw=clean,
+            cfa=self.cfa,
+            white_balance=shot.white_balance,
+            color_matrix=torch.tensor(_COLOR_MATRIX),
+            noisy=_digitise(shot_var * electrons + read_noise),
+            shot_var=shot_var,
+            read_var=read_var,
+            camera="rawaug demo camera",
+        )
+
+    def capture(self, picture: Tensor, generator: torch.Generator, name: str = "demo", iso: int | None = None) -> Pair:
+        """:meth:`sample` and :meth:`apply` in one."""
+        return self.apply(picture, self.sample(generator, iso), name)
+
+    def _expose(self, picture: Tensor, shot: Shot) -> Tensor:
+        """The light on the sensor before noise, ``(1, H, W)``, white = 1."""
+        from kornia.filters import gaussian_blur2d
+
+        scene = gaussian_blur2d(decode_srgb(picture[None].float() / 255), 5, (_BLUR, _BLUR))[0]
+        to_camera = torch.linalg.inv(torch.tensor(_COLOR_MATRIX))
+        camera = torch.einsum("ij,jhw->ihw", to_camera, scene) / _column(shot.white_balance)
+        return mosaic(shot.exposure * _shading(*picture.shape[-2:]) * camera, self.cfa).clamp(min=0)
+
+    def _render(self, raw: Tensor, shot: Shot) -> Tensor:
+        """The camera's own picture, uint8 ``(3, H, W)``."""
+        camera = demosaic_malvar(raw / _shading(*raw.shape[-2:]), self.cfa) * _column(shot.white_balance)
+        linear = torch.einsum("ij,jhw->ihw", torch.tensor(_COLOR_MATRIX), camera.clamp(0, 1)).clamp(0, 1)
+        return (_tone(linear) * 255).round().to(torch.uint8)
+
+
+def _column(gains: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(gains).reshape(3, 1, 1)
+
+
+def _shading(height: int, width: int) -> Tensor:
+    """Relative illumination ``(height, width)``: cos^4 of the angle, 1 at its centre, about 0.6 in the corners."""
+    half_diagonal = (height**2 + width**2) ** 0.5 / 2
+    y = (torch.arange(height) + 0.5 - height / 2) / half_diagonal - _SHADING_CENTRE[0]
+    x = (torch.arange(width) + 0.5 - width / 2) / half_diagonal - _SHADING_CENTRE[1]
+    tangent = (y[:, None] ** 2 + x**2) / _SHADING_FOCAL_LENGTH**2
+    return (1 + tangent) ** -2
+
+
+def _digitise(light: Tensor) -> Tensor:
+    """Through the converter's digital numbers and back: RAW with black 0, white 1."""
+    numbers = (light * (WHITE - BLACK) + BLACK).round().clamp(0, WHITE)
+    return (numbers - BLACK) / (WHITE - BLACK)
+
+
+def _tone(linear: Tensor) -> Tensor:
+    """Film-like: a shoulder that holds highlights, the sRGB transfer, an S curve; [0, 1] to [0, 1], increasing."""
+    display = encode_srgb(linear * (1 + _SHOULDER) / (linear + _SHOULDER))
+    return (1 - _CONTRAST) * display + _CONTRAST * display**2 * (3 - 2 * display)

@@ -1,0 +1,130 @@
+"""Built-in data: a few photographs, dead leaves textured from them, and shots of both by the demo camera.
+
+The photographs are files of scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
+of texture. As for a camera at hand, there are few RAW pairs and many sRGB pictures.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
+from rawaug.data.demo.dead_leaves import dead_leaves
+from rawaug.data.pair import Pair
+from rawaug.io import read_picture
+from rawaug.seeding import keyed_generator
+
+PHOTOGRAPHS = {
+    "train": ("astronaut.png", "rocket.jpg"),
+    "validation": ("motorcycle_left.png", "motorcycle_right.png"),
+    "test": ("coffee.png", "chelsea.png"),
+}
+"""Files in scikit-image's data folder; the two motorcycles are one scene from two places."""
+
+PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png")
+"""More photographs of the user's sRGB folder, of which the camera has no RAW."""
+
+PAIRS = {"train": 5, "validation": 4, "test": 9}
+"""Number of pairs of a split unless told otherwise."""
+
+FRAME = (288, 448)
+"""Height and width of every frame."""
+
+
+def demo_photographs(split: str) -> dict[str, Tensor]:
+    """The split's photographs by name, uint8 ``(3, H, W)``.
+
+    Raises:
+        ValueError: if there is no such split.
+        FileNotFoundError: if scikit-image's installation lacks them.
+    """
+    _require_split(split)
+    return dict(_photographs(split))
+
+
+def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair]:
+    """Shots by the demo camera, 288 x 448: crops of the split's photographs, and of dead leaves except in training.
+
+    Pair k depends on (split, k, seed) alone; scenes and ISO values take turns.
+
+    Args:
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        count: number of pairs, by default that of :data:`PAIRS`.
+        seed: another seed gives other crops, illuminants and noise, of the same photographs.
+
+    Raises:
+        ValueError: if there is no such split, or ``count`` is not positive.
+
+    Example:
+        >>> pair = demo_pairs("train", count=1)[0]
+        >>> pair.raw.shape, pair.cfa, pair.noisy is not None
+        (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
+    """
+    _require_split(split)
+    count = PAIRS[split] if count is None else count
+    if count < 1:
+        raise ValueError(f"demo:{split}: count is at least 1, got {count}")
+    return [_pair(split, k, seed) for k in range(count)]
+
+
+def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
+    """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
+
+    The photographs are those of the training pairs and five others, none of validation or test.
+
+    Raises:
+        ValueError: if ``count`` is not positive.
+    """
+    if count < 1:
+        raise ValueError(f"demo: count is at least 1, got {count}")
+    photographs = [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
+    leaves = (
+        dead_leaves(*FRAME, photographs, keyed_generator(seed, "demo pictures", k))
+        for k in range(count - len(photographs))
+    )
+    return [*photographs[:count], *leaves]
+
+
+def _pair(split: str, k: int, seed: int) -> Pair:
+    photographs = _photographs(split)
+    scenes = list(photographs) if split == "train" else [*photographs, "leaves"]
+    scene, turn = scenes[k % len(scenes)], k // len(scenes)
+    generator = keyed_generator(seed, "demo pair", split, k)
+    if scene == "leaves":
+        picture = dead_leaves(*FRAME, list(photographs.values()), generator)
+    else:
+        picture = _random_crop(photographs[scene], generator)
+    levels = list(NOISE_LEVELS)
+    # every scene meets every ISO in time, and a few pairs already span the range
+    iso = levels[(1 + turn + len(levels) // len(scenes) * (k % len(scenes))) % len(levels)]
+    return DemoCamera().capture(picture, generator, name=f"{split}_{k:02d}_{scene}", iso=iso)
+
+
+def _random_crop(photograph: Tensor, generator: torch.Generator) -> Tensor:
+    top, left = (
+        int(torch.randint(side - size + 1, (), generator=generator))
+        for side, size in zip(photograph.shape[-2:], FRAME, strict=True)
+    )
+    crop = photograph[:, top : top + FRAME[0], left : left + FRAME[1]]
+    return crop.flip(-1) if torch.rand((), generator=generator) < 0.5 else crop
+
+
+def _photographs(split: str) -> dict[str, Tensor]:
+    return _read(PHOTOGRAPHS[split])
+
+
+@cache
+def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
+    import skimage
+
+    folder = Path(skimage.__file__).parent / "data"
+    return {Path(file).stem: read_picture(folder / file) for file in files}
+
+
+def _require_split(split: str) -> None:
+    if split not in PHOTOGRAPHS:
+        raise ValueError(f"demo:{split}: no such split; there are {', '.join(PHOTOGRAPHS)}")

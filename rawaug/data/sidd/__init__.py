@@ -1,0 +1,1 @@
+"""The Smartphone Image Denoising Dataset: frames, blocks and submissions."""

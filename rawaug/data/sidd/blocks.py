@@ -1,0 +1,202 @@
+"""SIDD's blocks of 256 x 256: validation, benchmark, and those of SIDD+ (NTIRE 2020).
+
+``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
+same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
+:data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, and tells the pattern
+of each frame in a line of ``siddplus_*bayer_patterns.csv``.
+
+The blocks come without colour: it is read from the METADATA files of their scene instances where these lie below the
+same folder; else the gains are 1, the colour matrix is the identity, and the picture shows camera colour.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.captured_noise import captured_noise
+from rawaug.data.colour import develop_mosaic
+from rawaug.data.lazy import LazyPairs
+from rawaug.data.mat import read_array
+from rawaug.data.pair import Pair
+from rawaug.data.sidd.frames import Colour, colour_of, indexed, noise_level_functions, normalised
+from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
+
+BLOCKS = 32
+"""Blocks of a frame."""
+
+_NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
+
+
+class NoisyBlock(NamedTuple):
+    """A block of which only the noisy version is public: ``noisy`` float32 ``(1, H, W)`` with its pattern ``cfa``."""
+
+    name: str
+    noisy: Tensor
+    cfa: CFA
+
+
+class SiddBlocks(LazyPairs):
+    """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB) once the first is read.
+
+    Noise levels are those of a ``noise_level_functions.csv`` where one lies below the folder and has the scene
+    instance, else measured on the 32 blocks of a frame against the clean ones.
+
+    Args:
+        path: contains ``ValidationNoisyBlocksRaw.mat`` and ``ValidationGtBlocksRaw.mat``, at any depth.
+
+    Raises:
+        FileNotFoundError: if one of them is not there.
+
+    Example:
+        >>> SiddBlocks("SIDD_Validation")[32].name  # doctest: +SKIP
+        '0021_001_GP_10000_05000_5500_N_00'
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
+        self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
+        self._blocks: tuple[Tensor, Tensor] | None = None
+        super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
+
+    def read(self, index: int) -> Pair:
+        scene, block = divmod(index, BLOCKS)
+        frame = self.scenes[scene]
+        clean, noisy = (blocks[scene] for blocks in self._all())
+        levels = self._levels.get(frame.name) or captured_noise(clean.numpy(), noisy.numpy())
+        colour = self._colours.get(frame.name, _NO_COLOUR)
+        return _pair(self.names[index], clean[block], noisy[block], frame.cfa, colour, levels, frame.camera)
+
+    def _all(self) -> tuple[Tensor, Tensor]:
+        if self._blocks is None:
+            clean, noisy = (_blocks_of_scenes(file) for file in self.files)
+            _require_same_shape(clean, noisy, self.files[1])
+            self._blocks = clean, noisy
+            self._levels = noise_level_functions(self.path)
+            self._colours = _colours(self.path)
+        return self._blocks
+
+
+class SiddPlusBlocks(LazyPairs):
+    """The validation blocks of SIDD+, 1,024 pairs; noise levels are measured as for :class:`SiddBlocks`.
+
+    Args:
+        path: contains ``siddplus_valid_noisy_raw.mat``, ``siddplus_valid_gt_raw.mat`` and a
+            ``siddplus_*bayer_patterns.csv`` with a pattern for each frame of 32 blocks, at any depth.
+
+    Raises:
+        FileNotFoundError: if one of them is not there.
+        ValueError: if the patterns are no patterns.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        path = Path(path)
+        self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
+        patterns = find_file(path, "siddplus_*bayer_patterns.csv")
+        with patterns.open(encoding="utf-8-sig", newline="") as stream:
+            self.cfas = [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
+        self._blocks: tuple[Tensor, Tensor] | None = None
+        super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
+
+    def read(self, index: int) -> Pair:
+        if self._blocks is None:
+            clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
+            _require_same_shape(clean, noisy, self.files[1])
+            if len(clean) != len(self):
+                raise ValueError(f"{self.files[0]}: holds {len(clean)} blocks, the patterns are for {len(self)}")
+            self._blocks = clean, noisy
+        frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
+        clean, noisy = self._blocks
+        levels = captured_noise(clean[frame].numpy(), noisy[frame].numpy())
+        cfa = self.cfas[index // BLOCKS]
+        return _pair(self.names[index], clean[index], noisy[index], cfa, _NO_COLOUR, levels, "SIDD+")
+
+
+class SiddBenchmark(Sequence[NoisyBlock]):
+    """The benchmark's noisy blocks, whose clean ones are not public; results go to :func:`write_submission`.
+
+    Args:
+        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+
+    Example:
+        >>> blocks = SiddBenchmark("SIDD_Benchmark")  # doctest: +SKIP
+        >>> write_submission("SubmitRaw.csv", (denoise(b.noisy, b.cfa) for b in blocks))  # doctest: +SKIP
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
+        self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
+        self._blocks: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(HELD_BACK) * BLOCKS
+
+    def __getitem__(self, index: int) -> NoisyBlock:  # type: ignore[override]
+        scene, block = divmod(range(len(self))[index], BLOCKS)
+        if self._blocks is None:
+            self._blocks = _blocks_of_scenes(self.file)
+        frame = self.scenes[scene]
+        return NoisyBlock(f"{frame.name}_{block:02d}", self._blocks[scene, block], frame.cfa)
+
+    def __iter__(self) -> Iterator[NoisyBlock]:
+        return (self[index] for index in range(len(self)))
+
+
+def find_file(path: Path, pattern: str) -> Path:
+    """The one file of this name below ``path``, or ``path`` itself.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if there are several.
+    """
+    found = [path] if path.is_file() and path.match(pattern) else sorted(path.rglob(pattern))
+    if not found:
+        raise FileNotFoundError(f"{path}: holds no {pattern}; see the page on datasets for where to get it")
+    if len(found) > 1:
+        raise ValueError(f"{path}: holds {len(found)} files {pattern}, {found[0]} and {found[1]}; name a folder of one")
+    return found[0]
+
+
+def _blocks_of_scenes(file: Path) -> Tensor:
+    """``(40, 32, 1, H, W)``."""
+    blocks = normalised(read_array(file, file.stem), 4, file)
+    if blocks.shape[:2] != (len(HELD_BACK), BLOCKS):
+        raise ValueError(f"{file}: holds {tuple(blocks.shape[:2])} blocks, the published file {len(HELD_BACK), BLOCKS}")
+    return blocks
+
+
+def _colours(path: Path) -> dict[str, Colour]:
+    files = {scene: found["METADATA_RAW"] for (scene, _), found in indexed(path).items() if "METADATA_RAW" in found}
+    return {scene: colour_of(file) for scene, file in files.items() if scene in HELD_BACK}
+
+
+def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:
+    if clean.shape != noisy.shape:
+        raise ValueError(f"{file}: holds {tuple(noisy.shape)}, its clean counterpart {tuple(clean.shape)}")
+
+
+def _pair(
+    name: str, clean: Tensor, noisy: Tensor, cfa: CFA, colour: Colour, levels: tuple[float, float], camera: str
+) -> Pair:
+    return Pair(
+        name=name,
+        srgb=develop_mosaic(clean, cfa, colour.white_balance, colour.matrix),
+        raw=clean,
+        cfa=cfa,
+        white_balance=colour.white_balance,
+        color_matrix=colour.matrix,
+        noisy=noisy,
+        shot_var=levels[0],
+        read_var=levels[1],
+        camera=camera,
+    )

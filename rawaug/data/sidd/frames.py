@@ -1,0 +1,184 @@
+"""SIDD: full frames of five phones, noisy and clean, with their pictures.
+
+A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are MATLAB files
+of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black; METADATA are
+of version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not. The pattern goes by phone:
+see :mod:`rawaug.data.sidd.scenes`.
+
+Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
+the dataset's ``noise_level_functions.csv``.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import turn_back
+from rawaug.data.captured_noise import measured_levels
+from rawaug.data.colour import color_matrix, develop_mosaic, white_balance
+from rawaug.data.lazy import LazyPairs
+from rawaug.data.mat import read_array, read_value
+from rawaug.data.pair import Pair
+from rawaug.data.sidd.scenes import HELD_BACK, SiddScene, is_scene
+from rawaug.io import read_picture
+from rawaug.io.picture_files import view_of_orientation
+
+_FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
+
+
+class SiddFrames(LazyPairs):
+    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set too where it lies there.
+
+    Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
+    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is develop_mosaic as the dataset's makers did.
+
+    Args:
+        path: contains the folders of the scene instances, at any depth. Those of validation and benchmark are left out.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds no frames, or a noisy frame without its clean one or its METADATA.
+
+    Example:
+        >>> pair = SiddFrames("SIDD_Medium_Raw")[0]  # doctest: +SKIP
+        >>> pair.name, pair.cfa, pair.raw.shape  # doctest: +SKIP
+        ('0001_001_S6_00100_00060_3200_L_010', <CFA.GRBG: 'GRBG'>, torch.Size([1, 3000, 5328]))
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.shots = [
+            (SiddScene.parse(scene), number, files)
+            for (scene, number), files in sorted(indexed(self.path).items())
+            if "NOISY_RAW" in files and scene not in HELD_BACK
+        ]
+        for scene, number, files in self.shots:
+            missing = {"GT_RAW", "METADATA_RAW"} - set(files)
+            if missing:
+                raise ValueError(
+                    f"{files['NOISY_RAW']}: {min(missing)}_{number} of {scene.name} is missing; get it too"
+                )
+        if not self.shots:
+            raise ValueError(f"{path}: holds no NOISY_RAW frames of SIDD for training")
+        self.levels = noise_level_functions(self.path)
+        super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
+
+    def read(self, index: int) -> Pair:
+        scene, _, files = self.shots[index]
+        clean, noisy = (mosaic_of(files[kind]) for kind in ("GT_RAW", "NOISY_RAW"))
+        if clean.shape != noisy.shape:
+            sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
+            raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
+        gains, matrix, view = colour_of(files["METADATA_RAW"])
+        if "GT_SRGB" in files:
+            srgb = _even(turn_back(read_picture(files["GT_SRGB"]), view))
+        else:
+            srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
+        shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
+        return Pair(
+            name=self.names[index],
+            srgb=srgb.contiguous(),
+            raw=clean,
+            cfa=scene.cfa,
+            white_balance=gains,
+            color_matrix=matrix,
+            noisy=noisy,
+            shot_var=shot_var,
+            read_var=read_var,
+            camera=scene.camera,
+        )
+
+
+def mosaic_of(file: Path) -> Tensor:
+    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as :func:`rawaug.data.mat.read_array`; ValueError also if it is no
+            matrix, or exceeds white.
+    """
+    return _even(normalised(read_array(file, "x"), 2, file))
+
+
+def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
+    """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
+    if values.ndim != axes or values.dtype.kind != "f" or not values.size:
+        raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floating point, {axes} axes")
+    low, high = float(values.min()), float(values.max())
+    if not (low > -1 and high <= 1):
+        raise ValueError(f"{file}: values run from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
+
+
+def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``; maybe none.
+
+    Raises:
+        ValueError: if the file has other columns.
+    """
+    file = next(iter(sorted(path.rglob("noise_level_functions.csv"))), None)
+    if file is None:
+        return {}
+    with file.open(encoding="utf-8-sig", newline="") as stream:
+        rows = list(csv.DictReader(stream, skipinitialspace=True))
+    levels = {}
+    for row in rows:
+        try:
+            shot, read = (sum(float(row[f"beta{k}_{colour}"]) for colour in "rggb") / 4 for k in (1, 2))
+            levels[row["scene_instance_id"]] = max(shot, 0.0), max(read, 0.0)
+        except (KeyError, TypeError, ValueError) as error:
+            columns = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
+            raise ValueError(f"{file}: each row has the columns {columns}; {error!r} is wrong") from error
+    return levels
+
+
+def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
+    """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+    """
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder of SIDD")
+    index: dict[tuple[str, str], dict[str, Path]] = {}
+    for parent, _, files in os.walk(path):
+        folder = Path(parent)
+        for file in files if is_scene(folder.name) else ():
+            found = _FILE.fullmatch(file)
+            if found:
+                index.setdefault((folder.name, found[2]), {})[found[1].upper()] = folder / file
+    return index
+
+
+class Colour(NamedTuple):
+    """What a METADATA file tells: gains, colour matrix, and the view that shows the frame upright."""
+
+    white_balance: tuple[float, float, float]
+    matrix: Tensor
+    upright_view: int
+
+
+def colour_of(file: Path) -> Colour:
+    """The colour of a frame from its METADATA file.
+
+    Raises:
+        FileNotFoundError, OSError, ValueError: as :func:`rawaug.data.mat.read_value`; ValueError also if it lacks one.
+    """
+    tags: dict[str, Any] = read_value(file, "metadata")
+    try:
+        gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
+        return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{file}: tells no AsShotNeutral and ColorMatrix2 ({error}); get the file again") from error
+
+
+def _even(image: Tensor) -> Tensor:
+    height, width = (side // 2 * 2 for side in image.shape[-2:])
+    return image[..., :height, :width]

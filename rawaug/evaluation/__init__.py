@@ -1,0 +1,1 @@
+"""Scores of ISPs and denoisers, and the tables and pages that show them."""

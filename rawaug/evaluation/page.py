@@ -1,0 +1,165 @@
+"""The page of a run: one HTML file that needs nothing beside it, with curves, tables and pictures.
+
+RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Of each frame the whole clean picture
+stands there once, and the window with most detail of it at twice its size: noisy, of every arm, clean.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, table_rows
+
+WINDOW = 64
+"""Side in packed pixels of the enlarged windows."""
+
+WHOLE = 640
+"""Largest width of a whole frame on the page, in pixels."""
+
+ON_PAGE = 12
+"""Frames on the page at most."""
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
+table { border-collapse: collapse; margin: 1rem 0; }
+th, td { padding: .25rem .8rem; border-bottom: 1px solid #ddd; text-align: right; font-variant-numeric: tabular-nums; }
+th:first-child, td:first-child { text-align: left; }
+.frame { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-start; margin-bottom: 2rem; }
+figure { margin: 0; } figcaption { font-size: 13px; }
+.window img { width: 256px; image-rendering: pixelated; }
+img { max-width: 100%; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
+"""
+
+
+class Page:
+    """Collects the parts of the page; frames are encoded as they come and not kept.
+
+    Args:
+        title: of the page.
+        results: by arm, one entry a seed.
+        classical: summaries of the classical denoisers, by name.
+    """
+
+    def __init__(self, title: str, results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> None:
+        self.title = title
+        self.parts = [f"<h1>{html.escape(title)}</h1>", "<h2>Scores</h2>"]
+        for columns in (COLUMNS, QUARTERS):
+            self.parts.append(_table(["", *columns], table_rows(results, classical, columns)))
+        self.parts += ["<h2>Every image</h2>", _images_table(results, classical)]
+
+    def add_curves(self, png: bytes) -> None:
+        """A figure as :func:`draw_curves` makes it."""
+        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'curves of training')}</p>", "<h2>Pictures</h2>"]
+
+    def add_frame(self, row: Row, cfa: CFA) -> None:
+        """One test frame."""
+        clean = list(row.panels.values())[-1]
+        exposure = exposure_of(clean, row.pair)
+        top, left = most_detailed(clean)
+        whole = develop_packed(clean, cfa, row.pair, exposure)
+        figures = []
+        for name, packed in row.panels.items():
+            window = packed[..., top : top + WINDOW, left : left + WINDOW]
+            png = encode_png(develop_packed(window, cfa, row.pair, exposure))
+            caption = html.escape(name if name == "clean" else f"{name}, {row.captions.get(name, '')}")
+            figures.append(f'<figure class="window">{_picture(png, name)}<figcaption>{caption}</figcaption></figure>')
+        scale = min(1.0, WHOLE / whole.shape[-1])
+        if scale < 1.0:
+            whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
+        caption = f"<figcaption>whole frame, clean; the window is at row {2 * top}, column {2 * left}</figcaption>"
+        figures.append(f"<figure>{_picture(encode_png(whole), 'whole frame')}{caption}</figure>")
+        self.parts.append(f'<h3>{html.escape(row.pair.name)}</h3><div class="frame">{"".join(figures)}</div>')
+
+    def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
+        """The file, with ``settings`` at its end."""
+        shown = html.escape(json.dumps(settings, indent=1))
+        body = "\n".join([*self.parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
+        title = f"<title>{html.escape(self.title)}</title>"
+        head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width">{title}'
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
+        path.write_text(f"{text}</body></html>\n", encoding="utf-8")
+        return path
+
+
+def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:
+    """At most :data:`ON_PAGE` of the frames, evenly spaced."""
+    count = min(ON_PAGE, len(pairs))
+    return (pairs[k * len(pairs) // count] for k in range(count))
+
+
+def most_detailed(packed: Tensor) -> tuple[int, int]:
+    """Top and left, in packed pixels, of the window of a clean frame ``(1, 4, h, w)`` with the steepest green."""
+    green = packed[:, 1:3].mean(1, keepdim=True).clamp_min(0.0).sqrt()
+    steep = (green[..., 1:, :-1] - green[..., :-1, :-1]).abs() + (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
+    size = [min(WINDOW, side) for side in steep.shape[-2:]]
+    scores = F.avg_pool2d(steep, size, stride=4)
+    place = int(scores.argmax())
+    return 4 * (place // scores.shape[-1]), 4 * (place % scores.shape[-1])
+
+
+def encode_png(srgb: Tensor) -> bytes:
+    """sRGB ``(3, H, W)`` in [0, 1] as a PNG file."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).numpy()).save(file, "PNG")
+    return file.getvalue()
+
+
+def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
+    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = dict(zip(("loss", "psnr"), figure.subplots(1, 2), strict=True))
+    for colour, (arm, paths) in enumerate(logs.items()):
+        for k, path in enumerate(paths):
+            with path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+            for key, axis in axes.items():
+                points = ([int(row["step"]) for row in rows], [float(row[key]) for row in rows])
+                axis.plot(*points, color=f"C{colour % 10}", linewidth=1.2, label=None if k else arm)
+    axes["loss"].set(xlabel="step", ylabel="loss", yscale="log")
+    axes["psnr"].set(xlabel="step", ylabel="validation PSNR (dB)")
+    axes["psnr"].legend(fontsize=8)
+    file_like = io.BytesIO()
+    figure.savefig(file_like, dpi=110)
+    return file_like.getvalue()
+
+
+def _picture(png: bytes, alt: str) -> str:
+    return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def _table(head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
+    def line(tag: str, cells: Sequence[str]) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    body = "".join(line("td", [name, *cells]) for name, cells in rows.items())
+    return f"<table><thead>{line('th', head)}</thead><tbody>{body}</tbody></table>"
+
+
+def _images_table(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> str:
+    """PSNR / SSIM of every image by every method, on the mosaic; an arm's first seed."""
+    summaries = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+    rows: dict[str, list[str]] = {}
+    for summary in summaries.values():
+        for image in summary["images"]:
+            cells = rows.setdefault(image["name"], [f"{image['psnr_noisy']:.2f} / {image['ssim_noisy']:.4f}"])
+            cells.append(f"{image['psnr']:.2f} / {image['ssim']:.4f}")
+    return _table(["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows)

@@ -1,0 +1,87 @@
+"""PSNR_r of an ISP: how well it makes the RAW of frames from their sRGB."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.data.pair import Pair
+from rawaug.isp import conditioning
+from rawaug.isp.fit.samples import block_averages
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.setting import ISPParams
+from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.metrics import PATCH, patch_psnr, psnr
+from rawaug.seeding import keyed_generator
+
+STRIP = 256
+
+
+@torch.no_grad()
+def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches: int | None = None) -> float:
+    """PSNR_r of one frame; of an unregistered pair at the resolution of block averages.
+
+    Args:
+        isp: the ISP.
+        pair: the frame.
+        white_balance: give the frame's as-shot white balance.
+        patches: score so many patches of a registered frame (:func:`windows_of`); None scores all.
+    """
+    given = pair.white_balance if white_balance else None
+    if pair.registered:
+        params = conditioning.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
+        if patches is not None:
+            return windows_psnr(lambda patch, place: isp.reverse(patch, params, place=place).raw, pair, patches)
+        return patch_psnr(mosaic_of(isp, pair, params), pair.raw[None]).item()
+    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
+    params = conditioning.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
+    made = isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0]
+    return block_psnr(made, blocks.raw, blocks.clipped)
+
+
+def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
+    """PSNR between block averages ``(3, h, w)``, blocks with a clipped reading ``(h, w)`` left out."""
+    error = (made.clamp(0.0, 1.0) - raw) ** 2
+    return -10.0 * error[:, ~clipped].mean().log10().item()
+
+
+@torch.no_grad()
+def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
+    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, within [0, 1], in the pattern of the pair.
+
+    Strip by strip, to bound memory.
+    """
+    height, width = pair.raw.shape[-2:]
+    strips = []
+    for top in range(0, height, STRIP):
+        strip = as_float(pair.srgb[None, :, top : top + STRIP])
+        place = place_in_frame(strip.shape[-2], width, (top, 0), (height, width))
+        strips.append(bayer.mosaic(isp.reverse_pixels(strip, params, place), pair.cfa).clamp_(0.0, 1.0))
+    return torch.cat(strips, dim=-2)
+
+
+def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
+    """Corners of ``count`` random non-overlapping patches of the frame, keyed by its name; all if None.
+
+    As in :func:`rawaug.metrics.patch_psnr`, a side shorter than a patch is the patch's side.
+    """
+    rows, columns = (range(0, max(side - PATCH, 0) + 1, PATCH) for side in pair.raw.shape[-2:])
+    every = [(top, left) for top in rows for left in columns]
+    if count is None or count >= len(every):
+        return every
+    order = torch.randperm(len(every), generator=keyed_generator("windows", pair.name)).tolist()
+    return [every[k] for k in sorted(order[:count])]
+
+
+@torch.no_grad()
+def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
+    """Mean PSNR over windows of what ``make`` makes of an sRGB patch ``(1, 3, h, w)`` and its place in the frame."""
+    values, (height, width) = [], pair.raw.shape[-2:]
+    for top, left in windows_of(pair, count):
+        window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
+        place = place_in_frame(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
+        values.append(psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]).item())
+    return sum(values) / len(values)

@@ -1,0 +1,295 @@
+"""PSNR and SSIM of an ISP or a denoiser, image by image.
+
+An ISP's PSNR_r is the mean over non-overlapping 256 x 256 mosaic patches of reconstruction against RAW. A denoiser's
+PSNR_d and SSIM are taken on the whole mosaic, on frozen noise: the captured one, or one keyed by (seed, name); and once
+more on sRGB, after one fixed development (:func:`rawaug.data.development.develop_packed`) of result and clean frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+from tqdm.auto import tqdm
+
+import denoisers
+from denoisers.classical import Classical, Stabilised
+from denoisers.network import Denoiser
+from rawaug import bayer
+from rawaug._version import __version__
+from rawaug.bayer import CFA, aligned
+from rawaug.data import open_pairs
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.evaluation.page import Page, shown_on_page
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.evaluation.tables import METRICS, Row
+from rawaug.isp.model import DictionaryISP, find_weights
+from rawaug.metrics import psnr, ssim, worst_and_best_quarter
+from rawaug.noise import NoiseModel, anscombe, noise_model
+from rawaug.seeding import keyed_generator
+
+TILE, OVERLAP = 384, 64
+"""Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
+
+Method = Callable[[Pair, Sample], Tensor]
+"""Denoises the packed RAW of a sample; what it may know of the pair are the levels of the noise."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input."""
+
+    name: str
+    psnr: float
+    ssim: float | None = None
+    psnr_srgb: float | None = None
+    ssim_srgb: float | None = None
+    psnr_noisy: float | None = None
+    ssim_noisy: float | None = None
+    psnr_srgb_noisy: float | None = None
+    ssim_srgb_noisy: float | None = None
+
+
+def read_header(path: str | Path) -> dict[str, str]:
+    """The metadata of a weights file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a rawaug weights file.
+    """
+    path = find_weights(path)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            header = dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"{path}: not a safetensors file ({error}); fit or train it again") from error
+    if header.get("format") != "rawaug":
+        raise ValueError(f"{path}: a safetensors file, but not rawaug's; give one written by rawaug fit or rawaug run")
+    return header
+
+
+def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
+    """The frame as a test case ``(1, 4, h, w)``: its own captured noise, or noise keyed by (seed, name)."""
+    pair = pair.with_levels()
+    clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
+    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
+        noisy = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa)
+        return Sample(noisy, clean, pair.read_var + pair.shot_var * noisy.clamp_min(0.0))
+    params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
+    noisy = noise.apply(clean, params)
+    return Sample(noisy, clean, noise.variance(noisy, params))
+
+
+@torch.no_grad()
+def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, maybe as a mean of views.
+
+    Returns:
+        The same shape, on the CPU.
+    """
+    run: Any = model
+    if max(sample.noisy.shape[-2:]) > TILE:
+        run = partial(denoisers.tiled, model, tile=TILE, overlap=OVERLAP)
+    if self_ensemble:
+        run = denoisers.SelfEnsemble(run, cfa, views=8)
+    device = next(model.parameters()).device
+    denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
+    return denoised.cpu()
+
+
+def score_method(
+    method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
+) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
+    """Scores of every frame, with what was compared; one frame in memory at a time."""
+    for pair in tqdm(pairs, desc=label, unit="image", leave=False):
+        sample = frozen_sample(pair, noise, cfa, seed)
+        denoised = method(pair, sample)
+        values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
+        yield Score(pair.name, *values), pair, sample, denoised
+
+
+def score_denoiser(
+    model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, self_ensemble: bool, label: str
+) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
+    """:func:`score_method` of a network."""
+    return score_method(lambda _, sample: denoise(model, sample, cfa, self_ensemble), pairs, noise, cfa, seed, label)
+
+
+def row_of(models: Mapping[str, Denoiser], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
+    """Panels of a frame: noisy, denoised by each model, clean."""
+    row = Row(pair, {}, {})
+    for name, model in models.items():
+        score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, seed, False, f"picture, {name}"))
+        row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
+        row.panels[name] = denoised
+        row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", name: f"{score.psnr:.2f} dB"}
+    row.panels["clean"] = sample.clean
+    row.captions["clean"] = pair.name
+    return row
+
+
+def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float, float, float, float]:
+    """PSNR and SSIM on the mosaic and on sRGB of packed RAW ``(1, 4, h, w)`` against the clean one."""
+    exposure = exposure_of(clean, pair)
+    raw = [bayer.unpack(x, cfa) for x in (packed, clean)]
+    srgb = [develop_packed(x, cfa, pair, exposure)[None] for x in (packed, clean)]
+    return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
+
+
+def evaluate(
+    weights: str | Path,
+    data: str,
+    self_ensemble: bool = False,
+    noise: str | Sequence[float] | None = None,
+    seed: int = 0,
+    classical: Sequence[str] = (),
+    device: str = "cpu",
+    report: str | Path | None = None,
+) -> dict[str, Any]:
+    """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
+
+    Args:
+        weights: an ISP's or a denoiser's; the file says which.
+        data: a folder of RAW files, or ``kind:path``.
+        self_ensemble: average a denoiser over eight views; its scores without stand under ``plain``.
+        noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
+            with.
+        seed: of that noise.
+        classical: classical denoisers to score beside it on the same noise, see :data:`CLASSICAL`.
+        device: where the denoiser runs.
+        report: HTML file to write: scores and pictures of a denoiser.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
+            is for denoisers and the file is an ISP's.
+    """
+    require_classical(classical)
+    weights = find_weights(weights)
+    kind = read_header(weights)["kind"]
+    pairs = open_pairs(data, split="test")
+    if kind == "isp":
+        if self_ensemble or noise is not None or classical or report is not None:
+            raise ValueError(f"{weights}: is an ISP; self-ensemble, noise, classical and report are for denoisers")
+        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
+        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
+    else:
+        model, info = denoisers.load(weights)
+        levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
+        model = model.to(device)
+        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        if report is not None:
+            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
+            page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
+            for pair in shown_on_page(pairs):
+                page.add_frame(row_of({"denoised": model}, pair, levels, cfa, seed), cfa)
+            page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    return {"kind": kind, "data": data, **result, "weights_sha256": digest, "version": __version__}
+
+
+def _denoiser_result(
+    model: Denoiser,
+    pairs: Sequence[Pair],
+    noise: NoiseModel,
+    cfa: CFA,
+    seed: int,
+    self_ensemble: bool,
+    classical: Sequence[str],
+) -> dict[str, Any]:
+    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
+    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
+    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
+    if self_ensemble:
+        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
+        result |= {"plain": plain, **summary([score for score, *_ in scored])}
+    else:
+        result |= plain
+    if classical:
+        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
+    return result
+
+
+CLASSICAL: dict[str, Callable[[], Classical]] = {
+    "NonLocalMeans": denoisers.NonLocalMeans,
+    "Wavelet": denoisers.Wavelet,
+    "TotalVariation": denoisers.TotalVariation,
+    "BM3D": denoisers.BM3D,
+}
+"""By name; BM3D needs a wheel of its own."""
+
+
+def require_classical(names: Sequence[str]) -> None:
+    """Refuse a name that is no classical denoiser's.
+
+    Raises:
+        ValueError: naming those there are.
+    """
+    for name in names:
+        if name not in CLASSICAL:
+            raise ValueError(f"classical: {name} is unknown; there are {', '.join(CLASSICAL)}")
+
+
+def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
+    """A classical denoiser as something to score; shot noise is stabilised before and after."""
+    require_classical([name])
+    denoiser = CLASSICAL[name]()
+
+    def method(pair: Pair, sample: Sample) -> Tensor:
+        levels = frozen_levels(pair, noise, seed)
+        if levels is None or not levels[0] > 0:
+            return denoiser(sample.noisy, sample.variance)
+        shot_var, read_var = (torch.tensor([level]) for level in levels)
+        return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
+
+    return method
+
+
+def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, float] | None:
+    """(shot_var, read_var) of what :func:`frozen_sample` gives; None if the noise is of another kind."""
+    pair = pair.with_levels()
+    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
+        return pair.shot_var, pair.read_var
+    params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
+    return (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+
+
+def score_classical(
+    names: Sequence[str], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
+) -> dict[str, dict[str, Any]]:
+    """The summary of each classical denoiser, by name."""
+    methods = {name: classical_method(name, noise, seed) for name in names}
+    return {
+        name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
+        for name, method in methods.items()
+    }
+
+
+def summary(scores: Sequence[Score]) -> dict[str, Any]:
+    """Per image, mean, worst and best 25%; what does not apply is left out."""
+    images = [{key: value for key, value in vars(score).items() if value is not None} for score in scores]
+    result: dict[str, Any] = {"images": images}
+    for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
+        known = [value for score in scores if (value := getattr(score, key)) is not None]
+        if known:
+            result[key] = sum(known) / len(known)
+            result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
+    return result
+
+
+def write_json(result: dict[str, Any], path: str | Path) -> None:
+    """Write a result whole or not at all, making its folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(result, indent=1) + "\n")
+    partial.replace(path)

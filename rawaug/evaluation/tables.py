@@ -1,0 +1,156 @@
+"""What an experiment ends with: a table, and a picture of noisy, denoised and clean side by side.
+
+RAW is developed for the eye by one fixed pipeline, the same for every panel of a row: bilinear demosaic, the frame's
+white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve of IEC 61966-2-1.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+
+PANEL = 256
+"""Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
+
+
+METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
+"""Of an image: on the mosaic, and developed."""
+
+
+@dataclass
+class Row:
+    """One frame of the picture: packed panels by title, the clean one last, with their captions."""
+
+    pair: Pair
+    panels: dict[str, Tensor]
+    captions: dict[str, str]
+
+
+def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
+    """Write the figure: one line of panels a row."""
+    from matplotlib.figure import Figure
+
+    columns = max(len(row.panels) for row in rows)
+    figure = Figure(figsize=(3.2 * columns, 3.2 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for line, row in zip(axes, rows, strict=True):
+        exposure = exposure_of(list(row.panels.values())[-1], row.pair)
+        for axis, (title, packed) in zip(line, row.panels.items(), strict=True):
+            panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
+            axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
+            axis.set_title(f"{title}\n{row.captions.get(title, '')}", fontsize=9)
+            axis.set_axis_off()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    return path
+
+
+def _centre(packed: Tensor) -> Tensor:
+    height, width = packed.shape[-2:]
+    rows, columns = min(height, PANEL // 2), min(width, PANEL // 2)
+    top, left = (height - rows) // 2, (width - columns) // 2
+    return packed[..., top : top + rows, left : left + columns]
+
+
+def mean_and_spread(values: Sequence[float], digits: int) -> str:
+    """``mean`` or ``mean +- standard deviation``."""
+    mean = f"{statistics.fmean(values):.{digits}f}"
+    return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
+
+
+COLUMNS = {
+    "PSNR (dB)": ("plain", "psnr"),
+    "SSIM": ("plain", "ssim"),
+    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
+    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
+    "PSNR, sRGB": ("plain", "psnr_srgb"),
+    "SSIM, sRGB": ("plain", "ssim_srgb"),
+}
+"""Of the table: which summary and which figure stand in each column."""
+
+QUARTERS = {
+    f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")
+    for figure, key in (
+        ("PSNR (dB)", "psnr"),
+        ("SSIM", "ssim"),
+        ("PSNR, sRGB", "psnr_srgb"),
+        ("SSIM, sRGB", "ssim_srgb"),
+    )
+    for part in ("worst 25%", "best 25%")
+}
+"""Of the second table of the page."""
+
+Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+
+
+def table_rows(
+    results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Mapping[str, tuple[str, str]]
+) -> dict[str, list[str]]:
+    """Cells by method: the noisy input, classical denoisers, the arms; empty where a figure does not apply."""
+    plain = next(iter(results.values()))[0]["plain"]
+    noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
+    methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": noisy}]}
+    methods |= {name: [{"plain": scores}] for name, scores in (classical or {}).items()}
+    methods |= results
+    rows = {}
+    for method, runs in methods.items():
+        cells = []
+        for kind, key in columns.values():
+            values = [run[kind][key] for run in runs if key in run.get(kind, {})]
+            cells.append(mean_and_spread(values, 2 if "psnr" in key else 4) if values else "")
+        rows[method] = cells
+    return rows
+
+
+def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title)
+    table.add_column("arm")
+    for column in COLUMNS:
+        table.add_column(column, justify="right")
+    for method, cells in table_rows(results, classical, COLUMNS).items():
+        table.add_row(method, *cells)
+    Console(width=110).print(table)
+
+
+def print_scores(result: Mapping[str, Any]) -> None:
+    """The table of ``rawaug evaluate``."""
+    from rich.console import Console
+    from rich.table import Table
+
+    title = "PSNR_r, RAW reconstruction" if result["kind"] == "isp" else "PSNR_d, RAW denoising"
+    table = Table(title=f"{title}: {result['data']}")
+    table.add_column("image")
+    table.add_column("PSNR (dB)", justify="right")
+    for column in ("SSIM", "PSNR, sRGB", "SSIM, sRGB") if result["kind"] == "denoiser" else ():
+        table.add_column(column, justify="right")
+    metrics = METRICS[: len(table.columns) - 1]
+    for image in result["images"]:
+        table.add_row(image["name"], *_cells(image, "{}", metrics))
+    table.add_section()
+    shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
+    for label, key in shown.items():
+        if key.format("psnr") in result:
+            table.add_row(label, *_cells(result, key, metrics))
+    if "plain" in result:
+        table.add_row("mean, without self-ensemble", *_cells(result["plain"], "{}", metrics))
+    for name, scores in result.get("classical", {}).items():
+        table.add_row(name, *_cells(scores, "{}", metrics))
+    Console(width=100).print(table)
+
+
+def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:
+    found = [(metric, result.get(key.format(metric))) for metric in metrics]
+    return ["" if value is None else f"{value:.{2 if 'psnr' in metric else 4}f}" for metric, value in found]

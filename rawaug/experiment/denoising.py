@@ -1,0 +1,264 @@
+"""A recipe, stage by stage: fit the ISP, train every arm, evaluate, report.
+
+Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is not done again, so that
+a run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import denoisers
+from denoisers.network import Denoiser
+from rawaug.bayer import CFA
+from rawaug.commands.fit import fit
+from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
+from rawaug.data.lazy import LazyPairs
+from rawaug.data.pair import Pair
+from rawaug.evaluation.page import Page, draw_curves, shown_on_page
+from rawaug.evaluation.scores import (
+    require_classical,
+    row_of,
+    score_classical,
+    score_denoiser,
+    summary,
+    write_json,
+)
+from rawaug.evaluation.tables import Row, draw, print_table
+from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
+from rawaug.experiment.recipe import Recipe
+from rawaug.isp.model import DictionaryISP, find_weights
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.augment import noise_for
+from rawaug.training.loop import train
+from rawaug.training.noisy_frames import noisy_only
+
+SHOWN = 3
+"""Test frames in the picture."""
+
+Results = dict[str, list[dict[str, Any]]]
+"""By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
+
+
+def run(recipe: Recipe) -> Results:
+    """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``.
+
+    Of several processes (``devices``) the first one writes; the others return empty lists.
+    """
+    return _Run(recipe).all_stages()
+
+
+class _Run:
+    """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe, self.data = recipe, recipe.data
+        self.folder = Path(recipe.out) / recipe.name
+        require_classical(recipe.classical)
+        if recipe.noise != "camera":
+            noise_model(recipe.noise)
+        denoisers.build(recipe.denoiser.name, **recipe.denoiser.settings)
+        self.test = _first(open_pairs(self.data.test), self.data.test_count)
+        source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
+        self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
+        _require_unseen(self.test, {"pairs": source, "validation": self.validation})
+        self.pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
+        self.pairs = list(source[: self.data.count])
+        if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+            self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+
+    def all_stages(self) -> Results:
+        recipe = self.recipe
+        results: Results = {arm: [] for arm in recipe.arms}
+        models: dict[str, Denoiser] = {}
+        for seed in range(recipe.seed, recipe.seed + recipe.seeds):
+            isp = self.fitted_isp(seed)
+            noise = noise_for(isp, recipe.noise)
+            for arm in recipe.arms:
+                models[arm] = self.trained(arm, isp, noise, seed)
+                if _leads():
+                    results[arm].append(self.evaluated(arm, models[arm], noise, isp.cfa, seed))
+        if not _leads():
+            return results
+        classical = score_classical(recipe.classical, self.test, noise, isp.cfa, seed=0)
+        self.reported(results, classical, models, noise, isp.cfa)
+        return results
+
+    def fitted_isp(self, seed: int) -> DictionaryISP:
+        """The ISP of the few pairs, or the recipe's own."""
+        if self.recipe.camera is not None:
+            weights = find_weights(self.recipe.camera)
+            isp = DictionaryISP.from_pretrained(weights)
+            isp.info["key"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            return isp
+        path = self.folder / f"seed{seed}" / "isp.safetensors"
+        settings = {**asdict(self.recipe.isp), "seed": seed}
+        measure = self.recipe.noise == "camera"
+        key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
+        if path.is_file():
+            isp = DictionaryISP.from_pretrained(path)
+            if isp.info.get("key") == key:
+                print(f"fitted already: {path}")
+                return isp
+        isp = fit(self.pairs, noise="on" if measure else "off", **settings)
+        isp.info["key"] = key
+        isp.save(path)
+        return isp
+
+    def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
+        """The denoiser of one arm."""
+        recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
+        path = place / "denoiser.safetensors"
+        config, network = recipe.train, recipe.denoiser
+        parts = (recipe.arms[arm], config, network, self.data)
+        seen = (stamps(self.pairs), stamps(self.validation), len(self.pictures))
+        key = fingerprint(isp.info["key"], recipe.noise, *seen, *(asdict(part) for part in parts))
+        if path.is_file():
+            model, info = denoisers.load(path)
+            if info.get("key") == key:
+                print(f"trained already: {path}")
+                return model
+        if _leads():
+            _discard_other_checkpoint(place, key)
+        stream = training_stream(recipe, recipe.arms[arm], self.pairs, self.pictures, isp, noise, seed)
+        validation = validation_samples(recipe, self.validation, self.pictures, isp, noise)
+        label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
+        where, choose = (recipe.device, recipe.devices), bool(self.validation)
+        model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
+        if not _leads():
+            return model
+        levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
+        info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
+        denoisers.save(model, path, info)
+        (place / "last.pt").unlink(missing_ok=True)
+        return model
+
+    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
+        """Plain and self-ensemble scores on the test frames."""
+        place = self.folder / f"seed{seed}" / arm
+        digest = hashlib.sha256((place / "denoiser.safetensors").read_bytes()).hexdigest()
+        key = fingerprint(digest, self.data.test, stamps(self.test))
+        path = place / "evaluation.json"
+        if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
+            print(f"evaluated already: {path}")
+            return {kind: known[kind] for kind in ("plain", "self_ensemble")}
+        result: dict[str, Any] = {}
+        model.to(_device(self.recipe.device))
+        for kind in ("plain", "self_ensemble"):
+            label, ensemble = f"evaluate {arm}, {kind}", kind == "self_ensemble"
+            scored = score_denoiser(model, self.test, noise, cfa, 0, ensemble, label)
+            result[kind] = summary([score for score, *_ in scored])
+        write_json({"key": key, **result}, path)
+        return result
+
+    def reported(
+        self,
+        results: Results,
+        classical: dict[str, dict[str, Any]],
+        models: dict[str, Denoiser],
+        noise: NoiseModel,
+        cfa: CFA,
+    ) -> None:
+        """``results.json``, the table, the picture, and the page with all of it."""
+        recipe = self.recipe
+        everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
+        write_json(everything, self.folder / "results.json")
+        settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
+        title = f"{recipe.name}: {settings}, tested on {self.data.test}"
+        page, shown = Page(title, results, classical), list[Row]()
+        seeds = range(recipe.seed, recipe.seed + recipe.seeds)
+        page.add_curves(
+            draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
+        )
+        for model in models.values():
+            model.to(_device(recipe.device))
+        for pair in shown_on_page(self.test):
+            row = row_of(models, pair, noise, cfa, seed=0)
+            page.add_frame(row, cfa)
+            shown += [row] if len(shown) < SHOWN else []
+        picture = draw(shown, cfa, self.folder / "picture.png")
+        written = page.write(self.folder / "report.html", asdict(recipe))
+        print_table(results, title, classical)
+        print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
+        if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
+            print(self.pictures.report())
+
+
+def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
+    return pairs if count is None else pairs[:count]
+
+
+def _leads() -> bool:
+    """Whether this is the one of several training processes that writes and evaluates."""
+    from lightning_fabric.utilities.rank_zero import rank_zero_only
+
+    return getattr(rank_zero_only, "rank", 0) == 0
+
+
+def _device(accelerator: str) -> torch.device:
+    """Where Fabric would put a network."""
+    from lightning_fabric import Fabric
+
+    return Fabric(accelerator=accelerator, devices=1).device
+
+
+def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:
+    """Refuse test frames that are also among the frames of training or validation."""
+    unseen = _identities(test)
+    for part, pairs in others.items():
+        seen = unseen & _identities(pairs)
+        if seen:
+            raise ValueError(f"data.test: {min(seen)} is also among data.{part}; test on frames that nothing has seen")
+
+
+def _identities(pairs: Sequence[Pair]) -> set[str]:
+    """What tells frames apart without reading them: the path of a file, else the name."""
+    if isinstance(pairs, RawFolder):
+        return {str(file.resolve()) for file in pairs.files}
+    if isinstance(pairs, LazyPairs):
+        return set(pairs.names)
+    return {pair.name for pair in pairs}
+
+
+def fingerprint(*settings: Any) -> str:
+    """A fingerprint of settings: equal if and only if the stage would do the same."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _discard_other_checkpoint(place: Path, key: str) -> None:
+    """A checkpoint of other settings cannot be gone on from."""
+    place.mkdir(parents=True, exist_ok=True)
+    stamp = place / "key.txt"
+    if not stamp.is_file() or stamp.read_text() != key:
+        for file in ("last.pt", "log.csv"):
+            (place / file).unlink(missing_ok=True)
+    stamp.write_text(key)
+
+
+def stamps(pairs: Sequence[Pair]) -> list[str]:
+    """What a stage that was done with these frames depends on, by frame, told without reading files again.
+
+    Of RAW files path, size and time of change; of the frames of a dataset their names; of frames in memory what is in
+    them, in samples.
+    """
+    if isinstance(pairs, RawFolder):
+        return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]
+    if isinstance(pairs, LazyPairs):
+        return list(pairs.names)
+    return [_sampled(pair) for pair in pairs]
+
+
+def _sampled(pair: Pair) -> str:
+    digest = hashlib.sha256(repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode())
+    for image in (pair.srgb, pair.raw, pair.noisy):
+        if image is not None:
+            digest.update(image.flatten()[::4099].contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

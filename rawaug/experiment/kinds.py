@@ -1,0 +1,52 @@
+"""The kinds of experiment that the key ``experiment`` of a recipe names; without it denoisers are trained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
+from rawaug.experiment.denoising import run
+from rawaug.experiment.recipe import Recipe, smoke
+from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
+
+
+class Kind(NamedTuple):
+    """One kind of experiment.
+
+    Args:
+        settings: dataclass of its keys.
+        run: does it.
+        smoke: its settings in a form of seconds.
+    """
+
+    settings: type[Any]
+    run: Callable[[Any], Any]
+    smoke: Callable[[Any], Any]
+
+
+KINDS = {
+    "training": Kind(Recipe, run, smoke),
+    "reconstruction": Kind(Comparison, compare, smoke_comparison),
+    "ablation": Kind(Ablation, ablate, smoke_ablation),
+}
+
+
+def kind_of(recipe: str | Path) -> str:
+    """The kind of experiment that a recipe's file names.
+
+    Raises:
+        ValueError: if the file cannot be read as YAML, or there is no such kind.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(recipe).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{recipe}: not a YAML file ({reason}); see the recipes in the package") from error
+    kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ValueError(f"{recipe}: experiment {kind!r} is none of {', '.join(KINDS)}")
+    return kind

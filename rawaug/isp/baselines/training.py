@@ -1,0 +1,170 @@
+"""Fitting the baselines: one loop for all that learn by descent, each with its own loss, on random crops of the pairs.
+
+A step draws ``batch`` frames and as many crops from a generator keyed by the seed and the step's number. The crops
+start where the frame's CFA is that of the model, so frames of any pattern train one model. Adam; the rate falls to 0 by
+half a cosine over the budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same
+seed gives the same weights.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from tqdm.auto import tqdm
+
+from rawaug.bayer import CFA
+from rawaug.isp.baselines.base import Crops, CropTrainedISP, ReverseISP
+from rawaug.isp.baselines.upi_tuned import TunedUPI
+from rawaug.isp.fit.samples import FramePair
+from rawaug.isp.stages import as_float
+from rawaug.seeding import keyed_generator
+
+Model = TypeVar("Model", bound=ReverseISP)
+
+CLIP_NORM = 1.0
+"""The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
+
+
+def fit_baseline(
+    model: Model,
+    pairs: Sequence[FramePair],
+    seconds: float | None = None,
+    steps: int | None = None,
+    *,
+    crop: int = 128,
+    batch: int = 4,
+    learning_rate: float | None = None,
+    both: bool = True,
+    seed: int = 0,
+    progress: bool = True,
+) -> Model:
+    """Fit a baseline in place; ``model.info`` tells the steps and seconds it took, and the last loss.
+
+    UPI as published has nothing to fit: it comes back as it is, after 0 steps. Tuned UPI is solved in closed form, in
+    one step, whatever the budget.
+
+    Args:
+        model: one of :data:`rawaug.isp.baselines.BASELINES`, on any device.
+        pairs: frames; read once and kept in memory.
+        seconds: stop after these, reading not counted; the step under way is finished.
+        steps: stop after these. At least one of the two is given, and one step is done in any case.
+        crop: side of the crops, even.
+        batch: crops a step.
+        learning_rate: at the start; the model's own by default.
+        both: also train the forward pass where the method has one.
+        seed: of the crops.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: if there is no budget or no pair, or a frame is smaller than a crop or not registered.
+    """
+    frames = list(pairs)
+    if not frames:
+        raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
+    start = time.perf_counter()
+    steps_done, loss = 0, math.nan
+    if isinstance(model, TunedUPI):
+        model.tune(frames, seed)
+        steps_done = 1
+    elif isinstance(model, CropTrainedISP):
+        budget, draw = _Budget(seconds, steps), _CropDrawer(frames, model.cfa, crop, batch, seed)
+        model.prepare(frames)
+        steps_done, loss = _descend(model, draw, budget, learning_rate, both, progress)
+    model.info = {"frames": [frame.name for frame in frames], "seed": seed, "steps": steps_done}
+    model.info["seconds"] = round(time.perf_counter() - start, 2)
+    if not math.isnan(loss):
+        model.info["loss"] = loss
+    return model.eval()
+
+
+@dataclass(frozen=True)
+class _Budget:
+    """Seconds, steps, or both."""
+
+    seconds: float | None
+    steps: int | None
+
+    def __post_init__(self) -> None:
+        given = [limit for limit in (self.seconds, self.steps) if limit is not None]
+        if not given or min(given) <= 0:
+            raise ValueError(f"give seconds or steps above 0, got seconds={self.seconds}, steps={self.steps}")
+
+    def spent(self, seconds: float, steps: int) -> float:
+        """The part of the budget that is used up, of that limit which is nearer."""
+        by_time = 0.0 if self.seconds is None else seconds / self.seconds
+        by_steps = 0.0 if self.steps is None else steps / self.steps
+        return max(by_time, by_steps)
+
+
+@dataclass(frozen=True)
+class _CropDrawer:
+    """Random crops of frames, keyed by the step, in one CFA."""
+
+    frames: Sequence[FramePair]
+    cfa: CFA
+    side: int
+    batch: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.side < 2 or self.side % 2 or self.batch < 1:
+            raise ValueError(f"crop is even and batch at least 1, got crop {self.side}, batch {self.batch}")
+        for frame in self.frames:
+            height, width = frame.raw.shape[-2:]
+            if not frame.registered:
+                raise ValueError(f"{frame.name}: RAW and sRGB do not meet pixel for pixel; crops need pairs that do")
+            if min(height, width) < self.side + 2:
+                needed = self.side + 2
+                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; take a smaller crop")
+
+    def __call__(self, step: int, device: torch.device) -> Crops:
+        generator = keyed_generator(self.seed, "baseline crops", step)
+        chosen = torch.randint(len(self.frames), (self.batch,), generator=generator).tolist()
+        places = torch.rand(self.batch, 2, generator=generator).tolist()
+        cuts = [self._cut(self.frames[k], *place) for k, place in zip(chosen, places, strict=True)]
+        return Crops(*(torch.stack(values).to(device) for values in zip(*cuts, strict=True)))
+
+    def _cut(self, frame: FramePair, *place: float) -> Crops:
+        """One crop of a frame at ``place`` in [0, 1)^2 of where it can be, without the leading dimension."""
+        shift = CFA(frame.cfa).shift_to(self.cfa)
+        free = ((size - self.side) // 2 for size in frame.raw.shape[-2:])
+        top, left = (first + 2 * int(part * room) for first, part, room in zip(shift, place, free, strict=True))
+        window = (..., slice(top, top + self.side), slice(left, left + self.side))
+        return Crops(as_float(frame.srgb[window]), frame.raw[window], torch.tensor(frame.white_balance))
+
+
+def _descend(
+    model: CropTrainedISP,
+    draw: _CropDrawer,
+    budget: _Budget,
+    learning_rate: float | None,
+    both: bool,
+    progress: bool,
+) -> tuple[int, float]:
+    """Adam until the budget is spent; the number of steps and the last loss."""
+    model.train()
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    rate = model.learning_rate if learning_rate is None else learning_rate
+    optimiser = torch.optim.Adam(parameters, lr=rate)
+    bar = tqdm(desc=f"fit {model.name}", total=budget.steps, disable=not progress, unit="step", leave=False)
+    start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
+    while spent < 1.0:
+        for group in optimiser.param_groups:
+            group["lr"] = rate * 0.5 * (1.0 + math.cos(math.pi * spent))
+        loss = model.loss(draw(step, parameters[0].device), both)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(parameters, CLIP_NORM)
+        optimiser.step()
+        step, value = step + 1, loss.item()
+        elapsed = time.perf_counter() - start
+        spent = budget.spent(elapsed, step)
+        bar.update()
+        bar.set_postfix_str(f"loss {value:.2e}, {elapsed:.0f} s", refresh=False)
+    bar.close()
+    return step, value

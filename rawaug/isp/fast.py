@@ -1,0 +1,142 @@
+r"""The fitted reverse pass as a table and a matrix: the same RAW, dozens of times faster.
+
+``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``
+
+Tone network and gamma are the same for every picture, and pointwise: ``T`` is their table over the sRGB cube, read by
+trilinear interpolation (65 nodes a side: above 75 dB against the network). Colour and gains are one matrix and three
+numbers a picture, and the mask is a function of the coordinates. Every site computes its own colour alone, which the
+mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
+has a table of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from importlib import import_module
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rawaug.bayer import CFA
+from rawaug.isp import stages
+from rawaug.isp.chooser import Chooser
+from rawaug.isp.config import POINTWISE_STAGES
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.setting import ISPParams
+from rawaug.kernels import compiled, fallback, raw_torch
+from rawaug.kernels.threads import one_thread
+
+NODES = 65
+"""Nodes of the table along each axis of the sRGB cube."""
+
+
+class BakedISP(nn.Module):
+    """The reverse pass of an ISP as it is now; later changes of the ISP do not reach it.
+
+    Args:
+        isp: the fitted ISP, its stages in the usual order (any may be left out).
+        nodes: of the table along an axis.
+
+    Raises:
+        ValueError: if the stages are in another order.
+
+    Example:
+        >>> isp = DictionaryISP()
+        >>> baked, srgb = BakedISP(isp), torch.randint(256, (2, 3, 32, 32), dtype=torch.uint8)
+        >>> baked(srgb, baked.choose(srgb)).shape
+        torch.Size([2, 4, 16, 16])
+    """
+
+    table: Tensor
+    attention: Tensor
+
+    def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
+        super().__init__()
+        self.config = isp.config
+        if not bakeable(self.config.stages):
+            raise ValueError(f"only stages in the usual order can be baked, got {' '.join(self.config.stages)}")
+        axis = torch.linspace(0.0, 1.0, nodes)
+        cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
+        networks = isp.reverse_networks
+        with torch.no_grad(), one_thread():  # the same table in every process
+            x = networks.tone(cube) if "tone" in self.config.stages else cube
+            x = stages.gamma_expand(x, networks.gamma) if "gamma" in self.config.stages else x
+            self.register_buffer("table", _as_table(x, nodes))
+            attends = self.config.attention and "shading" in self.config.stages
+            attention = _as_table(networks.attention(cube), nodes) if attends else torch.empty(0, 0, 0, 4)
+            self.register_buffer("attention", attention)
+        self.shading = deepcopy(isp.shading)
+        self.chooser = Chooser(isp)
+
+    def choose(self, srgb: Tensor) -> ISPParams:
+        """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
+        chosen: ISPParams = self.chooser(srgb, self.table)
+        return chosen
+
+    @torch.no_grad()
+    def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to clean packed RAW ``(B, 4, H/2, W/2)``, float32.
+
+        Args:
+            srgb: pictures with even sides.
+            params: camera settings.
+            place: ``(B, 4)`` top, left, height, width of the full frames, or ``(B, 5)`` with the view that the crop was
+                turned to (:func:`rawaug.bayer.turn`); untouched full frames by default.
+            white: where the sensor saturates; nowhere by default.
+
+        Raises:
+            ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.
+        """
+        require_batch(srgb, params, place)
+        camera = self._camera(srgb, params, place)
+        if srgb.dtype != torch.uint8:
+            srgb = srgb.float()
+        if fallback.usable(srgb):  # imported late, for Triton may be missing
+            return fallback.kernel_or(
+                lambda: import_module("rawaug.kernels.raw_triton").unprocess(srgb, camera, white),
+                lambda: raw_torch.unprocess(srgb, camera, white),
+            )
+        if srgb.device.type != "cpu" or not compiled.available():
+            return raw_torch.unprocess(srgb, camera, white)
+        from rawaug.kernels import raw_numba
+
+        return raw_numba.unprocess(srgb, camera, white)
+
+    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> raw_torch.Camera:
+        batch, _, height, width = srgb.shape
+        kept, table = self.config.stages, self.table
+        matrix = params.matrix.to(table) if "colour" in kept else torch.eye(3).to(table).expand(batch, 3, 3)
+        floor = 1.0 / params.gains.to(table)[:, None] if "gains" in kept else torch.ones(batch, 1, 3).to(table)
+        colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
+        frame, shading = table.new_zeros(batch, 6), table.new_empty(0)
+        if "shading" in kept:
+            centre = (float(self.shading.mean[0]), float(self.shading.mean[1]))
+            places = [[0, 0, height, width]] * batch if place is None else place.tolist()
+            frame = table.new_tensor([raw_torch.frame_of(p, height, width, centre) for p in places]).reshape(batch, 6)
+            precision = self.shading.precision * (0.5 / math.log(2.0))
+            shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
+        sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
+        return raw_torch.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
+
+
+def bakeable(order: Sequence[str]) -> bool:
+    """Whether stages stand in the usual order; any may be left out."""
+    return list(order) == [stage for stage in POINTWISE_STAGES if stage in order]
+
+
+def require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
+    """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
+    if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
+        raise ValueError(f"sRGB has shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
+    for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
+        if value is not None and len(value) != len(srgb):
+            raise ValueError(f"{what} is for {len(value)} pictures, the batch has {len(srgb)}")
+
+
+def _as_table(values: Tensor, nodes: int) -> Tensor:
+    """``(1, C, N, N * N)`` on the cube to ``(N, N, N, 4)``, the channels that are missing 0."""
+    channels_last = values[0].permute(1, 2, 0).reshape(nodes, nodes, nodes, -1)
+    return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()

@@ -1,0 +1,71 @@
+"""How an ISP is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+
+_SWITCH = ("auto", "on", "off")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How an ISP is fitted.
+
+    Args:
+        size: "small" has at most 8 atoms in each dictionary and narrow encoders: 0.12 M parameters instead of 0.52 M.
+        atoms: largest number of atoms in each dictionary; more frames than that are clustered.
+        reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
+            digital gain its fourth root) to either side of the frames' mean, so that the hull holds other light as
+            well; 1 adds none.
+        steps: refinement steps of each direction.
+        pixels: random pixels kept of each frame.
+        batch: pixels of each frame in a step.
+        learning_rate: of Adam, falling to 0 by a cosine.
+        shading: "on" fits the lens shading mask, "off" leaves the stage out, "auto" keeps a mask that takes
+            away half of the squared error at least.
+        attention: fit the attention mask as well.
+        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
+            and keeps them where they beat the constants on frames left out.
+        joint_steps: steps of a last end-to-end training of everything at once; None takes 1000 from 50 frames upwards
+            and else 0. Kept only as far as frames left out of it gain.
+        noisy: fit on the captured noisy RAW of the pairs.
+        seed: of the pixels drawn and of the networks' start.
+        isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
+    """
+
+    size: Literal["default", "small"] = "default"
+    atoms: int = 16
+    reach: float = 1.6
+    steps: int = 200
+    pixels: int = 32768
+    batch: int = 4096
+    learning_rate: float = 2e-3
+    shading: Literal["auto", "on", "off"] = "auto"
+    attention: bool = False
+    encoders: Literal["auto", "on", "off"] = "auto"
+    joint_steps: int | None = None
+    noisy: bool = False
+    seed: int = 0
+    isp: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def most_atoms(self) -> int:
+        """``atoms``, as far as the size allows."""
+        return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
+
+    def __post_init__(self) -> None:
+        for key in ("atoms", "pixels", "batch"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key} is at least 1, got {getattr(self, key)}")
+        for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
+            if getattr(self, key) not in values:
+                raise ValueError(f"{key} is {' or '.join(values)}, got {getattr(self, key)!r}")
+        if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
+            raise ValueError(f"isp: unknown {sorted(unknown)}; there are {[key.name for key in fields(ISPConfig)]}")
+        if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):
+            raise ValueError("isp: a fit needs the stage tone or gamma")
+        if self.steps < 0 or self.reach < 1:
+            raise ValueError(f"steps is at least 0 and reach at least 1, got {self.steps} and {self.reach}")

@@ -1,0 +1,269 @@
+r"""The stages of a fit, in order.
+
+1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
+   and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
+2. Tone. The tone network starts as that curve and is refined together with all of stage 1.
+3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
+4. Encoders, where frames that were left out say that they help.
+5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
+6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
+
+The losses are in :mod:`rawaug.isp.fit.losses`.
+
+Source: the model and losses of Conde et al., AAAI 2022; splitting the fit into a global and a per-frame part is what
+makes it hold up with a handful of frames (``docs/fit.md``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from rawaug._version import __version__
+from rawaug.isp import stages
+from rawaug.isp.config import SMALL, ISPConfig
+from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
+from rawaug.isp.fit.colour_fit import FrameColour, Tie, fall_off, least_squares
+from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.encoders import train_encoders
+from rawaug.isp.fit.fit_config import FitConfig
+from rawaug.isp.fit.joint import train_jointly
+from rawaug.isp.fit.losses import cycle_error, reading_error
+from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
+from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.threads import one_thread
+from rawaug.seeding import derived_seed
+
+STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
+"""gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""
+CURVE_STEPS = 150
+CURVE_RATE = 2e-2
+DIMMEST = 0.01
+SHADING_PAYS = 0.5
+"""A mask stays that takes away half of the squared error: what the frames' content feigns takes a few percent."""
+FRAMES_A_STEP = 16
+
+
+def fit_isp(
+    pairs: Iterable[FramePair],
+    config: FitConfig | None = None,
+    progress: bool = True,
+    state: str | Path | None = None,
+    report: Callable[[DictionaryISP], str] | None = None,
+) -> DictionaryISP:
+    """Fit a dictionary ISP to pairs of RAW and sRGB.
+
+    Args:
+        pairs: one or more frames, of one or several cameras; read once.
+        config: settings; see :class:`FitConfig`.
+        progress: show progress bars.
+        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
+
+    Raises:
+        ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
+    """
+    config = config or FitConfig()
+    reading = tqdm(pairs, desc="read", unit="frame", leave=False, disable=None if progress else True)
+    samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
+    fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
+    with one_thread():
+        fit.curve()
+        fit.tone(report)
+        fit.atoms(fit.isp)
+        train_encoders(fit.isp, samples, shots, config, fit.descent)
+        fit.forward()
+        train_jointly(fit.isp, samples, shots, config, fit.descent)
+    fit.descent.finish()
+    fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
+    return fit.isp.eval()
+
+
+def _path(state: str | Path | None) -> Path | None:
+    return None if state is None else Path(state)
+
+
+def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[Shot]) -> str:
+    """What a kept state belongs to: the version, the settings, the very pixels and what the files say of them."""
+    told = [(shot.name, shot.camera, shot.white_balance) for shot in shots]
+    digest = hashlib.sha256(repr((__version__, config, told)).encode())
+    digest.update(samples.srgb.numpy().tobytes())
+    digest.update(samples.target.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
+    """An ISP of the size that the frames call for, drawn from the seed."""
+    patterns = {shot.cfa for shot in shots}
+    count = min(config.most_atoms, len(shots))
+    more = REACH_ATOMS if config.reach > 1.0 else 0
+    settings: dict[str, Any] = {
+        "colour_atoms": count,
+        "gain_atoms": min(config.most_atoms, count + more),
+        "encoder_widths": (SMALL if config.size == "small" else ISPConfig()).encoder_widths,
+        "attention": config.attention,
+        "cfa": str(patterns.pop()) if len(patterns) == 1 else "RGGB",
+        **config.isp,
+    }
+    fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
+    if not fewest <= settings["gain_atoms"] <= most:
+        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames call for {fewest} to {most}")
+    return DictionaryISP(ISPConfig(**settings), derived_seed(config.seed, "isp"))
+
+
+class _Fit:
+    """The ISP under way, with every frame's own colour."""
+
+    def __init__(self, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent) -> None:
+        self.samples, self.shots, self.config, self.descent = samples, shots, config, descent
+        self.isp = new_isp(shots, config)
+        self.tie = Tie(shots)
+        self.toe = torch.zeros(())
+        self.colour = self._start()
+
+    @torch.no_grad()
+    def _start(self) -> FrameColour:
+        """Least squares under the curve of the standard that fits best."""
+        tried = []
+        for gamma, toe in STANDARD_CURVES:
+            self.isp.reverse_networks.gamma.fill_(gamma)
+            self.toe.fill_(toe)
+            self.colour = FrameColour.from_product(least_squares(self._curved(self.samples), self.samples))
+            tried.append((self._error(), gamma, toe, self.colour))
+        _, gamma, toe, colour = min(tried, key=lambda one: one[0])
+        self.isp.reverse_networks.gamma.fill_(gamma)
+        self.toe.fill_(toe)
+        return colour
+
+    # -- stage 1 ----------------------------------------------------------------------------------------------------
+
+    def curve(self) -> None:
+        """Stage 1, without the mask and, where the readings fall off towards the corners, with it as well."""
+        wanted = self.config.shading if "shading" in self.isp.config.stages else "off"
+        with_mask = self.isp.config
+        kept = tuple(stage for stage in with_mask.stages if stage != "shading")
+        self.isp.config = without_mask = replace(with_mask, stages=kept)
+        if wanted != "on":
+            self._descend_on_curve("curve")
+        if wanted == "off":
+            return
+        mean, precision = fall_off(self._curved(self.samples), self.samples, self.colour.product())
+        if wanted == "auto" and not takes_light(mean, precision):
+            return
+        plain, error = self._few_numbers(), self._error()
+        before = {name: tensor.detach().clone() for name, tensor in plain.items()}
+        self.isp.config = with_mask
+        self.isp.shading.set(mean, precision)
+        self._descend_on_curve("curve and shading")
+        if wanted == "auto" and self._error() > SHADING_PAYS * error:
+            self.isp.config = without_mask
+            for name, tensor in plain.items():
+                tensor.data.copy_(before[name])
+
+    @torch.no_grad()
+    def _error(self) -> float:
+        predicted = stages.correct_colour(self._curved(self.samples), self.colour.product())
+        return float(reading_error(predicted, self.samples))
+
+    def _curved(self, part: PixelSamples) -> Tensor:
+        """x2 of the curve, times the mask: what a matrix takes to RAW."""
+        kept, x = self.isp.config.stages, part.srgb
+        x = x + self.toe * (1.0 - x) if "tone" in kept else x
+        x = stages.gamma_expand(x, self.isp.reverse_networks.gamma) if "gamma" in kept else x
+        return x * self.isp.shading(part.place) if "shading" in kept else x
+
+    def _descend_on_curve(self, stage: str) -> None:
+        tensors = self._few_numbers()
+
+        def loss(generator: torch.Generator) -> Tensor:
+            frames, part = self._draw(generator)
+            predicted = stages.correct_colour(self._curved(part), self.colour.pick(frames).product())
+            return reading_error(predicted, part) + self.tie(self.colour)
+
+        self.descent.run(stage, loss, tensors, CURVE_STEPS, CURVE_RATE)
+
+    # -- stage 2 ----------------------------------------------------------------------------------------------------
+
+    def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
+        """Stage 2."""
+        networks = self.isp.reverse_networks
+        networks.tone.start_from(float(self.toe))
+        tensors = self._few_numbers() | named(tone=networks.tone, attention=networks.attention)
+        del tensors["toe"]  # it has gone into the network
+
+        def loss(generator: torch.Generator) -> Tensor:
+            frames, part = self._draw(generator)
+            predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.place)
+            return reading_error(predicted, part) + self.tie(self.colour)
+
+        def tell() -> str:
+            return "" if report is None else report(self.snapshot())
+
+        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, tell)
+
+    def _few_numbers(self) -> dict[str, Tensor]:
+        tensors = named(shading=self.isp.shading) if "shading" in self.isp.config.stages else {}
+        colour = {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
+        return {**tensors, **colour, "toe": self.toe, "gamma": self.isp.reverse_networks.gamma}
+
+    def _draw(self, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
+        """Random frames (all, if few) and pixels of a step."""
+        count, pixels = self.samples.srgb.shape[0], self.samples.srgb.shape[-1]
+        frames: Tensor | slice = slice(None)
+        if count > FRAMES_A_STEP:
+            frames = torch.randperm(count, generator=generator)[:FRAMES_A_STEP]
+        index = torch.randint(pixels, (min(self.config.batch, pixels),), generator=generator)
+        return frames, self.samples.pick(index, frames)
+
+    # -- stage 3 ----------------------------------------------------------------------------------------------------
+
+    def atoms(self, isp: DictionaryISP) -> None:
+        """Stage 3."""
+        set_knee(isp, self.colour, self.samples)
+        set_atoms(isp, self.colour, self.shots, self.config)
+        set_priors(isp, self.samples)
+
+    def snapshot(self) -> DictionaryISP:
+        """The ISP as it would be if stage 2 ended now."""
+        isp = new_isp(self.shots, self.config)
+        isp.load_state_dict(self.isp.state_dict())
+        isp.config = self.isp.config
+        self.atoms(isp)
+        return isp.eval()
+
+    # -- stage 5 ----------------------------------------------------------------------------------------------------
+
+    def forward(self) -> None:
+        """Stage 5."""
+        isp, networks = self.isp, self.isp.forward_networks
+        with torch.no_grad():
+            networks.gamma.copy_(isp.reverse_networks.gamma)
+        tensors = {"gamma": networks.gamma, **named(tone=networks.tone, attention=networks.attention)}
+
+        def loss(generator: torch.Generator) -> Tensor:
+            frames, part = self._draw(generator)
+            params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
+            with torch.no_grad():
+                back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
+            return cycle_error(isp, part, params, back, self.config.noisy)
+
+        self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
+
+
+def takes_light(mean: Tensor, precision: Tensor) -> bool:
+    """Whether a mask takes more than :data:`DIMMEST` of the light at a corner, 1 from the centre."""
+    corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
+    exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)
+    return bool((exponent > DIMMEST).any())
+
+
+def named(**modules: torch.nn.Module) -> dict[str, Tensor]:
+    """The parameters of ``modules`` under their names."""
+    return {f"{name}.{key}": p for name, module in modules.items() for key, p in module.named_parameters()}

@@ -1,0 +1,126 @@
+r"""The reverse pass of a baked ISP, pixel by pixel: look-up, colour, gains, shading, mosaic, clip.
+
+.. math:: y_c = \min(\sum_k C_{ck} T_k(x) \, (floor_c + m \, rise_c) \, G(p) \, A(x_4),\ white), \qquad
+    m = \mathrm{clip}((\bar x_3 - knee) / (1 - knee), 0, 1)^2
+
+with :math:`floor = 1 / g` and :math:`rise = \max(1 - 1 / g, 0)`, which is Brooks' ``max(m + (1 - m) / g, 1 / g)``.
+Every site computes the one colour that its mosaic keeps.
+
+This is the pass in PyTorch, for any device; :mod:`rawaug.kernels.raw_numba` is the fast form for CPUs.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_BAND = 2**19
+"""Pixels that a CPU works on at a time, to bound memory."""
+
+
+class Camera(NamedTuple):
+    """What the pass needs to know, float32 on the device of the pictures.
+
+    Args:
+        table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used.
+        attention: of the same form, A in the first of the four over the cube of x4; or empty, for none.
+        colour: ``(B, 6, 3)``: the rows of the matrix, their mean, floor, rise.
+        knee: mean of x3 where the gains start to spare highlights.
+        frame: ``(B, 6)`` y and x about the mask's centre of the first pixel, of a step down, and of one to the right.
+        shading: ``(3,)`` a, b, c of the mask ``G = 2^-(a y^2 + b x y + c x^2)``; or empty, for none.
+        sites: ``(4, 3)`` row and column within the cell, and colour, of R, Gr, Gb, B; integers on the CPU.
+    """
+
+    table: Tensor
+    attention: Tensor
+    colour: Tensor
+    knee: float
+    frame: Tensor
+    shading: Tensor
+    sites: Tensor
+
+
+def frame_of(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
+    """One row of :attr:`Camera.frame`.
+
+    Args:
+        place: top, left, height, width of the full frame, and the view in which the crop was turned (none if left out).
+        height, width: of the picture as it is, turned.
+        centre: y and x of the mask's centre in the coordinates of :func:`rawaug.isp.stages.place_in_frame`.
+    """
+    top, left, frame_height, frame_width, view = (*place, 0)[:5]
+    half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
+
+    def position(i: int, j: int) -> tuple[float, float]:
+        i, j = height - 1 - i if view & 2 else i, width - 1 - j if view & 1 else j
+        row, column = (j, i) if view & 4 else (i, j)
+        y = (row + top + 0.5 - frame_height / 2) / half_diagonal - centre[0]
+        return y, (column + left + 0.5 - frame_width / 2) / half_diagonal - centre[1]
+
+    (y, x), down, right = position(0, 0), position(1, 0), position(0, 1)
+    return [y, x, down[0] - y, down[1] - x, right[0] - y, right[1] - x]
+
+
+def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
+    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
+    batch, _, height, width = srgb.shape
+    raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device)
+    pictures, rows = batch, height
+    if srgb.device.type == "cpu":
+        pictures, rows = 1, max(2, _BAND // max(width, 1) // 2 * 2)
+    for b in range(0, batch, pictures):
+        own = slice(b, b + pictures)
+        camera_here = camera._replace(colour=camera.colour[own], frame=camera.frame[own])
+        for top in range(0, height, rows):
+            _develop(srgb[own, :, top : top + rows], camera_here, top, raw[own, :, top // 2 : (top + rows) // 2])
+    return raw.clamp_(max=white)
+
+
+def look_up(table: Tensor, x: Tensor) -> Tensor:
+    """Trilinear interpolation of ``table`` ``(N, N, N, 4)`` at ``x`` ``(B, 3, H, W)``: ``(B, 4, H, W)``."""
+    batch, _, height, width = x.shape
+    half = 127.5 if x.dtype == torch.uint8 else 0.5
+    points = (x / half - 1.0).permute(0, 2, 3, 1).reshape(1, batch, height, width, 3)
+    found = F.grid_sample(table.permute(3, 0, 1, 2)[None], points.to(table), padding_mode="border", align_corners=True)
+    return found[0].transpose(0, 1)
+
+
+def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
+    """Rows of pictures from ``top`` on, to ``raw``."""
+    x2 = look_up(camera.table, srgb)[:, :3]
+    mask = _fall_off(camera, top, *srgb.shape[-2:])
+    for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
+        here = x2[..., i::2, j::2]
+        shade = mask if mask is None else mask[..., i::2, j::2]
+        if camera.attention.numel():
+            x4 = _channels(here, camera, slice(0, 3), shade)
+            raw[:, plane] = x4[:, channel] * look_up(camera.attention, x4)[:, 0]
+        else:
+            raw[:, plane] = _channels(here, camera, slice(channel, channel + 1), shade)[:, 0]
+
+
+def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) -> Tensor:
+    """``channels`` of x4 times the mask."""
+    rows, mean, floor, rise = camera.colour[:, :3], camera.colour[:, 3:4], camera.colour[:, 4], camera.colour[:, 5]
+    m = torch.einsum("bck,bkhw->bchw", mean, x2).sub_(camera.knee).div_(1.0 - camera.knee).clamp_(0.0, 1.0).square_()
+    factor = torch.addcmul(floor[:, channels, None, None], m, rise[:, channels, None, None])
+    x4 = torch.einsum("bck,bkhw->bchw", rows[:, channels], x2).mul_(factor)
+    return x4 if mask is None else x4.mul_(mask)
+
+
+def _fall_off(camera: Camera, top: int, height: int, width: int) -> Tensor | None:
+    """The mask ``(B, 1, H, W)`` of the rows from ``top`` on."""
+    if not camera.shading.numel():
+        return None
+    i = torch.arange(top, top + height, device=camera.frame.device)[:, None]
+    j = torch.arange(width, device=camera.frame.device)
+    y, x = (
+        start + i * down + j * right
+        for start, down, right in (camera.frame[:, axis::2, None, None].unbind(1) for axis in (0, 1))
+    )
+    a, b, c = camera.shading
+    return torch.exp2(-(a * y * y + (b * y + c * x) * x))[:, None]

@@ -1,0 +1,1 @@
+"""The product: RAW pairs from the pictures of any Dataset or DataLoader."""

@@ -1,0 +1,107 @@
+"""What was drawn for a pair, and the pair; parameters go to a file and back, and replay the pair bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from rawaug.isp.setting import ISPParams
+
+_KIND = "augment_params"
+
+
+class AugmentParams(NamedTuple):
+    """All that was drawn for a batch; tensors with leading dimension B, or without it for one picture of a Dataset.
+
+    Args:
+        isp: camera settings.
+        noise: levels and seeds of the noise.
+        place: ``(B, 5)`` top, left, height, width, view: where in which full frame the picture stands, and how it was
+            turned after the crop (see :func:`rawaug.bayer.turn`).
+    """
+
+    isp: ISPParams
+    noise: dict[str, Tensor]
+    place: Tensor
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
+        """Every tensor changed alike: ``params.map(lambda t: t[0])`` are those of the first picture."""
+        noise = {name: change(value) for name, value in self.noise.items()}
+        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """As a flat dict, to be kept with a batch; :meth:`from_tensors` is the way back."""
+        isp = {f"isp.{name}": value for name, value in self.isp._asdict().items()}
+        return isp | {f"noise.{name}": value for name, value in self.noise.items()} | {"place": self.place}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
+        """The inverse of :meth:`tensors`.
+
+        Raises:
+            ValueError: if one is missing.
+        """
+        missing = {"place", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
+        if missing:
+            raise ValueError(f"these are no parameters of an augmentation: {', '.join(sorted(missing))} missing")
+        isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
+        noise = {name.removeprefix("noise."): value for name, value in tensors.items() if name.startswith("noise.")}
+        return cls(isp, noise, tensors["place"])
+
+
+class RawPair(NamedTuple):
+    """A training pair, packed R, Gr, Gb, B; without the leading B where it comes from a Dataset.
+
+    Args:
+        noisy: ``(B, 4, H/2, W/2)``, at most 1, below 0 where the noise goes there.
+        clean: ``(B, 4, H/2, W/2)``, at most 1: the sensor saturates there.
+        variance: ``(B, 4, H/2, W/2)`` noise variance as the noisy signal tells it: what a network is given.
+        params: replays the pair.
+    """
+
+    noisy: Tensor
+    clean: Tensor
+    variance: Tensor
+    params: AugmentParams
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> RawPair:
+        """Every tensor changed alike: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
+        return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
+
+
+def save_params(params: AugmentParams, path: str | Path) -> None:
+    """Write parameters to a safetensors file, atomically."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: value.detach().cpu().contiguous() for name, value in params.tensors().items()}
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(save(tensors, {"format": "rawaug", "kind": _KIND}))
+    partial.replace(path)
+
+
+def load_params(path: str | Path) -> AugmentParams:
+    """Parameters from a file of :func:`save_params`, on the CPU.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it holds something else.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file of parameters")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            kind = (file.metadata() or {}).get("kind", "no rawaug parameters")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a readable safetensors file ({error}); save the parameters again") from error
+    if kind != _KIND:
+        raise ValueError(f"{path}: holds {kind}, not the parameters of an augmentation")
+    try:
+        return AugmentParams.from_tensors(tensors)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -1,0 +1,1 @@
+"""Training a RAW denoiser, with clean targets or from noisy frames alone."""

@@ -1,0 +1,207 @@
+"""The training loop: one denoiser, one stream of samples, one page.
+
+``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
+weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
+``torchrun`` or ``fabric run`` start them.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+from tqdm.auto import tqdm
+
+import denoisers
+from denoisers.network import Denoiser
+from rawaug.data.sample import Sample
+from rawaug.metrics import psnr
+from rawaug.seeding import derived_seed
+from rawaug.training.estimators import Supervised
+from rawaug.training.stream import StepSampler, TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l1": nn.functional.l1_loss,
+    "l2": nn.functional.mse_loss,
+    "charbonnier": lambda a, b: ((a - b) ** 2 + 1e-6).sqrt().mean(),
+}
+
+
+def train(
+    stream: TrainingStream,
+    validation: Sequence[Sample],
+    network: DenoiserConfig,
+    config: TrainConfig,
+    folder: Path,
+    seed: int = 0,
+    device: str = "auto",
+    devices: int = 1,
+    label: str = "train",
+    estimator: Supervised | None = None,
+    choose: bool = True,
+) -> Denoiser:
+    """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
+
+    Args:
+        stream: keyed samples.
+        validation: frozen crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
+        network, config: what is trained, and how.
+        folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
+        seed: of the network's start.
+        device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
+        label: heads the progress bar.
+        estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
+        choose: keep the averaged weights of the best validation; if not, those of the end.
+
+    Returns:
+        The network with the weights that are kept, in eval mode, on the CPU.
+
+    Raises:
+        ValueError: if no validation score was a number: the training has diverged.
+    """
+    estimator = estimator or Supervised()
+    fabric = launched(device, devices, config.precision)
+    folder.mkdir(parents=True, exist_ok=True)
+    net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
+    ema = torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
+    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=ema)
+    optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
+    start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
+
+    layout = torch.channels_last if config.channels_last else torch.contiguous_format
+    model, optimiser = fabric.setup(net.to(memory_format=layout), optimiser)  # type: ignore[call-overload]
+    step_model: Any = torch.compile(model) if config.compile else model
+    trained: Any = average.to(fabric.device).module
+    sampler = StepSampler(start, config.steps, stream.batch, fabric.global_rank, fabric.world_size)
+    pinned = fabric.device.type == "cuda"
+    loader = DataLoader(stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=pinned)
+    journal = Journal(folder, start) if fabric.is_global_zero else None
+    began = time.perf_counter()
+
+    bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=journal is None)
+    for step, batch in enumerate(bar, start=start + 1):
+        sample = type(batch)(*(x.to(fabric.device, memory_format=layout) for x in batch))
+        loss = estimator.loss(step_model, sample, LOSSES[config.loss], step / config.steps)
+        optimiser.zero_grad(set_to_none=True)
+        fabric.backward(loss)
+        if config.clip_norm:
+            fabric.clip_gradients(model, optimiser, max_norm=config.clip_norm)
+        optimiser.step()
+        schedule.step()
+        average.update_parameters(net) if config.ema else trained.load_state_dict(net.state_dict())
+
+        rate = (step - start) * stream.batch / (time.perf_counter() - began)
+        if step % config.validate_every == 0 or step == config.steps:
+            score = validate(estimator.corrected(trained), validation, fabric.device)
+            if score > best["psnr"] or not choose:
+                best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
+            mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
+            if journal is not None:
+                journal.log(step, loss=mean_loss, psnr=score, samples_per_second=rate)
+        if journal is not None and (step % config.checkpoint_every == 0 or step == config.steps):
+            parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
+            state = {key: part.state_dict() for key, part in parts.items()}
+            write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
+        told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
+        bar.set_postfix_str(told, refresh=False)
+    if journal is not None:
+        journal.close()
+    if not math.isfinite(best["psnr"]):
+        raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
+    trained.load_state_dict(best["net"])
+    trained.cpu().to(memory_format=torch.contiguous_format)
+    return estimator.corrected(trained).eval()
+
+
+def launched(device: str, devices: int, precision: str) -> Any:
+    """Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself.
+
+    All have met here when it returns, so that none looks for a checkpoint before the first has put away an old one.
+    """
+    from lightning_fabric import Fabric
+
+    nodes = 1
+    if torch.distributed.is_torchelastic_launched():
+        devices = int(os.environ["LOCAL_WORLD_SIZE"])
+        nodes = int(os.environ["WORLD_SIZE"]) // devices
+    fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision)
+    if os.environ.get("LT_CLI_USED") != "1":  # ``fabric run`` has launched it
+        fabric.launch()
+    fabric.barrier()
+    return fabric
+
+
+def learning_rate_factor(step: int, config: TrainConfig) -> float:
+    """Linear warm-up, then a cosine to 1% of the highest rate, or a halving every ``halve_every`` steps."""
+    if step < config.warmup:
+        return (step + 1) / config.warmup
+    if config.schedule == "step":
+        return float(0.5 ** (step // config.halve_every))
+    progress = (step - config.warmup) / max(1, config.steps - config.warmup)
+    return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
+
+
+@torch.no_grad()
+def validate(net: nn.Module, samples: Sequence[Sample], device: torch.device) -> float:
+    """Mean PSNR in dB over frozen samples."""
+    net.eval()
+    scores = [psnr(net(*(x.to(device) for x in (s.noisy, s.variance))), s.clean.to(device)) for s in samples]
+    net.train()
+    return torch.cat(scores).mean().item()
+
+
+def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> tuple[int, dict[str, Any]]:
+    """Load the checkpoint at ``path`` if there is one; the number of steps already done, and the best until then."""
+    if not path.is_file():
+        return 0, {"psnr": float("-inf"), "step": 0}
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    for key, target in {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}.items():
+        target.load_state_dict(state[key])
+    return int(state["step"]), state["best"]
+
+
+def write_atomically(state: dict[str, Any], path: Path) -> None:
+    """A checkpoint is there whole or not at all: a kill leaves the one before."""
+    partial = path.with_name(path.name + ".partial")
+    torch.save(state, partial)
+    partial.replace(path)
+
+
+class Journal:
+    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: what a killed run told beyond it is dropped."""
+
+    def __init__(self, folder: Path, start: int) -> None:
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        self.path = folder / "log.csv"
+        if self.path.is_file():
+            head, *rows = self.path.read_text().splitlines(keepends=True)
+            kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
+            self.path.write_text("".join([head, *kept]) if kept else "")
+        self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
+
+    def log(self, step: int, **values: float) -> None:
+        """One row in the CSV file and one point in each TensorBoard curve."""
+        new = not self.path.is_file() or self.path.stat().st_size == 0
+        with self.path.open("a", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            if new:
+                rows.writerow(["step", *values])
+            rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
+        for name, value in values.items():
+            self.writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self.writer.close()

@@ -1,0 +1,160 @@
+"""Frames of which only a noisy RAW is known, real ones and those made once and for all from sRGB pictures.
+
+Noise that is drawn anew whenever a picture comes up is averaged out over the epochs: the network would in effect be
+shown clean RAW. So the camera setting and the noise of a picture are keyed by (seed, index) for good; only crops, turns
+and what an estimator adds change from step to step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA, aligned
+from rawaug.data.development import develop_packed
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.noise import ShotReadModel
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.pictures import even_sided, to_rgb_tensor
+from rawaug.seeding import keyed_generator
+from rawaug.training.estimators import R2R, SelfSupervised
+from rawaug.training.stream import turned_crop
+
+CACHED = 64
+"""Pictures whose frames are kept: more than this and frames are made when asked for."""
+
+
+class NoisyFrame(NamedTuple):
+    """One scene.
+
+    Args:
+        name: for reports.
+        shots: noisy mosaics of it ``(K, H, W)``.
+        shot_var, read_var: the levels of their noise.
+        cfa: their pattern.
+    """
+
+    name: str
+    shots: Tensor
+    shot_var: float
+    read_var: float
+    cfa: CFA
+
+
+def noisy_only(pair: Pair) -> Pair:
+    """The pair without what only a clean frame could tell.
+
+    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` its development (bilinear demosaic, the
+    camera's white balance and matrix, the sRGB curve). A pair without one is a RAW file as shot: it is noisy itself.
+    """
+    if pair.noisy is None:
+        return pair
+    srgb = develop_packed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
+    return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
+
+
+def noisy_frame(pair: Pair, camera: dict[str, float] | None) -> NoisyFrame:
+    """A real noisy frame.
+
+    Args:
+        pair: as :func:`noisy_only` leaves it.
+        camera: measured ``shot_var`` and ``read_var``, for pairs that do not tell theirs.
+
+    Raises:
+        ValueError: if neither tells the levels.
+    """
+    if pair.shot_var is not None and pair.read_var is not None:
+        return NoisyFrame(pair.name, pair.raw, pair.shot_var, pair.read_var, pair.cfa)
+    if camera is None:
+        raise ValueError(f'{pair.name}: the levels of its noise are not known; measure them with noise: "camera"')
+    return NoisyFrame(pair.name, pair.raw, camera["shot_var"], camera["read_var"], pair.cfa)
+
+
+class FrozenPictures(Sequence[NoisyFrame]):
+    """sRGB pictures as noisy RAW frames that never change.
+
+    Args:
+        pictures: a Dataset of pictures.
+        augment: the camera and its noise.
+        seed: with a picture's index it determines the picture's frame.
+        shots: noisy frames of each scene, of independent noise.
+
+    Raises:
+        ValueError: if the noise is not of the shot and read kind, whose levels the estimators need.
+    """
+
+    def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
+        if not isinstance(augment.noise, ShotReadModel):
+            raise ValueError("self-supervised training needs noise of known shot_var and read_var, such as a preset's")
+        self.pictures, self.augment, self.seed, self.shots = pictures, augment, seed, shots
+        self._kept: dict[int, NoisyFrame] = {}
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        frame = self._kept.get(index) or self._made(index)
+        if len(self._kept) < CACHED:
+            self._kept[index] = frame
+        return frame
+
+    def _made(self, index: int) -> NoisyFrame:
+        srgb = even_sided(to_rgb_tensor(self.pictures[index]))[None]
+        params = self.augment.sample(srgb, keyed_generator(self.seed, "frozen", index))
+        shots = []
+        for shot in range(self.shots):
+            seed = torch.randint(2**62, (1,), generator=keyed_generator(self.seed, "shot", index, shot))
+            pair = self.augment.apply(srgb, params._replace(noise={**params.noise, "seed": seed}))
+            shots.append(bayer.unpack(pair.noisy, self.augment.isp.cfa)[0])
+        shot_var, read_var = (params.noise[name].item() for name in ("shot_var", "read_var"))
+        return NoisyFrame(f"picture {index}", torch.cat(shots), shot_var, read_var, self.augment.isp.cfa)
+
+
+class NoisyCrops:
+    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
+
+    Raises:
+        ValueError: if a real frame is smaller than the crop, or has fewer shots than the estimator needs.
+    """
+
+    def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:
+        self.frames, self.estimator, self.crop, self.cfa = frames, estimator, crop, cfa
+
+    def draw(self, generator: torch.Generator) -> Any:
+        """One crop of a random frame."""
+        frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
+        if len(frame.shots) < self.estimator.shots:
+            name, count = type(self.estimator).__name__, len(frame.shots)
+            raise ValueError(f"{frame.name}: {name} needs {self.estimator.shots} shots of a scene, there is {count}")
+        if min(frame.shots.shape[-2:]) < self.crop + 6:
+            size = f"{frame.shots.shape[-2]} x {frame.shots.shape[-1]}"
+            raise ValueError(f"{frame.name}: a frame of {size} is too small for train.crop={self.crop}")
+        images = turned_crop(aligned(frame.shots, frame.cfa, self.cfa), self.crop, self.cfa, generator)
+        shots = bayer.pack(images[:, None], self.cfa)
+        drawn = self.estimator.sample(shots.shape[1:], generator)
+        return self.estimator.apply(shots, frame.shot_var, frame.read_var, drawn)
+
+
+def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Sample]:
+    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``: an unbiased score that no clean frame is needed for.
+
+    The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
+    constant: the weights that score best are the best, though the decibels are lower than against a clean frame.
+    """
+    samples = []
+    for frame in frames:
+        packed = bayer.pack(aligned(frame.shots[:1], frame.cfa, cfa)[:, None], cfa)
+        estimator = R2R()
+        drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
+        sample = estimator.apply(packed, frame.shot_var, frame.read_var, drawn)
+        samples.append(Sample(*(x[None] for x in sample)))
+    return samples

@@ -1,0 +1,134 @@
+"""The stream of training samples: sample i depends on (seed, i) alone, so any step can be had again.
+
+A batch is part real crops (clean RAW of the few pairs with its captured noise, or with drawn noise where none was
+captured; or of frames that are only known noisy), part RAW made from sRGB pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.noise import NoiseModel
+from rawaug.plugin.dataset import RawPairs
+from rawaug.seeding import keyed_generator
+
+
+class Source(Protocol):
+    """Where samples come from."""
+
+    def draw(self, generator: torch.Generator) -> Any:
+        """A training sample, a named tuple of tensors, that depends on ``generator`` alone."""
+        ...
+
+
+class RealCrops:
+    """Crops of real RAW pairs, in eight turns that keep the CFA.
+
+    Args:
+        pairs: the frames; kept in memory. All are brought to ``cfa`` by leaving out a first row or column.
+        noise: drawn anew for every crop of a frame without a noisy capture; a capture's own noise is never renewed.
+        crop: side in mosaic pixels, even.
+        cfa: the pattern that the network is trained for.
+    """
+
+    def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
+        self.pairs = [pair.with_levels() for pair in pairs]
+        self.noise, self.crop, self.cfa = noise, crop, cfa
+        for pair in self.pairs:
+            if min(pair.raw.shape[-2:]) < crop + 6:
+                size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
+                raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={crop}")
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """One crop of a random frame."""
+        pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+        images = pair.raw if pair.noisy is None else torch.cat([pair.raw, pair.noisy])
+        images = turned_crop(bayer.aligned(images, pair.cfa, self.cfa), self.crop, self.cfa, generator)
+        packed = bayer.pack(images[:, None], self.cfa)
+        params = self.noise.sample(1, generator)
+        if pair.noisy is not None:
+            params = {"shot_var": torch.tensor([pair.shot_var]), "read_var": torch.tensor([pair.read_var])}
+            clean, noisy = packed[:1], packed[1:]
+            level = params["read_var"] + params["shot_var"] * noisy.clamp_min(0.0)
+            return Sample(noisy[0], clean[0], level[0])
+        noisy = self.noise.apply(packed, params)
+        return Sample(noisy[0], packed[0], self.noise.variance(noisy, params)[0])
+
+
+class PictureCrops:
+    """Clean RAW from sRGB pictures, with noise drawn anew: the samples of :class:`rawaug.RawPairs`."""
+
+    def __init__(self, pairs: RawPairs) -> None:
+        self.pairs = pairs
+
+    def draw(self, generator: torch.Generator) -> Sample:
+        """One crop of a random picture."""
+        pair = self.pairs.draw(int(torch.randint(len(self.pairs), (), generator=generator)), generator)
+        return Sample(pair.noisy, pair.clean, pair.variance)
+
+
+def turned_crop(images: Tensor, crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:
+    """A random ``(C, crop, crop)`` of mosaics ``(C, H, W)``, in a random one of eight turns, its pattern kept.
+
+    A larger crop is turned, then cut to size, so that lines lost to the CFA do not show.
+    """
+    side = crop + 4
+    height, width = images.shape[-2:]
+    top = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
+    left = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
+    view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
+    turned = bayer.turn_keeping_cfa(bayer.crop(images, top, left, side, side), cfa, view)
+    return bayer.crop(turned, 0, 0, crop, crop)
+
+
+class TrainingStream(Dataset[Any]):
+    """Sample i of an arm: the first ``augmented`` of every batch from pictures, the rest real.
+
+    Args:
+        real: crops of the few frames; may be None if everything is augmented.
+        pictures: crops from sRGB pictures, or the RawPairs of these; may be None if nothing is augmented.
+        batch: samples in a step.
+        augmented: share from pictures.
+        seed: of all samples.
+    """
+
+    def __init__(
+        self, real: Source | None, pictures: Source | RawPairs | None, batch: int, augmented: float, seed: int
+    ) -> None:
+        self.real, self.batch, self.seed = real, batch, seed
+        self.pictures = PictureCrops(pictures) if isinstance(pictures, RawPairs) else pictures
+        self.from_pictures = round(augmented * batch)
+        if self.from_pictures and pictures is None:
+            raise ValueError("this arm is augmented and needs sRGB pictures; set data.pictures")
+        if self.from_pictures < batch and real is None:
+            raise ValueError("this arm is trained on real pairs and has none; set data.pairs")
+
+    def __getitem__(self, index: int) -> Any:
+        source = self.real if index % self.batch >= self.from_pictures else self.pictures
+        assert source is not None
+        return source.draw(keyed_generator(self.seed, "stream", index))
+
+
+class StepSampler(Sampler[list[int]]):
+    """The samples of each step from ``start`` on; of several processes each takes every ``world``-th."""
+
+    def __init__(self, start: int, steps: int, batch: int, rank: int = 0, world: int = 1) -> None:
+        if batch % world:
+            raise ValueError(f"train.batch={batch} must be a multiple of the number of processes, {world}")
+        self.start, self.steps, self.batch, self.rank, self.world = start, steps, batch, rank, world
+
+    def __len__(self) -> int:
+        return self.steps - self.start
+
+    def __iter__(self) -> Iterator[list[int]]:
+        for step in range(self.start, self.steps):
+            yield [step * self.batch + position for position in range(self.rank, self.batch, self.world)]

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import denoisers
+from rawaug.bayer import CFA, mosaic
+from rawaug.cli import main
+from rawaug.commands.denoise import denoise_file, denoise_folder, denoise_mosaic, levels_of
+from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.noise import noise_levels
+
+LEVELS = (1e-3, 1e-5)
+Dng = Callable[..., Path]
+
+
+def a_scene(cfa: CFA) -> Tensor:
+    """Linear ramps, ``(1, 96, 128)``, as the mosaic of a camera."""
+    y, x = torch.meshgrid(torch.linspace(0.05, 0.6, 96), torch.linspace(0.05, 0.8, 128), indexing="ij")
+    return mosaic(torch.stack([x, y, (x + y) / 2]), cfa)
+
+
+def shot(path: Path, bayer_dng: Dng, cfa: CFA = CFA.RGGB, black: int = 511, **tags: Any) -> Path:
+    raw = a_scene(cfa)
+    noise = torch.randn(raw.shape, generator=torch.Generator().manual_seed(0))
+    noisy = raw + noise * (LEVELS[0] * raw + LEVELS[1]).sqrt()
+    numbers = (noisy[0] * (16383 - black) + black).round().clamp(0, 16383).numpy().astype(np.uint16)
+    return bayer_dng(path, numbers, cfa.value, black=(black,), white=16383, noise_profile=LEVELS, **tags)
+
+
+class LocalMean(denoisers.UNet):
+    """A denoiser that is known: the mean of 5 x 5 packed pixels, of each plane."""
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        assert variance is not None
+        self.seen = float(variance.min()), float(variance.max())
+        return torch.nn.functional.avg_pool2d(noisy, 5, 1, 2, count_include_pad=False)
+
+
+@pytest.fixture
+def identity(tmp_path: Path) -> Path:
+    """The weights of an untrained network, which changes nothing."""
+    path = tmp_path / "weights" / "identity.safetensors"
+    path.parent.mkdir()
+    denoisers.save(denoisers.UNet(width=4, scales=2), path, {"cfa": "GRBG"})
+    return path
+
+
+@pytest.mark.parametrize("own", list(CFA))
+@pytest.mark.parametrize("self_ensemble", [False, True])
+def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
+    tmp_path: Path, bayer_dng: Dng, own: CFA, self_ensemble: bool
+) -> None:
+    frame = read_raw(shot(tmp_path / "a.dng", bayer_dng, own))
+    model = LocalMean(width=4, scales=2)
+    denoised = denoise_mosaic(model, CFA.GRBG, frame, LEVELS, self_ensemble)
+    assert denoised.shape == frame.mosaic.shape
+    clean = a_scene(own)
+    inner = (..., slice(12, -12), slice(12, -12))
+    before, after = ((x - clean)[inner].square().mean() for x in (frame.mosaic, denoised))
+    assert after < before / 10
+    for i in (0, 1):
+        for j in (0, 1):  # no cast: every site of the cell on its own
+            assert abs((denoised - clean)[inner][0, i::2, j::2].mean()) < 1e-3
+    assert model.seen[1] == pytest.approx(LEVELS[0] * frame.mosaic.max().item() + LEVELS[1], rel=0.01)
+
+
+def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
+    source = shot(tmp_path / "a.dng", bayer_dng, orientation=6)
+    result = denoise_file(source, tmp_path / "out" / "b.dng", identity)
+    assert (result.shot_var, result.read_var, result.told_by) == (*LEVELS, "profile") and result.below_zero == 0
+    before, after = read_raw(source), read_raw(tmp_path / "out" / "b.dng")
+    assert torch.equal(before.mosaic, after.mosaic)
+    for key in ("cfa", "black", "white", "white_balance", "camera", "orientation", "iso", "daylight"):
+        assert getattr(before, key) == getattr(after, key), key
+    assert torch.equal(before.color_matrix, after.color_matrix)
+    assert after.noise_profile is None
+
+
+def test_below_the_digital_number_0_is_counted(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = shot(tmp_path / "a.dng", bayer_dng, black=0)
+    monkeypatch.setattr(denoisers.UNet, "forward", lambda self, noisy, variance=None: noisy - 0.1)
+    result = denoise_file(source, tmp_path / "b.dng", identity)
+    expected = (read_raw(source).mosaic < 0.1 - 0.5 / 16383).float().mean().item()
+    assert result.below_zero == pytest.approx(expected, abs=1e-3) and expected > 0.01
+    assert read_raw(tmp_path / "b.dng").mosaic.min() == 0
+
+
+def test_where_the_levels_come_from(tmp_path: Path, bayer_dng: Dng) -> None:
+    frame = read_raw(shot(tmp_path / "a.dng", bayer_dng))
+    assert levels_of(frame) == (*LEVELS, "profile")
+    assert levels_of(frame, (1e-2, 1e-4)) == (1e-2, 1e-4, "given")
+    phone = dataclasses.replace(frame, iso=800.0)
+    assert levels_of(phone, "Google Pixel")[0] == pytest.approx(0.001764, rel=1e-3)
+    for camera in ("SonyA7S2", "NikonD850"):  # the law itself, not a draw about it
+        draws = noise_levels(camera, iso=800).sample(4001, torch.Generator().manual_seed(0))[1]
+        assert levels_of(phone, camera)[1] == pytest.approx(draws.median().item(), rel=0.05)
+    with pytest.raises(ValueError, match="a: ISO 800000"):
+        levels_of(dataclasses.replace(frame, iso=8e5), "Google Pixel")
+    with pytest.raises(ValueError, match="not negative"):
+        levels_of(frame, (-1e-3, -0.1))
+    with pytest.raises(ValueError, match="does not tell its ISO"):
+        levels_of(frame, "Google Pixel")
+    with pytest.raises(ValueError, match="'upi' is none of auto, profile, estimate"):
+        levels_of(frame, "upi")
+    bare = dataclasses.replace(frame, noise_profile=None)
+    with pytest.raises(ValueError, match="a: has no NoiseProfile tag"):
+        levels_of(bare, "profile")
+    with pytest.raises(ValueError, match=r"a: too few .* give --noise as two variances"):
+        levels_of(bare)
+
+
+def test_levels_are_estimated_without_a_profile() -> None:
+    generator = torch.Generator().manual_seed(0)
+    clean = torch.linspace(0.02, 0.9, 640).expand(1, 640, 640)
+    noisy = clean + (LEVELS[0] * clean + LEVELS[1]).sqrt() * torch.randn(clean.shape, generator=generator)
+    frame = RawFrame(
+        noisy.clamp(max=1), CFA.RGGB, (64.0,) * 4, 1023.0, (1.0,) * 3, (1.0,) * 3, torch.eye(3), "x", None, None, 0, "a"
+    )
+    shot_var, read_var, told_by = levels_of(frame)
+    assert told_by == "estimate" and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
+
+
+def test_folders_are_resumed(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    (source / "sub").mkdir(parents=True)
+    shot(source / "a.dng", bayer_dng)
+    shot(source / "sub/a.dng", bayer_dng)
+    (source / "broken.nef").write_bytes(b"no RAW")
+    first = denoise_folder(source, out, identity)
+    assert sorted(str(done.out.relative_to(out)) for done in first.files) == ["a.dng", "sub/a.dng"]
+    assert len(first.broken) == 1 and "broken.nef" in next(iter(first.broken.values()))
+    (out / "sub/a.dng").unlink()
+    second = denoise_folder(source, out, identity)
+    assert (len(second.files), second.there) == (1, 1)
+    with pytest.raises(ValueError, match=r"denoise\.json: made with noise auto, not estimate"):
+        denoise_folder(source, out, identity, noise="estimate")
+    with pytest.raises(ValueError, match="choose a folder outside"):
+        denoise_folder(source, source / "out", identity)
+    (source / "a.nef").write_bytes(b"no RAW")
+    with pytest.raises(ValueError, match="has this stem"):
+        denoise_folder(source, out, identity)
+
+
+def test_the_command(tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = shot(tmp_path / "a.dng", bayer_dng)
+    command = ["denoise", str(source), str(tmp_path / "b.dng"), "--denoiser", str(identity)]
+    assert main([*command, "--noise", "[0.002, 1e-5]"]) == 0
+    assert "shot_var 0.002, read_var 1e-05 (given)" in capsys.readouterr().out
+    assert main(["denoise", str(source), str(source), "--denoiser", str(identity)]) == 2
+    assert "is the file to denoise" in capsys.readouterr().err
+    assert main(["denoise", str(source), str(tmp_path / "b.tif"), "--denoiser", str(identity)]) == 2
+    assert "name that ends in .dng" in capsys.readouterr().err
+    assert main(["denoise", str(tmp_path / "gone.dng"), str(tmp_path / "b.dng"), "--denoiser", str(identity)]) == 2
+    assert "gone.dng: no such RAW file" in capsys.readouterr().err
+
+
+def test_12_megapixels_take_less_than_2_gib(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
+    numbers = np.random.default_rng(0).integers(400, 4000, (3000, 4000)).astype(np.uint16)
+    bayer_dng(tmp_path / "a.dng", numbers, black=(64,), noise_profile=LEVELS)
+    code = "import sys; from rawaug.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = ["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng"), "--denoiser", str(identity)]
+    child = subprocess.Popen([sys.executable, "-c", code, *command], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    assert child.returncode == 0
+    assert usage.ru_maxrss < 2 * 2**20  # KiB
+
+
+def test_a_real_dng_keeps_its_gain_maps(tmp_path: Path, camera_files: Path, identity: Path) -> None:
+    source = camera_files / "raw/gopro/hero6_0024.dng"
+    frame = read_raw(source)
+    cut = dataclasses.replace(frame, mosaic=frame.mosaic[:, :256, :256].contiguous())
+    write_dng(tmp_path / "cut.dng", cut, source)
+    denoise_file(tmp_path / "cut.dng", tmp_path / "b.dng", identity)
+    back = read_raw(tmp_path / "b.dng")
+    assert len(back.gain_maps) == 4 and back.orientation == 1 and back.iso == 100
+    assert torch.equal(back.shading_gains, cut.shading_gains) and torch.equal(back.mosaic, cut.mosaic)

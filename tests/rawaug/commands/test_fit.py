@@ -1,0 +1,164 @@
+"""``rawaug fit``: what it is fitted to, what it only looks at, and how a stopped fit goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import rawaug
+from rawaug.cli import main
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.io import read_picture, read_raw_and_develop, write_picture
+from rawaug.isp.fit.descent import Descent
+from rawaug.isp.model import DictionaryISP
+
+QUICK = ["--steps", "4", "--pixels", "512", "--batch", "128", "--noise", "off"]
+INTERRUPTED = 130
+
+Shoot = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def short_first_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 10)
+
+
+@pytest.fixture
+def shoot(tmp_path: Path, bayer_dng: Shoot) -> Shoot:
+    """Writes a DNG of coarse random greys: ``shoot("folder/name.dng", side)``."""
+
+    def write(name: str, side: int = 96) -> Path:
+        file = tmp_path / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        rng = np.random.default_rng(sum(name.encode()))
+        coarse = rng.uniform(200, 3000, (side // 8, side // 8))
+        return bayer_dng(file, np.kron(coarse, np.ones((8, 8))).astype(np.uint16))
+
+    return write
+
+
+def fit(out: Path, *arguments: object, status: int = 0) -> DictionaryISP:
+    assert main(["fit", *map(str, arguments), "--out", str(out), *QUICK]) == status
+    return DictionaryISP.from_pretrained(out) if status == 0 else DictionaryISP()
+
+
+def same(a: DictionaryISP, b: DictionaryISP) -> bool:
+    first, second = a.state_dict(), b.state_dict()
+    return set(first) == set(second) and all(torch.equal(first[key], second[key]) for key in first)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line on stderr with which ``arguments`` are refused."""
+    capsys.readouterr()
+    assert main([str(a) for a in arguments]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return str(line)
+
+
+def test_files_and_folders_are_fitted_together(
+    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = shoot("one.dng"), shoot("two.dng")
+    shoot("more/b.dng"), shoot("more/deep/a.dng")
+    out = tmp_path / "x.safetensors"
+    isp = fit(out, one, tmp_path / "more", two)
+    assert isp.info["frames"] == ["one", "b", "a", "two"]
+    assert isp.info["data"] == [str(one), str(tmp_path / "more"), str(two)]
+    assert f"fitted 4 frames in {isp.info['seconds']} s: {out}" in capsys.readouterr().out
+    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", steps=4, pixels=512, batch=128)
+    assert same(isp, by_hand)
+    assert not same(isp, fit(out, one, two))
+
+
+def test_what_cannot_be_fitted_together_is_named(
+    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, out = shoot("one.dng"), ["--out", tmp_path / "x.safetensors"]
+    assert "demo:train: a known dataset is fitted alone" in refused(capsys, "fit", one, "demo:train", *out)
+    assert "gone.dng" in refused(capsys, "fit", one, tmp_path / "gone.dng", *out)
+    assert "gone" in refused(capsys, "fit", one, "--held-out", tmp_path / "gone", *out)
+    assert not (tmp_path / "x.safetensors").exists() and not list(tmp_path.glob("*.state"))
+
+
+@pytest.mark.parametrize("side", [96, 264])
+def test_held_out_frames_are_scored_and_leave_no_trace_in_the_fit(
+    side: int, tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen, unseen = [shoot("a.dng"), shoot("b.dng")], shoot("unseen.dng", side)
+    alone = fit(tmp_path / "alone.safetensors", *seen)
+    capsys.readouterr()
+    watched = fit(tmp_path / "watched.safetensors", *seen, "--held-out", unseen)
+    assert same(alone, watched) and watched.info["frames"] == ["a", "b"]
+    scores = watched.info["held_out"]
+    assert len(scores) == 2 and scores[0].keys() == scores[1].keys() == {"blind", "as_shot"}
+    assert all(5.0 < value < 70.0 for value in scores[-1].values())
+    said = capsys.readouterr().out
+    assert f"held out: {scores[-1]['blind']:.2f} dB blind, {scores[-1]['as_shot']:.2f} dB with" in said
+    assert "held_out" not in alone.info
+
+
+def test_the_last_score_is_that_of_the_file(tmp_path: Path, shoot: Shoot) -> None:
+    out, unseen = tmp_path / "x.safetensors", shoot("unseen.dng", 264)
+    scores = fit(out, shoot("a.dng"), "--held-out", unseen).info["held_out"]
+    pair, isp = rawaug.data.RawFolder(unseen)[0], DictionaryISP.from_pretrained(out)
+    assert scores[-1]["blind"] == pytest.approx(psnr_r(isp, pair), abs=0.006)
+    assert scores[-1]["as_shot"] == pytest.approx(psnr_r(isp, pair, white_balance=True), abs=0.006)
+
+
+def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
+    tmp_path: Path, shoot: Shoot, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames, out = [shoot("a.dng"), shoot("b.dng")], tmp_path / "x.safetensors"
+    state = tmp_path / "x.safetensors.state"
+    whole = fit(tmp_path / "whole.safetensors", *frames)
+    kept, restore = Descent._keep, Descent._restore
+    steps: dict[str, int] = {}
+
+    def stop(self: Descent, stage: str, *rest: object) -> None:
+        kept(self, stage, *rest)  # type: ignore[arg-type]
+        if stage == "sRGB to RAW":
+            raise KeyboardInterrupt
+
+    def noted(self: Descent, stage: str, *rest: object) -> int:
+        steps[stage] = restore(self, stage, *rest)  # type: ignore[arg-type]
+        return steps[stage]
+
+    monkeypatch.setattr(Descent, "_keep", stop)
+    fit(out, *frames, status=INTERRUPTED)
+    assert state.is_file() and not out.exists()
+    assert "the same command goes on from here" in capsys.readouterr().err
+    stopped = state.read_bytes()
+    monkeypatch.setattr(Descent, "_keep", kept)
+    monkeypatch.setattr(Descent, "_restore", noted)
+    assert same(fit(out, *frames), whole)
+    assert steps.pop("curve") == 10 and steps.pop("sRGB to RAW") == 4  # not one of them again
+    assert set(steps.values()) == {0} and not state.exists()
+
+    state.write_bytes(stopped)  # of other frames it is not used
+    fit(out, frames[0])
+    assert set(steps.values()) == {0} and not state.exists()
+    state.write_bytes(b"cut off")
+    assert "x.safetensors.state" in refused(capsys, "fit", *frames, "--out", out, *QUICK)
+
+
+def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: Shoot) -> None:
+    raw = shoot("shots/a.dng", 128)
+    plain = fit(tmp_path / "x.safetensors", raw, "--held-out", raw)
+    rendering = read_raw_and_develop(raw)[1]
+    write_picture(tmp_path / "shots" / "a.jpg", rendering // 2 + 60)  # not what LibRaw would make of it
+    assert read_picture(tmp_path / "shots" / "a.jpg").shape == rendering.shape
+    with_jpeg = fit(tmp_path / "x.safetensors", raw, "--held-out", raw)
+    without = fit(tmp_path / "x.safetensors", raw, "--held-out", raw, "--camera-jpeg", "false")
+    assert same(without, plain) and without.info["held_out"] == plain.info["held_out"]
+    assert not same(with_jpeg, plain) and with_jpeg.info["held_out"] != plain.info["held_out"]
+    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, steps=4, pixels=512, batch=128), plain)
+
+
+def test_pairs_are_fitted_as_they_are() -> None:
+    pairs = rawaug.data.demo_pairs("train", count=2)
+    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=pairs[1:], steps=2, pixels=256, batch=64)
+    assert isp.info["frames"] == [pair.name for pair in pairs] and len(isp.info["held_out"]) == 2

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from rawaug import DictionaryISP, ISPConfig, RawAugment
+from rawaug.bayer import pack
+from rawaug.cli import main
+from rawaug.commands.pair_files import camera_frames, replay
+from rawaug.commands.synth import synth
+from rawaug.io import read_raw, write_picture
+from rawaug.noise import estimate_noise
+
+FIXED = (2e-3, 1e-4)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four pictures, two of them of one stem, and a broken one."""
+    folder = tmp_path_factory.mktemp("pictures")
+    (folder / "sub").mkdir()
+    generator = torch.Generator().manual_seed(0)
+    for name, size in (("a.png", (64, 96)), ("a.jpg", (63, 65)), ("sub/b.png", (96, 64)), ("c.png", (64, 64))):
+        coarse = torch.rand(1, 3, 8, 8, generator=generator)
+        write_picture(folder / name, torch.nn.functional.interpolate(coarse, size, mode="bilinear")[0])
+    (folder / "broken.jpg").write_bytes((folder / "a.jpg").read_bytes()[:300])
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("format", ["dng", "npz", "tiff"])
+def test_every_format_replays_bit_for_bit(tmp_path: Path, pictures: Path, format: str) -> None:
+    result = synth(pictures, tmp_path, format=format, per_image=2, workers=0)  # type: ignore[arg-type]
+    assert (result.pictures, result.made, result.there) == (5, 8, 0)
+    assert list(result.broken) == ["broken.jpg"] and "broken.jpg" in result.broken["broken.jpg"]
+    stems = sorted(str(file.relative_to(tmp_path).with_suffix("")) for file in tmp_path.rglob("*.safetensors"))
+    assert stems == [f"{stem}_{k}" for stem in ("a_jpg", "a_png", "c", "sub/b") for k in (0, 1)]
+    pair = replay(tmp_path / "sub/b_1.safetensors")
+    assert pair.clean.shape == (4, 48, 32)
+    for name, packed in (("clean", pair.clean), ("noisy", pair.noisy)):
+        stem = tmp_path / "sub" / "b_1"
+        if format == "npz":
+            with np.load(f"{stem}.npz") as file:
+                assert np.array_equal(file[name], packed.numpy())
+                assert file["shot_var"] == pair.params.noise["shot_var"].numpy() and str(file["cfa"]) == "RGGB"
+        elif format == "tiff":
+            mosaic = torch.from_numpy(tifffile.imread(f"{stem}_{name}.tif"))[None]
+            assert torch.equal(pack(mosaic, "RGGB"), packed)
+        else:
+            frame = read_raw(f"{stem}_{name}.dng")
+            step = 1 / (frame.white - frame.black[0])
+            assert torch.allclose(pack(frame.mosaic, frame.cfa), packed, atol=0.51 * step, rtol=0)
+            levels = (pair.params.noise["shot_var"].item(), pair.params.noise["read_var"].item())
+            assert frame.noise_profile == (levels if name == "noisy" else None)
+
+
+def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    synth(pictures, whole, per_image=2, workers=0)
+    synth(pictures, parts, per_image=1, workers=0)
+    for file in parts.rglob("a_png_0*"):
+        file.unlink()
+    (parts / "c_1_clean.dng.partial").write_bytes(b"a run that was killed here")
+    again = synth(pictures, parts, per_image=2, workers=0)
+    assert (again.made, again.there) == (5, 3)
+    assert contents(parts) == contents(whole)
+    assert synth(pictures, parts, per_image=2, workers=0).made == 0
+    other = synth(pictures, tmp_path / "other", seed=1, workers=0).out
+    assert contents(other)["c_0_noisy.dng"] != contents(whole)["c_0_noisy.dng"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes of a session")
+def test_a_killed_run_with_a_worker_goes_on_without_and_leaves_no_process(tmp_path: Path, pictures: Path) -> None:
+    many, out, whole = tmp_path / "many", tmp_path / "out", tmp_path / "whole"
+    many.mkdir()
+    for k in range(60):
+        (many / f"{k}.png").write_bytes((pictures / "a.png").read_bytes())
+    code = f"from rawaug.commands.synth import synth; synth({str(many)!r}, {str(out)!r}, workers=1)"
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, start_new_session=True) as process:
+        while len(list(out.glob("*.safetensors"))) < 5 and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    for _ in range(100):
+        if not others_in_session(process.pid):
+            break
+        time.sleep(0.1)
+    assert not others_in_session(process.pid)
+    assert 5 <= len(list(out.glob("*.safetensors"))) < 60
+    synth(many, out, workers=0)
+    synth(many, whole, workers=0)
+    assert contents(out) == contents(whole)
+
+
+def others_in_session(session: int) -> list[str]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended meanwhile
+            continue
+        if fields[0] != "Z" and fields[3] == str(session):
+            found.append(stat.parent.name)
+    return found
+
+
+def test_the_dngs_tell_the_truth(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    ramp = torch.linspace(0.1, 0.9, 512)[None, :, None].expand(3, 512, 512)
+    write_picture(tmp_path / "in/ramp.png", ramp)
+    synth(tmp_path / "in", tmp_path / "out", noise=FIXED, workers=0)
+    clean, noisy = (read_raw(tmp_path / f"out/ramp_0_{name}.dng") for name in ("clean", "noisy"))
+    assert noisy.noise_profile == pytest.approx(FIXED) and clean.noise_profile is None
+    assert noisy.black == clean.black and noisy.mosaic.min() < -0.01 < 0 <= clean.mosaic.min() + 1e-4
+    estimate = estimate_noise(noisy.mosaic, noisy.cfa)
+    assert estimate.shot_var == pytest.approx(FIXED[0], rel=0.1)
+    balanced = pack(clean.mosaic, clean.cfa)[[0, 1, 3]].mean((1, 2)) * torch.tensor(clean.white_balance)
+    assert balanced / balanced[1] == pytest.approx(torch.ones(3), abs=0.03), "grey is not neutral"
+
+
+def test_lens_shading_comes_as_a_gain_map() -> None:
+    isp = DictionaryISP(ISPConfig(attention=False))
+    isp.shading.set(torch.tensor([0.1, -0.2]), torch.eye(2))
+    augment = RawAugment(isp, noise=(0.0, 0.0))
+    srgb = torch.full((3, 64, 96), 0.5)
+    pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))
+    clean, _, stops = camera_frames(pair, augment)
+    flat = pack(clean.mosaic * clean.shading_gains, clean.cfa)
+    assert clean.mosaic.std() / clean.mosaic.mean() > 0.05
+    assert (flat.std((1, 2)) / flat.mean((1, 2))).max() < 1e-3
+    rgb = flat[[0, 1, 3]].mean((1, 2)) * torch.tensor(clean.white_balance) * 2**stops
+    assert rgb == pytest.approx(torch.full((3,), 0.5**2.2), rel=1e-2)
+
+
+def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere: no such folder of pictures"):
+        synth(tmp_path / "nowhere", tmp_path / "out")
+    with pytest.raises(ValueError, match="would lie among the pictures"):
+        synth(pictures, pictures / "out", workers=0)
+    with pytest.raises(ValueError, match="'bogus' is unknown"):
+        synth(pictures, tmp_path / "out", noise="bogus", workers=0)
+    synth(pictures, tmp_path / "out", workers=0)
+    with pytest.raises(ValueError, match=r"synth\.json: made with seed 0, not 1; choose another folder"):
+        synth(pictures, tmp_path / "out", seed=1, workers=0)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "x.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="none of its 1 pictures can be read"):
+        synth(tmp_path / "in", tmp_path / "none", workers=0)
+
+
+def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) -> None:
+    (tmp_path / "in").mkdir()
+    picture = tmp_path / "in" / "c.png"
+    picture.write_bytes((pictures / "c.png").read_bytes())
+    synth(tmp_path / "in", tmp_path / "out", workers=0)
+    params = tmp_path / "out/c_0.safetensors"
+    before = replay(params)
+    moved = picture.rename(tmp_path / "moved.png")
+    with pytest.raises(FileNotFoundError, match=r"c\.png"):
+        replay(params)
+    assert torch.equal(replay(params, picture=moved).noisy, before.noisy)
+    with pytest.raises(ValueError, match="has changed since"):
+        replay(params, picture=pictures / "sub/b.png")
+    DictionaryISP().save(tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="is not the one that made this pair"):
+        replay(params, picture=moved, isp=tmp_path / "other.safetensors")
+
+
+def test_the_command(tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["synth", str(pictures), str(tmp_path / "out"), "--noise", "[0.001, 1e-5]", "--workers", "0"]
+    assert main([*command, "--per-image", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "pairs made" in text and "broken:" in text and "broken.jpg" in text
+    assert main([*command, "--format", "npz"]) == 2
+    assert "made with format dng, not npz" in capsys.readouterr().err
+
+
+def test_pairs_of_one_run_differ(tmp_path: Path, pictures: Path) -> None:
+    synth(pictures, tmp_path, per_image=2, workers=0)
+    first, second = (replay(tmp_path / f"c_{k}.safetensors") for k in (0, 1))
+    assert not torch.equal(first.clean, second.clean) and not torch.equal(first.noisy, second.noisy)
+    seeds = {replay(file).params.noise["seed"].item() for file in tmp_path.rglob("*.safetensors")}
+    assert len(seeds) == 8, "pictures or numbers share their draws"

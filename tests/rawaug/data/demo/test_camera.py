@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from rawaug.bayer import CFA, pack
+from rawaug.data import DemoCamera
+from rawaug.data.demo.camera import BLACK, NOISE_LEVELS, WHITE, Shot, _shading, _tone
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def flat(level: int, size: int = 192) -> torch.Tensor:
+    return torch.full((3, size, size), level, dtype=torch.uint8)
+
+
+DAYLIGHT = Shot(white_balance=(2.0, 1.0, 1.5), exposure=0.9, iso=100, noise_seed=7)
+
+
+def test_capture_is_sample_and_apply_and_replays_bit_for_bit() -> None:
+    picture = torch.randint(0, 256, (3, 32, 48), dtype=torch.uint8, generator=generator())
+    camera = DemoCamera()
+    captured = camera.capture(picture, generator(3), "shot")
+    again = camera.apply(picture, camera.sample(generator(3)), "shot")
+    for field in ("srgb", "raw", "noisy", "color_matrix"):
+        assert torch.equal(getattr(captured, field), getattr(again, field))
+    assert captured.white_balance == again.white_balance and captured.cfa == CFA.GRBG
+
+
+@pytest.mark.parametrize("iso", NOISE_LEVELS)
+@pytest.mark.parametrize("level", [0, 60, 255])
+def test_noise_has_the_variance_of_its_levels_and_no_bias(iso: int, level: int) -> None:
+    pair = DemoCamera().apply(flat(level), dataclasses.replace(DAYLIGHT, iso=iso))
+    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
+    noise = (pair.noisy - pair.raw).double()
+    step = 1 / (WHITE - BLACK)
+    expected = pair.shot_var * pair.raw.double().mean() + pair.read_var + step**2 / 12
+    spread = math.sqrt(2 / noise.numel())
+    assert noise.square().mean() / expected == pytest.approx(1, abs=6 * spread + 0.02)
+    assert abs(noise.mean()) < 5 * (expected / noise.numel()) ** 0.5 + 0.01 * expected**0.5
+    if level == 0:
+        assert (pair.noisy < 0).float().mean() > 0.3, "clipped at black"
+    assert pair.noisy.max() <= 1
+
+
+def test_levels_follow_the_line_of_known_cameras() -> None:
+    for shot_var, read_var in NOISE_LEVELS.values():
+        assert 7e-4 <= shot_var <= 2e-2
+        assert abs(math.log10(read_var) - 1.85 * math.log10(shot_var) - 0.3) < 0.2
+
+
+def test_raw_holds_digital_numbers() -> None:
+    pair = DemoCamera().capture(
+        torch.randint(0, 256, (3, 32, 48), dtype=torch.uint8, generator=generator()), generator()
+    )
+    assert pair.noisy is not None
+    for raw in (pair.raw, pair.noisy):
+        numbers = raw.double() * (WHITE - BLACK) + BLACK
+        assert (numbers - numbers.round()).abs().max() < 1e-3
+        assert numbers.min() > -1e-3 and numbers.max() < WHITE + 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_grey_stays_grey_and_flat_in_any_light(seed: int) -> None:
+    pair = DemoCamera().capture(flat(128, 64), generator(seed), iso=100)
+    assert pair.srgb.float().std() < 1.0
+    sites = pack(pair.raw, pair.cfa).mean((-2, -1))
+    red, green, blue = sites[0], (sites[1] + sites[2]) / 2, sites[3]
+    assert (green / red).item() == pytest.approx(pair.white_balance[0], rel=0.01)
+    assert (green / blue).item() == pytest.approx(pair.white_balance[2], rel=0.01)
+
+
+def test_raw_falls_off_towards_the_corners_around_a_point_off_centre() -> None:
+    shading = _shading(256, 384)
+    row, column = divmod(int(shading.argmax()), 384)
+    assert (row, column) != (128, 192) and abs(row - 128) < 30 and abs(column - 192) < 30
+    corners = shading[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert 0.5 < corners.min() < corners.max() < 0.7
+    raw = DemoCamera().apply(flat(255), DAYLIGHT).raw
+    green = pack(raw, CFA.GRBG)[1]
+    expected = _shading(192, 192)[0::2, 0::2] * DAYLIGHT.exposure  # Gr comes first in GRBG
+    assert torch.allclose(green, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_a_saturated_primary_lights_its_own_sites_most(cfa: CFA) -> None:
+    for channel, sites in ((0, (0,)), (1, (1, 2)), (2, (3,))):
+        picture = torch.zeros(3, 32, 32, dtype=torch.uint8)
+        picture[channel] = 255
+        shot = dataclasses.replace(DAYLIGHT, white_balance=(1.0, 1.0, 1.0))
+        pair = DemoCamera(cfa).apply(picture, shot)
+        means = pack(pair.raw, cfa).mean((-2, -1))
+        assert set(means.topk(len(sites)).indices.tolist()) == set(sites)
+        assert pair.srgb.float().mean((1, 2)).argmax() == channel
+
+
+def test_gains_are_those_of_daylight_to_tungsten() -> None:
+    shots = [DemoCamera().sample(generator(seed)) for seed in range(200)]
+    red = torch.tensor([shot.white_balance[0] for shot in shots])
+    blue = torch.tensor([shot.white_balance[2] for shot in shots])
+    assert red.min() >= 1.5 and red.max() <= 2.3 and blue.min() >= 1.29 and blue.max() <= 2.2
+    assert torch.corrcoef(torch.stack([red, blue]))[0, 1] < -0.9
+    assert {shot.iso for shot in shots} == set(NOISE_LEVELS)
+
+
+def test_the_tone_curve_keeps_order_and_ends() -> None:
+    curve = _tone(torch.linspace(0, 1, 4096))
+    assert (curve.diff() > 0).all() and curve[0] == 0 and curve[-1] == pytest.approx(1)
+
+
+def test_a_scene_that_is_no_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"demo: a scene is uint8 \(3, H, W\)"):
+        DemoCamera().capture(torch.rand(3, 8, 8), generator())
+    with pytest.raises(ValueError, match="even sides, got 9 x 8"):
+        DemoCamera().capture(torch.zeros(3, 9, 8, dtype=torch.uint8), generator())

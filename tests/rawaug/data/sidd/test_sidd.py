@@ -1,0 +1,275 @@
+"""SIDD in its published form, small: RAW of version 7.3, METADATA of version 5, upright PNGs, blocks of version 5."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.io import savemat
+
+from rawaug.bayer import CFA, mosaic, pack, turn
+from rawaug.data import (
+    SiddBenchmark,
+    SiddBlocks,
+    SiddFrames,
+    SiddPlusBlocks,
+    check_submission,
+    open_pairs,
+    write_submission,
+)
+from rawaug.data.sidd.scenes import HELD_BACK, PHONES, SiddScene
+from rawaug.io import write_picture
+from rawaug.io.picture_files import view_of_orientation
+
+Writer = Callable[[Path, dict[str, Any]], Path]
+NEUTRAL = (0.5, 1.0, 0.8)
+COLOUR = np.array([[0.9, -0.2, 0.0], [-0.3, 1.2, 0.1], [-0.1, 0.3, 0.7]])
+GREY = np.array([0.5, 1.0, 0.8])  # what the camera sees of a grey, by its AsShotNeutral
+SHOT_VAR, READ_VAR = 4e-3, 1e-4
+
+
+def clean_frame(cfa: CFA, height: int = 96, width: int = 128) -> torch.Tensor:
+    """A ramp of grey as the camera sees it, ``(1, H, W)``: three colours, no symmetry between rows and columns."""
+    ramp = (torch.arange(height)[:, None] * 3 + torch.arange(width)) / (3 * height + width)
+    return mosaic(0.9 * ramp * torch.tensor(GREY).float()[:, None, None], cfa)
+
+
+def noisy_frame(clean: torch.Tensor, seed: int = 0) -> torch.Tensor:
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
+    return (clean + noise * (SHOT_VAR * clean + READ_VAR).sqrt()).clamp(0, 1)
+
+
+def write_scene(
+    folder: Path,
+    mat73: Writer,
+    name: str,
+    numbers: tuple[str, ...] = ("010", "011"),
+    orientation: int = 1,
+    srgb: bool = False,
+) -> None:
+    """One scene instance of SIDD Medium."""
+    scene = SiddScene.parse(name)
+    for number in numbers:
+        clean = clean_frame(scene.cfa)
+        at = folder / name / f"{name[:4]}_"
+        for kind, frame in (("GT", clean), ("NOISY", noisy_frame(clean, int(number)))):
+            mat73(Path(f"{at}{kind}_RAW_{number}.MAT"), {"x": frame[0].numpy()})
+        tags = {
+            "Orientation": orientation,
+            "AsShotNeutral": [NEUTRAL],
+            "ColorMatrix2": COLOUR.reshape(1, 9),
+            "Make": "X",
+        }
+        savemat(f"{at}METADATA_RAW_{number}.MAT", {"metadata": tags})
+        if srgb:
+            picture = (clean.expand(3, -1, -1) * torch.tensor([100, 150, 250]).reshape(3, 1, 1)).to(torch.uint8)
+            write_picture(f"{at}GT_SRGB_{number}.PNG", turn(picture, view_of_orientation(orientation)))
+
+
+@pytest.mark.parametrize("phone", PHONES)
+def test_frames_have_their_phones_pattern_and_axes(tmp_path: Path, mat73: Writer, phone: str) -> None:
+    write_scene(tmp_path / "Data", mat73, f"0001_001_{phone}_00100_00060_3200_L")
+    frames = SiddFrames(tmp_path)
+    assert frames.names == [f"0001_001_{phone}_00100_00060_3200_L_{k}" for k in ("010", "011")]
+    pair = frames[0]
+    assert pair.cfa == PHONES[phone][1] and pair.camera == PHONES[phone][0]
+    assert torch.equal(pair.raw, clean_frame(pair.cfa)), "rows are rows"
+    assert pair.noisy is not None and torch.equal(pair.noisy, noisy_frame(pair.raw, 10))
+    red, green_r, green_b, blue = pack(pair.raw, pair.cfa).mean(dim=(1, 2)).tolist()
+    assert red / green_r == pytest.approx(0.5, rel=0.02) and blue / green_b == pytest.approx(0.8, rel=0.02)
+
+
+def test_the_patterns_are_the_published_ones() -> None:
+    assert {phone: str(cfa) for phone, (_, cfa) in PHONES.items()} == {
+        "GP": "BGGR", "IP": "RGGB", "S6": "GRBG", "N6": "BGGR", "G4": "BGGR",
+    }  # fmt: skip
+
+
+def test_colour_is_that_of_the_metadata_and_renders_grey_as_grey(tmp_path: Path, mat73: Writer) -> None:
+    write_scene(tmp_path, mat73, "0001_001_S6_00100_00060_3200_L")
+    pair = SiddFrames(tmp_path)[0]
+    assert pair.white_balance == pytest.approx((2.0, 1.0, 1.25))
+    assert torch.allclose(pair.color_matrix.sum(dim=1), torch.ones(3), atol=1e-5)
+    inside = pair.srgb[:, 8:-8, 8:-8].float()
+    assert (inside - inside.mean(dim=0)).abs().max() <= 2 and inside.std() > 20
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    for rgb in np.eye(3):
+        camera = COLOUR @ to_xyz @ rgb / (COLOUR @ to_xyz @ np.ones(3))
+        assert np.allclose(pair.color_matrix.numpy() @ camera, rgb, atol=1e-5)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_upright_picture_is_turned_to_the_mosaic(tmp_path: Path, mat73: Writer, orientation: int) -> None:
+    write_scene(tmp_path, mat73, "0001_001_GP_00100_00060_3200_L", ("010",), orientation, srgb=True)
+    pair = SiddFrames(tmp_path)[0]
+    expected = (clean_frame(CFA.BGGR).expand(3, -1, -1) * torch.tensor([100, 150, 250]).reshape(3, 1, 1)).to(
+        torch.uint8
+    )
+    assert torch.equal(pair.srgb, expected) and pair.registered
+
+
+def test_pictures_may_lie_in_another_folder(tmp_path: Path, mat73: Writer) -> None:
+    name = "0001_001_GP_00100_00060_3200_L"
+    write_scene(tmp_path / "SIDD_Medium_Raw" / "Data", mat73, name, ("010",), 6, srgb=True)
+    there = tmp_path / "SIDD_Medium_Srgb" / "Data" / name
+    there.mkdir(parents=True)
+    (picture,) = (tmp_path / "SIDD_Medium_Raw").rglob("*.PNG")
+    with_picture = SiddFrames(tmp_path)[0].srgb
+    picture.rename(there / picture.name)
+    assert torch.equal(SiddFrames(tmp_path)[0].srgb, with_picture)
+
+
+def test_noise_levels_are_measured_or_read_from_the_table(tmp_path: Path, mat73: Writer) -> None:
+    name = "0001_001_IP_00100_00060_3200_L"
+    write_scene(tmp_path, mat73, name, ("010",))
+    pair = SiddFrames(tmp_path)[0]
+    assert pair.shot_var == pytest.approx(SHOT_VAR, rel=0.1) and pair.read_var == pytest.approx(READ_VAR, rel=0.6)
+    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
+    (tmp_path / "noise_level_functions.csv").write_text(f"{header}\n{name}, 0.01, 1e-4, 0.02, 2e-4, 0.07, 3e-4\n")
+    pair = SiddFrames(tmp_path)[0]
+    assert (pair.shot_var, pair.read_var) == pytest.approx((0.03, 2e-4)), "green counts twice"
+
+
+def test_small_has_no_number_in_its_names_and_what_is_held_back_is_left_out(tmp_path: Path, mat73: Writer) -> None:
+    write_scene(tmp_path, mat73, "0001_001_IP_00100_00060_3200_L", ("010",))
+    for file in (tmp_path / "0001_001_IP_00100_00060_3200_L").iterdir():
+        file.rename(file.with_name(file.name[5:]))
+    write_scene(tmp_path, mat73, HELD_BACK[0], ("010",))
+    assert SiddFrames(tmp_path).names == ["0001_001_IP_00100_00060_3200_L_010"]
+
+
+def test_incomplete_and_damaged_frames_are_told(tmp_path: Path, mat73: Writer) -> None:
+    name = "0001_001_IP_00100_00060_3200_L"
+    write_scene(tmp_path, mat73, name, ("010",))
+    gt = tmp_path / name / "0001_GT_RAW_010.MAT"
+    content = gt.read_bytes()
+    gt.unlink()
+    with pytest.raises(ValueError, match=r"0001_NOISY_RAW_010\.MAT: GT_RAW_010 of 0001_001_IP_\S* is missing"):
+        SiddFrames(tmp_path)
+    gt.write_bytes(content[: len(content) // 2])
+    frames = SiddFrames(tmp_path)
+    with pytest.raises(OSError, match=r"0001_GT_RAW_010\.MAT: cannot be read as a MATLAB file"):
+        frames[0]
+    mat73(gt, {"x": 4095 * clean_frame(CFA.RGGB)[0].numpy()})
+    with pytest.raises(ValueError, match=r"values run from .* to .*; normalised RAW has black at 0, white at 1"):
+        frames[0]
+    mat73(gt, {"x": clean_frame(CFA.RGGB, 64, 64)[0].numpy()})
+    with pytest.raises(ValueError, match=r"the clean and the noisy frame differ in size"):
+        frames[0]
+    gt.write_bytes(content)
+    black = {"AsShotNeutral": np.array([0.5, 1.0, 0.0]), "ColorMatrix2": COLOUR.ravel()}
+    for tags in ({"Make": "Apple"}, black, {**black, "AsShotNeutral": np.ones(3), "ColorMatrix2": np.full(9, np.nan)}):
+        savemat(tmp_path / name / "0001_METADATA_RAW_010.MAT", {"metadata": tags})
+        with pytest.raises(ValueError, match=r"0001_METADATA_RAW_010\.MAT: tells no AsShotNeutral and ColorMatrix2"):
+            frames[0]
+
+
+SIDE = 8
+
+
+def flat_frame(cfa: CFA) -> torch.Tensor:
+    return mosaic(torch.tensor(GREY).float().reshape(3, 1, 1).expand(3, SIDE, SIDE), cfa)
+
+
+@pytest.fixture(scope="module")
+def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Validation and benchmark as published, with blocks of 8 x 8: each in the pattern of its scene instance."""
+    folder = tmp_path_factory.mktemp("sidd_blocks")
+    clean = torch.stack([flat_frame(SiddScene.parse(name).cfa).expand(32, SIDE, SIDE) for name in HELD_BACK])
+    clean = clean * torch.linspace(0.2, 1, 32)[:, None, None]
+    noisy = noisy_frame(clean)
+    for name, values in (("ValidationGt", clean), ("ValidationNoisy", noisy), ("BenchmarkNoisy", noisy.flip(1))):
+        savemat(folder / f"{name}BlocksRaw.mat", {f"{name}BlocksRaw": values.numpy()})
+    return folder
+
+
+def test_blocks_have_the_pattern_of_their_scene(blocks: Path) -> None:
+    pairs = SiddBlocks(blocks)
+    assert len(pairs) == 1280 and pairs.names[33] == f"{HELD_BACK[1]}_01"
+    assert [str(pairs[32 * k].cfa) for k in range(5)] == ["GRBG", "BGGR", "BGGR", "BGGR", "RGGB"]
+    for k in (0, 32 * 4 + 31):
+        pair = pairs[k]
+        bright = torch.linspace(0.2, 1, 32)[k % 32]
+        expected = flat_frame(pair.cfa) * bright
+        assert torch.allclose(pair.raw, expected) and pair.noisy is not None
+        packed = pack(pair.raw, pair.cfa).mean(dim=(1, 2))
+        assert packed[0] < packed[3] < packed[1], "red is darker than blue, blue than green"
+        assert pair.shot_var == pytest.approx(SHOT_VAR, rel=0.5) and pair.white_balance == (1, 1, 1)
+
+
+def test_blocks_take_colour_from_metadata_where_it_lies_there(blocks: Path, tmp_path: Path) -> None:
+    for file in blocks.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    scene = tmp_path / "BenchmarkMetadataRaw" / HELD_BACK[1]
+    scene.mkdir(parents=True)
+    tags = {"AsShotNeutral": [NEUTRAL], "ColorMatrix2": COLOUR.reshape(1, 9)}
+    savemat(scene / f"{HELD_BACK[1][:4]}_METADATA_RAW_010.MAT", {"metadata": tags})
+    pairs = SiddBlocks(tmp_path)
+    assert pairs[32].white_balance == pytest.approx((2, 1, 1.25)) and pairs[0].white_balance == (1, 1, 1)
+
+
+def test_the_benchmark_and_its_submission(blocks: Path, tmp_path: Path) -> None:
+    benchmark = SiddBenchmark(blocks)
+    noisy = list(benchmark)
+    assert len(noisy) == 1280 and noisy[0].name == f"{HELD_BACK[0]}_00" and noisy[0].cfa == CFA.GRBG
+    assert torch.equal(noisy[0].noisy, SiddBlocks(blocks)[31].noisy)  # type: ignore[arg-type]
+    for extension in ("csv", "mat"):
+        path = tmp_path / f"SubmitRaw.{extension}"
+        write_submission(path, (block.noisy / 2 for block in benchmark), SIDE)
+        read = check_submission(path, SIDE)
+        assert torch.equal(read, torch.stack([block.noisy / 2 for block in noisy]))
+
+
+def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
+    block = torch.full((1, SIDE, SIDE), 0.5)
+    with pytest.raises(ValueError, match="a submission has 1280 blocks, got 3"):
+        write_submission(tmp_path / "a.csv", [block] * 3, SIDE)
+    with pytest.raises(ValueError, match=r"block 1: a block has shape \(1, 256, 256\), got \(1, 8, 8\)"):
+        write_submission(tmp_path / "a.csv", [torch.zeros(1, 256, 256), block])
+    with pytest.raises(ValueError, match="block 0: holds values that are not finite"):
+        write_submission(tmp_path / "a.csv", [block * float("nan")], SIDE)
+    with pytest.raises(ValueError, match=r"is a \.csv or a \.mat file"):
+        write_submission(tmp_path / "a.npz", [block], SIDE)
+    path = tmp_path / "a.csv"
+    write_submission(path, [block * 3] * 1280, SIDE)
+    with pytest.raises(ValueError, match=r"values run from 1\.5 to 1\.5; clip them"):
+        check_submission(path, SIDE)
+    write_submission(path, [block] * 1280, SIDE)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], lines[2], lines[1], *lines[3:]]))
+    with pytest.raises(ValueError, match="IDs 0 to 1279 in order"):
+        check_submission(path, SIDE)
+    path.write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="block 0 has 256 bytes"):
+        check_submission(path)
+
+
+def test_sidd_plus_has_a_pattern_for_each_frame(tmp_path: Path) -> None:
+    cfas = [CFA.RGGB, CFA.BGGR]
+    clean = torch.cat([clean_frame(cfa, SIDE, SIDE).expand(32, -1, -1) for cfa in cfas])
+    for kind, values in (("gt", clean), ("noisy", noisy_frame(clean))):
+        name = f"siddplus_valid_{kind}_raw"
+        savemat(tmp_path / f"{name}.mat", {name: values.numpy()})
+    (tmp_path / "siddplus_valid_bayer_patterns.csv").write_text("rggb\nbggr\n")
+    pairs = open_pairs(f"siddplus:{tmp_path}")
+    assert [pairs[k].cfa for k in (0, 31, 32, 63)] == [CFA.RGGB, CFA.RGGB, CFA.BGGR, CFA.BGGR] and len(pairs) == 64
+    assert torch.equal(pairs[40].raw, clean_frame(CFA.BGGR, SIDE, SIDE))
+    (tmp_path / "siddplus_valid_bayer_patterns.csv").write_text("rggb\n")
+    with pytest.raises(ValueError, match="holds 64 blocks, the patterns are for 32"):
+        SiddPlusBlocks(tmp_path)[0]
+
+
+def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer) -> None:
+    write_scene(tmp_path, mat73, "0001_001_IP_00100_00060_3200_L", ("010",))
+    assert len(open_pairs(f"sidd:{blocks}")) == 1280
+    assert len(open_pairs(f"sidd:{tmp_path}", split="train")) == 1 == len(open_pairs(f"sidd:{tmp_path}:train"))
+    with pytest.raises(ValueError, match="has no split validation: train are the full frames"):
+        open_pairs(f"sidd:{tmp_path}", split="validation")
+    with pytest.raises(FileNotFoundError, match=r"holds no ValidationGtBlocksRaw\.mat"):
+        open_pairs(f"sidd:{tmp_path}")
+    with pytest.raises(ValueError, match="sidd:: say where the data are, sidd:PATH"):
+        open_pairs("sidd:")

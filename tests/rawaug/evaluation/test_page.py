@@ -1,0 +1,95 @@
+"""The page of a run: it stands alone, says what was measured, and its pictures are pictures."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pair import Pair
+from rawaug.evaluation.page import WINDOW, Page, draw_curves, encode_png, most_detailed
+from rawaug.evaluation.tables import Row
+
+VOID = {"img", "meta", "br"}
+
+
+class Elements(HTMLParser):
+    """Tags in order, the text, and whether every tag is closed where it should be."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def scores(psnr: float) -> dict[str, Any]:
+    keys = {"psnr": psnr, "ssim": 0.91, "psnr_srgb": 30.0, "ssim_srgb": 0.8}
+    quarters = {f"{key}_{part}": value for key, value in keys.items() for part in ("worst25", "best25")}
+    noisy = {f"{key}_noisy": 0.5 for key in keys}
+    return {"images": [{"name": "a <frame>", **keys, **noisy}], **keys, **quarters, **noisy}
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Elements:
+    log = tmp_path / "log.csv"
+    log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
+    results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
+    made = Page("a & b", results, {"Wavelet": scores(37.5)})
+    made.add_curves(draw_curves({"real": [log]}))
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.rand(1, 200, 800, generator=generator)
+    pair = Pair("a <frame>", torch.zeros(3, 200, 800, dtype=torch.uint8), raw, CFA.GRBG, (2, 1, 1.6), torch.eye(3))
+    packed = bayer.pack(raw[None], CFA.GRBG)
+    made.add_frame(Row(pair, {"noisy": packed, "real": packed, "clean": packed}, {"real": "40.12 dB"}), CFA.GRBG)
+    text = made.write(tmp_path / "new" / "report.html", {"steps": 4}).read_text(encoding="utf-8")
+    assert not re.search(r"(?:src|href)=[\"'](?!data:)", text)  # nothing is fetched
+    return Elements(text)
+
+
+def test_it_is_well_formed_and_says_what_was_measured(page: Elements) -> None:
+    assert page.open == []
+    for said in ("a & b", "a <frame>", "40.12", "37.50", "41.00", "Wavelet", "worst 25%", '"steps": 4', "noisy input"):
+        assert said in page.text
+
+
+def test_its_pictures_open_and_have_the_promised_sizes(page: Elements) -> None:
+    sources = [str(attributes["src"]) for tag, attributes in page.found if tag == "img"]
+    pictures = [Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))) for source in sources]
+    assert [picture.size for picture in pictures[1:]] == [(2 * WINDOW, 2 * WINDOW)] * 3 + [(640, 160)]
+    assert all(attributes.get("alt") for tag, attributes in page.found if tag == "img")
+
+
+def test_the_window_is_where_the_detail_is() -> None:
+    packed = torch.full((1, 4, 200, 300), 0.2)
+    packed[..., 120:150, 200:240] = torch.rand(30, 40, generator=torch.Generator().manual_seed(0))
+    top, left = most_detailed(packed)
+    assert top <= 120 and top + WINDOW >= 150 and left <= 200 and left + WINDOW >= 240
+    assert most_detailed(packed[..., :20, :30]) == (0, 0)
+
+
+def test_a_png_holds_the_picture() -> None:
+    srgb = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
+    png = Image.open(io.BytesIO(encode_png(srgb)))
+    assert png.size == (7, 5) and png.getpixel((6, 4)) == tuple((srgb[:, 4, 6] * 255).round().int().tolist())

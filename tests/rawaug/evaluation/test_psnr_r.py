@@ -1,0 +1,23 @@
+"""PSNR_r of an ISP."""
+
+from __future__ import annotations
+
+import torch
+
+from rawaug.data import demo_pairs
+from rawaug.evaluation.psnr_r import mosaic_of, psnr_r
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+
+
+def test_strips_give_the_whole_mosaic() -> None:
+    pair = demo_pairs("validation", count=1)[0]
+    isp = DictionaryISP(ISPConfig(cfa="GRBG"))
+    isp.shading.set(torch.zeros(2), torch.eye(2))
+    assert pair.raw.shape[-2] >= 256
+    tall = type(pair)(**{**vars(pair), **{k: torch.cat([getattr(pair, k)] * 2, 1) for k in ("srgb", "raw", "noisy")}})
+    with torch.no_grad():
+        whole = isp.reverse(tall.srgb[None])
+        torch.testing.assert_close(mosaic_of(isp, tall, whole.params), whole.raw.clamp(0.0, 1.0))
+    assert psnr_r(isp, tall) > 5.0
+    assert abs(psnr_r(isp, tall, patches=10**6) - psnr_r(isp, tall)) < 1e-3

@@ -1,0 +1,121 @@
+"""Scores: of an ISP by patches, of a denoiser on frozen noise, as the JSON that others read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import denoisers
+from rawaug.data import demo_pairs
+from rawaug.evaluation.scores import (
+    classical_method,
+    compared,
+    evaluate,
+    frozen_levels,
+    frozen_sample,
+    score_method,
+    write_json,
+)
+from rawaug.evaluation.tables import print_scores
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import noise_model
+
+
+@pytest.fixture
+def identity(tmp_path: Path) -> Path:
+    path = tmp_path / "identity.safetensors"
+    network = denoisers.build("UNet", width=4, scales=2)
+    denoisers.save(network, path, {"cfa": "GRBG", "noise": "cycleisp_sidd"})
+    return path
+
+
+def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> None:
+    result = evaluate(identity, "demo:test")
+    assert result["kind"] == "denoiser" and len(result["images"]) == 9
+    assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
+    assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
+    assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
+    figures = {"psnr", "ssim", "psnr_srgb", "ssim_srgb"}
+    assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
+    assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
+    assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
+    again = evaluate(identity, "demo:test", self_ensemble=True)
+    assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
+
+
+def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path) -> None:
+    DictionaryISP(ISPConfig(cfa="GRBG")).save(tmp_path / "isp.safetensors")
+    result = evaluate(tmp_path / "isp.safetensors", "demo:validation")
+    assert result["kind"] == "isp"
+    assert not {"ssim", "psnr_noisy", "self_ensemble", "seed"} & set(result)
+    assert len(result["weights_sha256"]) == 64 and result["version"]
+    write_json(result, tmp_path / "new" / "isp.json")
+    assert json.loads((tmp_path / "new" / "isp.json").read_text()) == result
+
+
+def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
+    pair = demo_pairs("test", count=1)[0]
+    bare = type(pair)(**{**vars(pair), "noisy": None, "shot_var": None, "read_var": None})
+    noise = noise_model("cycleisp_sidd")
+    first = frozen_sample(bare, noise, pair.cfa, seed=0)
+    assert torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=0).noisy)
+    assert not torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=1).noisy)
+
+
+def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured() -> None:
+    pair = demo_pairs("test", count=1)[0]
+    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
+    bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
+    told, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
+    assert torch.equal(measured.noisy, told.noisy)
+    assert (measured.variance / told.variance).mean() == pytest.approx(1.0, abs=0.1)
+    levels = frozen_levels(bare, noise, seed=0)
+    assert levels is not None
+    y = pair.raw.mean().item()
+    assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
+
+
+def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rawaug.evaluation.scores.open_pairs", lambda data, split: demo_pairs("test", count=2))
+    result = evaluate(identity, "demo:test", classical=["Wavelet", "TotalVariation"])
+    for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
+        scores = result["classical"][name]
+        assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
+        assert len(scores["images"]) == 2
+    print_scores(result)
+    with pytest.raises(ValueError, match="classical: Median is unknown; there are NonLocalMeans"):
+        evaluate(identity, "demo:test", classical=["Median"])
+
+
+def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
+    pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    noise = noise_model((0.0, 1e-3))
+    (scored,) = score_method(classical_method("Wavelet", noise, 0), [pair], noise, pair.cfa, 0, "Wavelet")
+    assert scored[0].psnr > (scored[0].psnr_noisy or 99.0) + 3.0
+
+
+def test_the_development_is_the_same_for_both(identity: Path) -> None:
+    """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
+    pair = demo_pairs("test", count=1)[0]
+    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
+    whole = compared(sample.noisy, sample.clean, pair.cfa, pair)
+    half = compared(sample.noisy / 2, sample.clean / 2, pair.cfa, pair)
+    assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
+
+
+def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(identity: Path, tmp_path: Path) -> None:
+    result = evaluate(identity, "demo:validation", self_ensemble=True, report=tmp_path / "new" / "page.html")
+    assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
+    page = (tmp_path / "new" / "page.html").read_text()
+    assert page.count("<h3>") == 4 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
+
+
+def test_what_is_for_denoisers_is_refused_for_an_isp(tmp_path: Path) -> None:
+    for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
+        with pytest.raises(ValueError, match="is an ISP"):
+            evaluate("universal-small", "demo:test", **flags)

@@ -1,0 +1,57 @@
+"""Development for the eye and what is shown: neutral grey stays grey, panels share one exposure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.evaluation.tables import Row, draw, mean_and_spread, print_table
+
+
+@pytest.fixture
+def grey_pair() -> Pair:
+    """A grey card under a light for which the camera needs gains of 2 and 1.6."""
+    light = 0.4 / torch.tensor([2.0, 1.0, 1.6])
+    raw = bayer.mosaic(light[:, None, None].expand(3, 32, 32), "GBRG")
+    srgb = torch.zeros(3, 32, 32, dtype=torch.uint8)
+    matrix = torch.tensor([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0.0, -0.5, 1.5]])
+    return Pair("grey", srgb, raw, CFA.GBRG, (2.0, 1.0, 1.6), matrix)
+
+
+def test_grey_is_developed_to_grey(grey_pair: Pair) -> None:
+    panel = develop_packed(bayer.pack(grey_pair.raw[None], "GBRG"), CFA.GBRG, grey_pair)
+    assert panel.shape == (3, 32, 32)
+    torch.testing.assert_close(panel, panel[:1].expand(3, -1, -1), atol=1e-5, rtol=0)
+    assert panel.mean().item() == pytest.approx(0.665, abs=0.002)  # the sRGB value of linear 0.4
+
+
+def test_exposure_brings_the_brightest_near_white(grey_pair: Pair) -> None:
+    packed = bayer.pack(grey_pair.raw[None], "GBRG")
+    assert exposure_of(packed, grey_pair) * 0.4 == pytest.approx(0.9, abs=1e-4)
+    dark = replace(grey_pair, raw=grey_pair.raw * 0)
+    assert exposure_of(packed * 0, dark) < 1e4
+
+
+def test_the_figure_is_written(grey_pair: Pair, tmp_path: Path) -> None:
+    packed = bayer.pack(grey_pair.raw[None], "GBRG")
+    row = Row(grey_pair, {"noisy": packed, "clean": packed}, {"noisy": "20.00 dB", "clean": "grey"})
+    assert draw([row], CFA.GBRG, tmp_path / "new" / "figure.png").stat().st_size > 1000
+
+
+def test_one_seed_has_no_spread() -> None:
+    assert mean_and_spread([40.123], 2) == "40.12"
+    assert mean_and_spread([40.0, 41.0], 2) == "40.50 ± 0.71"
+
+
+def test_the_table_names_every_arm(capsys: pytest.CaptureFixture[str]) -> None:
+    scores = {"psnr": 40.0, "ssim": 0.95, "psnr_noisy": 33.0, "ssim_noisy": 0.8}
+    print_table({"real": [{"plain": scores, "self_ensemble": {**scores, "psnr": 40.5}}]}, "title")
+    text = capsys.readouterr().out
+    assert "noisy input" in text and "33.00" in text and "real" in text and "40.50" in text

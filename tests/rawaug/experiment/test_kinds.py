@@ -1,0 +1,98 @@
+"""The kinds of experiment: a recipe names its own, and what its header says is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from rawaug.cli import _parser
+from rawaug.experiment.kinds import KINDS, kind_of
+from rawaug.experiment.methods import FAMILIES, ROWS
+from rawaug.experiment.recipe import find_recipe
+from rawaug.experiment.reconstruction import Comparison
+from rawaug.isp.baselines import BASELINES
+from rawaug.isp.fit.samples import BLOCK
+
+FOLDER = find_recipe("fewshot").parent
+NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
+
+
+def header(name: str) -> str:
+    """The comment that a recipe opens with, a command's broken line joined."""
+    lines = find_recipe(name).read_text().splitlines()
+    head = "\n".join(lines[: next(k for k, line in enumerate(lines) if not line.startswith("#"))])
+    return re.sub(r" *\\\n# +", " ", head)
+
+
+def test_every_kind_has_settings_that_name_it() -> None:
+    assert set(KINDS) == {"training", "reconstruction", "ablation"}
+    for name in ("reconstruction", "ablation"):
+        assert KINDS[name].settings().experiment == KINDS[name].settings().name == name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
+    expected = name if name in KINDS else "training"
+    assert kind_of(find_recipe(name)) == expected
+    parsed = _parser(expected).parse_args(["run", "--recipe", str(find_recipe(name))])
+    assert parsed.run.name == name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_commands_of_a_header_can_be_given(name: str) -> None:
+    commands = re.findall(r"^#   (rawaug run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
+    assert len(commands) >= 3 and any("--smoke" in command for command in commands)
+    parser = _parser(kind_of(find_recipe(name)))
+    for command in commands:
+        _, _, named, *rest = shlex.split(command)
+        assert named == name
+        given = parser.instantiate(parser.parse_args(["run", "--recipe", str(find_recipe(name)), *rest])).run
+        settings = vars(given)
+        settings.pop("recipe")
+        quick = settings.pop("smoke")
+        kind = KINDS[kind_of(find_recipe(name))]
+        recipe = kind.settings(**settings)
+        assert not quick or kind.smoke(recipe).name.endswith("-smoke")
+
+
+def test_the_reconstruction_header_tells_the_methods_rows_and_budgets_that_there_are() -> None:
+    head = header("reconstruction")
+    (named,) = re.findall(r"--methods '\[(.*?)\]'", head)
+    assert set(named.split(", ")) <= set(FAMILIES) and {"dictionary", "dictionary-encoders"} < set(named.split(", "))
+    assert set(named.split(", ")) & set(BASELINES) >= {"upi", "upi-tuned", "unet", "cycleisp", "invisp"}
+    assert len(ROWS) == 3 and "fills four rows: blind" in head
+    for row in ROWS.values():
+        assert row in head
+    keys = set(Comparison.__dataclass_fields__)
+    assert set(re.findall(r"`(\w+)`", find_recipe("reconstruction").read_text())) <= keys
+
+
+def test_the_ablation_header_tells_how_coarse_the_blocks_are() -> None:
+    assert f"at {BLOCK} times lower resolution" in header("ablation")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"experiment: reconstruktion\n", "experiment 'reconstruktion' is none of training, reconstruction, ablation"),
+        (b"experiment: [ablation]\n", r"experiment \['ablation'\] is none of training, reconstruction, ablation"),
+        (b"experiment:\n", "experiment None is none of training, reconstruction, ablation"),
+        (b"experiment: [ablation\n", "not a YAML file .*see the recipes"),
+        (b"\xff\xfe\x00\x81", "not a YAML file .*see the recipes"),
+    ],
+)
+def test_what_names_no_kind_is_refused_by_the_files_name(content: bytes, told: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_bytes(content)
+    with pytest.raises(ValueError, match=r"(?s)mine\.yaml: " + told):
+        kind_of(tmp_path / "mine.yaml")
+
+
+def test_a_recipe_that_names_no_kind_trains(tmp_path: Path) -> None:
+    for content in ("name: x\n", "", "just words\n"):
+        (tmp_path / "mine.yaml").write_text(content)
+        assert kind_of(tmp_path / "mine.yaml") == "training"
+    with pytest.raises(FileNotFoundError, match=r"gone\.yaml"):
+        kind_of(tmp_path / "gone.yaml")

@@ -1,0 +1,179 @@
+"""The methods on one footing: the true camera wins, what is known helps, a seed is a start of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.data.pair import Pair
+from rawaug.experiment import methods
+from rawaug.experiment.methods import (
+    FAMILIES,
+    ROWS,
+    Fitted,
+    cycle_psnr,
+    dictionary_params,
+    fit_family,
+    mosaic_only_psnr,
+    score_rows,
+)
+from rawaug.isp.baselines import BASELINES, UPI
+from rawaug.isp.baselines.plain_unet import UNetISP
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.fit import FitConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import PATCH
+
+FrameOf = Callable[..., Pair]
+LAMPS = (1.2, 1.0, 2.6)
+
+
+def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, float]:
+    rows: dict[str, float] = score_rows(Fitted(model, 0.0, 0), pair, patches)["rows"]
+    return rows
+
+
+@pytest.fixture
+def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its row is filled, but it takes no time."""
+    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+
+
+@pytest.mark.usefixtures("no_oracle")
+def test_the_true_camera_scores_highest(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
+    pair = frame_of("daylight", size=(256, 512))  # two patches: the fall-off is that of the frame
+    rows = rows_of(known_camera, pair)
+    upi = rows_of(UPI(pair.cfa), pair)
+    assert set(rows) == {"blind", *ROWS} and set(upi) == {"blind"}
+    assert min(rows["blind"], rows["as-shot"]) > 75.0  # the 12 bits alone
+    with torch.no_grad():
+        known_camera.colour.matrices.copy_(torch.eye(3)[None])
+    assert upi["blind"] < rows_of(known_camera, pair)["blind"] < 40.0
+
+
+def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
+    known_camera: DictionaryISP, frame_of: FrameOf
+) -> None:
+    rows = rows_of(known_camera, frame_of("lamps", LAMPS))
+    assert rows["blind"] < 32.0
+    assert rows["as-shot"] > 75.0 and rows["samples"] > 60.0  # what was given is exact, or 64 readings of 12 bits
+    assert rows["oracle"] > rows["blind"] + 20.0  # the light is one of the atoms
+
+
+@pytest.mark.usefixtures("no_oracle")
+def test_the_places_that_are_read_go_by_the_frames_name(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
+    pair = frame_of("lamps", LAMPS)
+
+    def gains(name: str) -> torch.Tensor:
+        return dictionary_params(known_camera, replace(pair, name=name))["samples"].gains
+
+    torch.manual_seed(0)
+    once = gains("lamps")
+    torch.manual_seed(1)
+    assert torch.equal(gains("lamps"), once)
+    assert not torch.equal(gains("other"), once)
+
+
+@pytest.mark.usefixtures("no_oracle")
+def test_the_speed_counts_every_row_and_every_pixel(
+    known_camera: DictionaryISP, frame_of: FrameOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = frame_of("wide", size=(256, 768))
+    for model, rows, patches, pixels in (
+        (UPI(pair.cfa), 1, 2, PATCH**2),
+        (known_camera, 4, None, PATCH**2),
+        (UPI(pair.cfa), 1, 8, 64 * 96),
+    ):
+        frame = pair if pixels == PATCH**2 else frame_of("small", size=(64, 96))
+        ticks = iter((10.0, 12.0))
+        monkeypatch.setattr(methods, "time", SimpleNamespace(perf_counter=lambda ticks=ticks: next(ticks)))
+        windows = min(patches or 3, frame.raw.shape[-1] // PATCH or 1)
+        speed = score_rows(Fitted(model, 0.0, 0), frame, patches)["mpix_s"]
+        assert speed == pytest.approx(rows * windows * pixels / 2.0 / 1e6)
+
+
+@pytest.mark.usefixtures("no_oracle")
+def test_a_frame_smaller_than_a_patch_is_scored_whole(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
+    small = frame_of("small", size=(64, 96))
+    assert rows_of(known_camera, small, 1)["as-shot"] > 75.0  # its fall-off too is in place
+
+
+@pytest.fixture
+def unfitted(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Fits do nothing, and tell what they were asked for."""
+    asked: dict[str, Any] = {}
+
+    def baseline(model: Any, pairs: Sequence[Pair], *budget: float, **settings: int) -> Any:
+        asked.update(pairs=pairs, budget=budget, settings=settings)
+        return model
+
+    def dictionary(pairs: Sequence[Pair], config: FitConfig) -> DictionaryISP:
+        asked.update(pairs=pairs, config=config)
+        return DictionaryISP(ISPConfig(encoders=config.encoders == "on", encoder_widths=(4, 4, 4)))
+
+    monkeypatch.setattr(methods, "fit_baseline", baseline)
+    monkeypatch.setattr(methods, "fit_isp", dictionary)
+    return asked
+
+
+def test_every_seed_starts_from_weights_of_its_own(frame_of: FrameOf, unfitted: dict[str, Any]) -> None:
+    pairs, before = [frame_of("a")], torch.get_rng_state()
+
+    def start(seed: int) -> torch.Tensor:
+        fitted = fit_family("invgrey", pairs, FitConfig(), (7.0, 32, 3), seed)
+        assert fitted.parameters == 741_123
+        return torch.cat([p.detach().flatten() for p in fitted.model.parameters()])
+
+    assert torch.equal(start(1), start(1)) and not torch.equal(start(1), start(2))
+    assert unfitted["budget"] == (7.0,) and unfitted["settings"] == {"crop": 32, "batch": 3, "seed": 2}
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("family", ["upi", "upi-tuned"])
+def test_a_method_without_parameters_takes_the_pattern_of_the_frames(
+    family: str, frame_of: FrameOf, unfitted: dict[str, Any]
+) -> None:
+    fitted = fit_family(family, [frame_of("a")], FitConfig(), (7.0, 32, 3), 0)
+    assert type(fitted.model) is BASELINES[family] and fitted.model.cfa == bayer.CFA.GRBG
+    assert fitted.parameters == sum(p.numel() for p in fitted.model.parameters())
+
+
+def test_encoders_are_on_in_one_family_and_count_only_there(frame_of: FrameOf, unfitted: dict[str, Any]) -> None:
+    counts = {}
+    for family, encoders in (("dictionary", "off"), ("dictionary-encoders", "on")):
+        fitted = fit_family(family, [frame_of("a")], FitConfig(steps=3), (7.0, 32, 3), 5)
+        assert unfitted["config"] == FitConfig(steps=3, seed=5, encoders=encoders)  # type: ignore[arg-type]
+        counts[family] = fitted.parameters
+        networks = fitted.model.get_submodule("reverse_networks")
+    looking = [p for name, p in networks.named_parameters() if "encoder" in name and "prior" not in name]
+    assert counts["dictionary-encoders"] - counts["dictionary"] == sum(p.numel() for p in looking)
+    whole = sum(p.numel() for p in fitted.model.parameters())
+    other = sum(p.numel() for p in fitted.model.get_submodule("forward_networks").parameters())
+    assert counts["dictionary-encoders"] == whole - other
+    assert set(FAMILIES) == {*counts, *BASELINES}
+
+
+def test_a_cycle_loses_the_mosaic_and_nothing_else_in_a_camera_that_inverts_itself(
+    known_camera: DictionaryISP,
+) -> None:
+    fine = torch.randint(30, 200, (3, 64, 96), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    scores = cycle_psnr(Fitted(known_camera, 0.0, 0), [fine, fine])
+    assert scores["cycle_without_mosaic"] > 80.0
+    assert abs(scores["cycle"] - mosaic_only_psnr([fine], "GRBG")) < 3.0
+    assert set(cycle_psnr(Fitted(UPI(), 0.0, 0), [fine])) == {"cycle"}
+    assert cycle_psnr(Fitted(UNetISP(width=4), 0.0, 0), [fine]) == {}  # no way back
+
+
+def test_the_ceiling_is_what_interpolation_misses() -> None:
+    slope = torch.linspace(20, 220, 64).round().to(torch.uint8).expand(3, 64, 64)
+    checks = (torch.arange(64)[:, None] + torch.arange(64)) % 2 * 255
+    board = checks.to(torch.uint8).expand(3, 64, 64)
+    smooth, hard = mosaic_only_psnr([slope]), mosaic_only_psnr([board])
+    assert smooth > 40.0 and hard < 10.0
+    assert mosaic_only_psnr([slope, board]) == pytest.approx((smooth + hard) / 2)

@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image, ImageCms, ImageOps
+
+from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
+from rawaug.io.picture_files import read_plane
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
+SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)
+
+
+def write_with_oiio(path: Path, pixels: np.ndarray, kind: str) -> None:
+    output = oiio.ImageOutput.create(str(path))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    assert output is not None
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+
+
+@pytest.mark.parametrize("extension", ["png", "tif", "bmp", "ppm"])
+def test_lossless_formats_give_back_every_bit(tmp_path: Path, extension: str) -> None:
+    path = tmp_path / f"picture.{extension}"
+    write_picture(path, SRGB)
+    picture = read_picture(path)
+    assert picture.dtype == torch.uint8 and torch.equal(picture, SRGB)
+
+
+@pytest.mark.parametrize("extension", ["jpg", "webp", "jxl"])
+def test_lossy_formats_are_close(tmp_path: Path, extension: str) -> None:
+    smooth = torch.linspace(0, 255, 64).expand(3, 48, 64).round().to(torch.uint8)
+    write_picture(tmp_path / f"picture.{extension}", smooth)
+    assert (read_picture(tmp_path / f"picture.{extension}").int() - smooth.int()).abs().max() <= 4
+
+
+def test_floats_are_rounded_to_the_nearest_level(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", SRGB.double() / 255 + 0.4 / 255 * (SRGB < 255))
+    assert torch.equal(read_picture(tmp_path / "a.png"), SRGB)
+
+
+def test_16_bits_become_8_by_rounding(tmp_path: Path) -> None:
+    numbers = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1).repeat(3, -1)
+    write_with_oiio(tmp_path / "a.png", numbers, "uint16")
+    expected = np.rint(numbers[..., 0] / 257).astype(int)
+    assert np.array_equal(read_picture(tmp_path / "a.png")[1].numpy(), expected)
+
+
+def test_display_referred_floats_are_taken_as_they_are(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "a.tif", (PIXELS / 255).astype(np.float32), "float")
+    assert torch.equal(read_picture(tmp_path / "a.tif"), SRGB)
+
+
+def test_linear_exr_goes_through_the_srgb_transfer(tmp_path: Path) -> None:
+    linear = decode_srgb(SRGB.double() / 255).permute(1, 2, 0).float().contiguous().numpy()
+    write_with_oiio(tmp_path / "a.exr", linear, "float")
+    assert torch.equal(read_picture(tmp_path / "a.exr"), SRGB)
+
+
+def test_values_outside_the_unit_range_are_refused(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "bright.exr", np.full((4, 4, 3), 1.7, np.float32), "float")
+    with pytest.raises(ValueError, match=r"bright\.exr: values run from 1\.7 to 1\.7, not in \[0, 1\]"):
+        read_picture(tmp_path / "bright.exr")
+    with pytest.raises(ValueError, match="not in"):
+        write_picture(tmp_path / "nan.png", torch.full((3, 4, 4), float("nan")))
+
+
+def test_grey_becomes_three_channels_and_alpha_shows_black(tmp_path: Path) -> None:
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "grey.png")
+    assert torch.equal(read_picture(tmp_path / "grey.png"), SRGB[:1].expand(3, -1, -1))
+    Image.fromarray(PIXELS[..., 0]).convert("LA").save(tmp_path / "grey_alpha.png")
+    assert torch.equal(read_picture(tmp_path / "grey_alpha.png"), SRGB[:1].expand(3, -1, -1))
+    alpha = np.full((*PIXELS.shape[:2], 1), 51, np.uint8)  # 0.2
+    Image.fromarray(np.dstack([PIXELS, alpha])).save(tmp_path / "rgba.png")
+    assert (read_picture(tmp_path / "rgba.png").float() - 0.2 * SRGB).abs().max() <= 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_respected(tmp_path: Path, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(PIXELS).save(tmp_path / "turned.png", exif=exif)
+    with Image.open(tmp_path / "turned.png") as stored:
+        upright = np.asarray(ImageOps.exif_transpose(stored))
+    assert np.array_equal(read_picture(tmp_path / "turned.png").permute(1, 2, 0).numpy(), upright)
+
+
+@pytest.mark.parametrize("extension", ["jpg", "tif"])
+def test_cmyk_is_refused(tmp_path: Path, extension: str) -> None:
+    path = tmp_path / f"print.{extension}"
+    Image.fromarray(PIXELS).convert("CMYK").save(path)
+    with pytest.raises(ValueError, match=rf"print\.{extension}: holds CMYK colours; convert it to sRGB first"):
+        read_picture(path)
+
+
+def test_five_channels_are_refused(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "layers.tif", np.zeros((4, 4, 5), np.uint8), "uint8")
+    with pytest.raises(ValueError, match=r"layers\.tif: holds channels R, G, B, A,"):
+        read_picture(tmp_path / "layers.tif")
+
+
+@pytest.mark.parametrize("extension", ["gif", "webp"])
+@pytest.mark.parametrize("settings", [{}, {"duration": 100}], ids=["frames", "timed"])
+def test_animations_are_refused_and_stills_are_not(tmp_path: Path, extension: str, settings: dict[str, Any]) -> None:
+    frames = [Image.fromarray(np.roll(PIXELS, k, 1)) for k in range(3)]
+    frames[0].save(tmp_path / f"still.{extension}")
+    assert read_picture(tmp_path / f"still.{extension}").shape == SRGB.shape
+    frames[0].save(tmp_path / f"moves.{extension}", save_all=True, append_images=frames[1:], **settings)
+    with pytest.raises(ValueError, match=rf"moves\.{extension}: is an animation; save one frame"):
+        read_picture(tmp_path / f"moves.{extension}")
+
+
+def test_more_pixels_than_the_limit_are_refused_by_the_header(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", SRGB)
+    assert read_picture(tmp_path / "a.png", max_pixels=24 * 37).shape == SRGB.shape
+    with pytest.raises(ValueError, match=r"a\.png: its header tells 24 x 37 pixels, above the limit of 887"):
+        read_picture(tmp_path / "a.png", max_pixels=24 * 37 - 1)
+
+
+def s15_fixed16(*values: float) -> bytes:
+    return b"".join(struct.pack(">i", round(value * 65536)) for value in values)
+
+
+def icc_profile(space: bytes, tags: dict[bytes, bytes]) -> bytes:
+    """A display profile of version 2; a description that does not say sRGB is added."""
+    text = b"other space\0"
+    tags = {b"desc": b"desc" + bytes(4) + struct.pack(">I", len(text)) + text + bytes(78), **tags}
+    data, table = b"", b""
+    for name, tag in tags.items():
+        table += name + struct.pack(">II", 128 + 4 + 12 * len(tags) + len(data), len(tag))
+        data += tag + bytes(-len(tag) % 4)
+    size = 128 + 4 + len(table) + len(data)
+    header = struct.pack(">I4sI4s4s4s", size, b"test", 0x02400000, b"mntr", space, b"XYZ ")
+    header = header.ljust(36, b"\0") + b"acsp"
+    header = header.ljust(68, b"\0") + s15_fixed16(0.9642, 1, 0.8249)
+    return header.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + data
+
+
+def curve(gamma: float) -> bytes:
+    return b"curv" + bytes(4) + struct.pack(">IH", 1, round(256 * gamma)) + bytes(2)
+
+
+def test_a_profile_is_applied_and_srgb_by_name_is_left_alone(tmp_path: Path) -> None:
+    """In a space whose red is sRGB's green and the other way round, the two channels change places."""
+    red, green, blue = ((0.4361, 0.2225, 0.0139), (0.3851, 0.7169, 0.0971), (0.1431, 0.0606, 0.7141))
+    primaries = {b"rXYZ": green, b"gXYZ": red, b"bXYZ": blue, b"wtpt": (0.9642, 1, 0.8249)}
+    tags = {name: b"XYZ " + bytes(4) + s15_fixed16(*xyz) for name, xyz in primaries.items()}
+    profile = icc_profile(b"RGB ", {**tags, **{name: curve(2.2) for name in (b"rTRC", b"gTRC", b"bTRC")}})
+    bright = np.clip(PIXELS, 64, 255)  # above the straight part of sRGB's curve
+    for extension in ("png", "tif"):
+        Image.fromarray(bright).save(tmp_path / f"a.{extension}", icc_profile=profile)
+        expected = torch.from_numpy(bright[..., [1, 0, 2]].astype(int)).permute(2, 0, 1)
+        assert (read_picture(tmp_path / f"a.{extension}").int() - expected).abs().max() <= 3
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(PIXELS).save(tmp_path / "srgb.png", icc_profile=srgb)
+    assert torch.equal(read_picture(tmp_path / "srgb.png"), SRGB)
+
+
+def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
+    white = b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)
+    profile = icc_profile(b"GRAY", {b"wtpt": white, b"kTRC": curve(1.0)})
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "grey.png", icc_profile=profile)
+    expected = encode_srgb(SRGB[:1].double() / 255) * 255
+    error = (read_picture(tmp_path / "grey.png") - expected).abs()  # LittleCMS is coarse near black
+    assert error[SRGB[:1].expand_as(error) >= 12].max() <= 2
+
+
+def test_a_damaged_profile_is_told(tmp_path: Path) -> None:
+    profile = bytearray(icc_profile(b"RGB ", {b"wtpt": b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)}))
+    Image.fromarray(PIXELS).save(tmp_path / "a.tif", icc_profile=bytes(profile))
+    with pytest.raises(ValueError, match=r"a\.tif: its ICC profile cannot be used .*; convert the picture to sRGB"):
+        read_picture(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_plane_is_read_as_stored(tmp_path: Path, kind: type[np.unsignedinteger]) -> None:
+    numbers = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (6, 9), kind)
+    Image.fromarray(numbers).save(tmp_path / "a.png")
+    plane = read_plane(tmp_path / "a.png")
+    assert plane.dtype == kind and np.array_equal(plane, numbers)
+    write_picture(tmp_path / "rgb.png", SRGB)
+    with pytest.raises(ValueError, match=r"rgb\.png: holds uint8 in channels R, G, B; a mosaic is one channel"):
+        read_plane(tmp_path / "rgb.png")
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+@pytest.mark.parametrize("share", [0, 0.5])
+def test_cut_short_is_one_line_that_names_the_file(tmp_path: Path, extension: str, share: float) -> None:
+    path = tmp_path / f"cut.{extension}"
+    write_picture(path, SRGB)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(OSError, match=rf"cut\.{extension}: cannot be read as a picture") as caught:
+        read_picture(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_files_and_unwritable_ones_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.png: no such picture file"):
+        read_picture(tmp_path / "none.png")
+    with pytest.raises(OSError, match=r"nowhere/a\.png: cannot be written"):
+        write_picture(tmp_path / "nowhere" / "a.png", SRGB)
+    with pytest.raises(ValueError, match=r"a\.xyz: no picture format has this extension"):
+        write_picture(tmp_path / "a.xyz", SRGB)
+    with pytest.raises(ValueError, match=r"shape \(3, H, W\), got \(1, 24, 37\)"):
+        write_picture(tmp_path / "a.png", SRGB[:1])
+
+
+@given(st.floats(0, 1))
+def test_the_srgb_transfer_is_inverted_and_continuous(value: float) -> None:
+    v = torch.tensor(value, dtype=torch.float64)
+    assert abs(decode_srgb(encode_srgb(v)) - v) < 1e-6
+    assert abs(encode_srgb(decode_srgb(v)) - v) < 1e-6
+
+
+def test_the_srgb_transfer_has_its_published_values() -> None:
+    assert encode_srgb(torch.tensor(0.18)).item() == pytest.approx(0.4613561, abs=1e-6)
+    assert decode_srgb(torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0, 0.2140411, 1], abs=1e-6)

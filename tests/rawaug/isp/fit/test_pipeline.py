@@ -1,0 +1,131 @@
+"""The fit recovers a camera that is known, and says so in decibels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from rawaug.data.pair import Pair
+from rawaug.isp.fit import FitConfig, descent, fit_isp
+from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import psnr
+
+QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
+TINY = FitConfig(steps=3, pixels=512, batch=128, shading="off")
+
+
+def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
+    raw = isp.reverse(pair.srgb[None], white_balance=white_balance).raw
+    return psnr(raw, pair.raw[None]).item()
+
+
+def test_it_recovers_matrix_and_gains(
+    fitted: DictionaryISP, exact_pairs: list[Pair], camera_matrix: torch.Tensor
+) -> None:
+    torch.testing.assert_close(fitted.colour.atoms(), camera_matrix.expand(3, 3, 3), atol=0.02, rtol=0)
+    ratios = fitted.gain.atoms()[:3, 1:] / torch.tensor([p.white_balance for p in exact_pairs])[:, [0, 2]]
+    torch.testing.assert_close(ratios, torch.ones(3, 2), atol=0.02, rtol=0)
+
+
+def test_known_gains_give_an_unseen_shot(fitted: DictionaryISP, exact_pair: Callable[..., Pair]) -> None:
+    unseen = exact_pair("unseen", (1.3, 1.0, 2.2), seed=9)
+    assert error_db(fitted, unseen, unseen.white_balance) > 55.0
+    assert error_db(fitted, unseen) < 40.0  # blind, the gains cannot be guessed
+
+
+def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -> None:
+    pair = exact_pair("shot", (1.6, 1.0, 1.5), 0, curve=lambda x: (3 * x**2 - 2 * x**3) ** 1.8)
+    isp = fit_isp([pair], replace(QUICK, batch=512, shading="off"), progress=False)
+    rendered = isp.forward(pair.raw[None], white_balance=pair.white_balance).srgb
+    assert psnr(rendered, pair.srgb[None] / 255.0).item() > 33.0  # gamma alone: 25
+
+
+def test_the_isp_tells_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
+    assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0}
+    assert str(fitted.cfa) == "GRBG" and not fitted.training
+
+
+def test_noisy_frames_give_the_constants_of_clean_ones(exact_pair: Callable[..., Pair]) -> None:
+    balances = [(1.5, 1.0, 2.0), (1.7, 1.0, 1.7), (2.0, 1.0, 1.5)]
+    pairs = [exact_pair(f"shot{k}", balance, k, shot_var=5e-3) for k, balance in enumerate(balances)]
+    config = replace(QUICK, steps=20, pixels=16384, shading="off")
+    clean = fit_isp(pairs, config, progress=False)
+    unread = [replace(pair, raw=torch.full_like(pair.raw, torch.nan)) for pair in pairs]  # the clean RAW is not seen
+    noisy = fit_isp(unread, replace(config, noisy=True), progress=False)
+    srgb = pairs[0].srgb[None]
+    torch.testing.assert_close(noisy.choose(srgb).gains, clean.choose(srgb).gains, rtol=0.03, atol=0)
+    torch.testing.assert_close(noisy.choose(srgb).matrix, clean.choose(srgb).matrix, rtol=0, atol=0.03)
+
+
+def test_the_forward_pass_of_a_noisy_fit_does_not_learn_the_noise(exact_pair: Callable[..., Pair]) -> None:
+    pair = exact_pair("shot", (1.6, 1.0, 1.5), 0, shot_var=2e-2)
+    isp = fit_isp([pair], replace(QUICK, batch=512, shading="off", noisy=True), progress=False)
+    x5 = isp.reverse(pair.srgb[None])
+    back = isp.forward(x5.raw, x5.params).srgb
+    assert psnr(back, pair.srgb[None] / 255.0).item() > 36.0
+
+
+def test_an_unregistered_pair_is_fitted_over_blocks(
+    exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
+) -> None:
+    wide = exact_pair("jpeg", (1.6, 1.0, 1.5), 0, size=(192, 256))
+    raw, srgb = wide.raw[:, 8:-8, 8:-8], wide.srgb[:, 4:-12, 14:-2]  # 4 pixels down, 6 to the left
+    jpeg = replace(wide, raw=raw, srgb=srgb, registered=False)
+    isp = fit_isp([jpeg], replace(QUICK, batch=256, shading="off"), progress=False)
+    torch.testing.assert_close(isp.colour.atoms()[0], camera_matrix, atol=0.05, rtol=0)
+    assert error_db(isp, exact_pair("unseen", (1.6, 1.0, 1.5), 9)) > 40.0
+
+
+def test_a_seed_gives_one_isp_and_another_seed_another(exact_pairs: list[Pair]) -> None:
+    first, again, other = (
+        fit_isp(exact_pairs[:1], replace(TINY, seed=seed), progress=False).state_dict() for seed in (0, 0, 1)
+    )
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert not torch.equal(first["colour.matrices"], other["colour.matrices"])
+
+
+def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(
+    exact_pairs: list[Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descent, "REPORT_STEPS", 2)
+    scores = []
+
+    def report(isp: DictionaryISP) -> str:
+        scores.append(error_db(isp, exact_pairs[0], exact_pairs[0].white_balance))
+        return f"{scores[-1]:.1f} dB"
+
+    last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report)
+    assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=1e-3)
+    seen = last.state_dict()
+    unseen = fit_isp(exact_pairs[:1], TINY, progress=False).state_dict()
+    assert len(scores) == 2 and min(scores) > 45.0  # after 2 and 3 steps
+    assert all(torch.equal(seen[key], unseen[key]) for key in seen)
+
+
+def test_more_frames_than_atoms_are_clustered(exact_pairs: list[Pair]) -> None:
+    isp = fit_isp(exact_pairs, replace(TINY, atoms=2), progress=False)
+    assert isp.config.gain_atoms == isp.config.colour_atoms == 2
+
+
+def test_no_frame_and_a_white_frame_are_refused(exact_pairs: list[Pair], camera_matrix: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="no RAW-sRGB pair"):
+        fit_isp([], TINY, progress=False)
+    first = exact_pairs[0]
+    white = Pair(
+        "white", torch.full_like(first.srgb, 255), torch.ones_like(first.raw), first.cfa, (1, 1, 1), camera_matrix
+    )
+    with pytest.raises(ValueError, match="unclipped"):
+        fit_isp([white], TINY, progress=False)
+
+
+def test_settings_that_cannot_be_are_refused(exact_pairs: list[Pair]) -> None:
+    settings: dict[str, Any]
+    for settings in ({"atoms": 0}, {"pixels": 0}, {"steps": -1}, {"reach": 0.9}):
+        with pytest.raises(ValueError, match=next(iter(settings))):
+            FitConfig(**settings)
+    with pytest.raises(ValueError, match="gain_atoms is 20, but these frames call for 1 to 9"):
+        fit_isp(exact_pairs[:1], replace(TINY, isp={"gain_atoms": 20}), progress=False)

@@ -1,0 +1,152 @@
+"""The baked reverse pass against the ISP itself."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
+from rawaug.isp.fast import BakedISP
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import place_in_frame
+from rawaug.isp.unbaked import UnbakedISP, reverse_pass
+from rawaug.kernels import compiled
+from rawaug.metrics import psnr
+
+
+def curved_isp(**settings: object) -> DictionaryISP:
+    """An ISP with atoms apart from each other, and with tone, attention and shading that do something."""
+    generator = torch.Generator().manual_seed(0)
+    isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings))  # type: ignore[arg-type]
+    with torch.no_grad():
+        isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
+        for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):
+            list(network.parameters())[-2].normal_(std=0.05, generator=generator)
+    isp.shading.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+    return isp
+
+
+@pytest.fixture(params=["compiled", "pytorch"])
+def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without compiled loops."""
+    monkeypatch.setattr(compiled, "available", lambda: request.param == "compiled")
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("attention", [False, True])
+def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
+    isp = curved_isp(attention=attention)
+    generator = torch.Generator().manual_seed(1)
+    srgb = torch.randint(256, (4, 3, 48, 64), generator=generator, dtype=torch.uint8)
+    params = isp.choose(srgb)
+    unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
+    assert psnr(BakedISP(isp)(srgb, params), unbaked).min().item() > 75.0
+
+
+def test_the_table_has_the_same_bits_with_any_number_of_threads() -> None:
+    isp, before = curved_isp(), torch.get_num_threads()
+    tables = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        try:
+            tables.append(BakedISP(isp).table)
+            assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+    assert torch.equal(tables[0], tables[1]) and torch.equal(tables[0], tables[2])
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("left_out", POINTWISE_STAGES)
+def test_any_stage_may_be_left_out(left_out: str) -> None:
+    isp = curved_isp(stages=tuple(stage for stage in POINTWISE_STAGES if stage != left_out))
+    srgb = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    params = isp.choose(srgb)
+    unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
+    assert psnr(BakedISP(isp)(srgb, params), unbaked).item() > 75.0
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("view", bayer.View)
+def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: bayer.View) -> None:
+    isp = curved_isp()
+    frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
+    params = isp.choose(frame)
+    x5 = isp.reverse_pixels(frame, params)
+    crop, expected = (bayer.turn(x[..., 6:26, 34:50], view) for x in (frame, x5))
+    raw = BakedISP(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
+    assert psnr(raw, bayer.pack_rgb(expected, isp.cfa)).item() > 75.0
+
+
+@pytest.mark.usefixtures("either_way")
+def test_white_is_where_the_sensor_saturates() -> None:
+    isp, srgb = curved_isp(), torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    params, baked = isp.choose(srgb), BakedISP(isp)
+    assert torch.equal(baked(srgb, params, white=0.1), baked(srgb, params).clamp(max=0.1))
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("looks", [False, True])
+def test_choice_is_that_of_the_isp(looks: bool) -> None:
+    generator = torch.Generator().manual_seed(2)
+    isp = curved_isp(encoders=looks)
+    with torch.no_grad():
+        for encoder in (isp.reverse_networks.colour_encoder, isp.reverse_networks.gain_encoder):
+            list(encoder.parameters())[-2].normal_(std=5.0, generator=generator)
+    srgb = torch.randint(256, (3, 3, 150, 200), generator=generator, dtype=torch.uint8)
+    chosen, expected = BakedISP(isp).choose(srgb), isp.choose(srgb)
+    assert (expected.colour_weights.std(0) > 1e-3).any() == looks
+    for a, b in zip(chosen, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=0)
+
+
+def test_later_changes_of_the_isp_do_not_reach_it() -> None:
+    isp, srgb = curved_isp(), torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    params, baked = isp.choose(srgb), BakedISP(isp)
+    before = baked(srgb, params)
+    with torch.no_grad():
+        for value in isp.parameters():
+            value.add_(0.1)
+    assert torch.equal(baked(srgb, params), before)
+
+
+def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
+    isp = curved_isp()
+    baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
+    with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
+        baked(torch.zeros(2, 3, 8, 7), params)
+    with pytest.raises(ValueError, match="matrix is for 2 pictures, the batch has 3"):
+        baked(torch.zeros(3, 3, 8, 8), params)
+    with pytest.raises(ValueError, match="place is for 1 pictures"):
+        baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))
+
+
+def test_bytes_and_floats_agree() -> None:
+    isp = curved_isp()
+    srgb = torch.randint(256, (1, 3, 16, 16), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    params, baked = isp.choose(srgb), BakedISP(isp)
+    torch.testing.assert_close(baked(srgb, params), baked(srgb / 255.0, params), atol=1e-6, rtol=1e-5)
+
+
+ODD_ORDER = ("gamma", "shading", "gains", "colour")
+
+
+def test_another_order_of_stages_is_not_baked() -> None:
+    isp = DictionaryISP(ISPConfig(stages=ODD_ORDER))
+    with pytest.raises(ValueError, match="usual order"):
+        BakedISP(isp)
+    assert isinstance(reverse_pass(isp), UnbakedISP)
+    assert isinstance(reverse_pass(DictionaryISP(ISPConfig(stages=["tone", "gains"]))), BakedISP)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("view", list(bayer.View))
+def test_unbaked_is_the_isp_wherever_the_crop_is(view: bayer.View) -> None:
+    isp = curved_isp(stages=ODD_ORDER)
+    frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(2))
+    crop = bayer.turn(frame[..., 6:26, 34:54], view).contiguous()
+    params = isp.choose(frame)
+    place = bayer.turn(place_in_frame(20, 20, (6, 34), (40, 60)), view)
+    expected = bayer.pack(isp.reverse(crop, params, place=place).raw, isp.cfa)
+    raw = reverse_pass(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
+    torch.testing.assert_close(raw, expected, atol=1e-6, rtol=1e-5)

@@ -1,0 +1,71 @@
+"""The kernels for a GPU: step by step on the CPU, compiled for a real target, and what is done where they fail."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from rawaug.kernels import fallback
+
+triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
+
+
+def test_step_by_step_they_do_what_the_cpu_does() -> None:
+    tests = Path(__file__).with_name("kernels_interpreted.py")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tests)]
+    done = subprocess.run(command, env={**os.environ, "TRITON_INTERPRET": "1"}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert "9 passed" in done.stdout
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_the_noise_compiles_for_a_gpu(told: bool) -> None:
+    from rawaug.kernels import noise_triton as noise
+
+    names = ("clean", "levels", "keys", "noisy", "variance", "cells", "white")
+    types = dict(zip(names, ("*fp32", "*fp32", "*i64", "*fp32", "*fp32", "i32", "fp32"), strict=True))
+    assert "st.global" in compiled_for_a_gpu(noise._cells, types, {"TOLD": told, "BLOCK": 512})
+
+
+@pytest.mark.parametrize(("pixels", "all_stages"), [("*u8", True), ("*fp32", False)])
+def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
+    from rawaug.kernels import raw_triton as raw
+
+    types = {"srgb": pixels, **dict.fromkeys(("table", "attention", "colour", "frame", "shading", "raw"), "*fp32")}
+    types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
+    constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "BLOCK": 256}
+    constants |= {"ATTENDS": all_stages, "SHADES": all_stages}
+    assert "st.global" in compiled_for_a_gpu(raw._cells, types, constants)
+
+
+def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, Any]) -> str:
+    """PTX for compute capability 8.0; needs no GPU."""
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    source = ASTSource(kernel, {**types, **dict.fromkeys(constants, "constexpr")}, constants)
+    return str(triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"enable_fp_fusion": True}).asm["ptx"])
+
+
+def test_a_kernel_that_fails_is_told_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fallback, "_refused", [])
+
+    def fails() -> int:
+        raise RuntimeError("no ptxas\nfor this target")
+
+    with pytest.warns(UserWarning, match="cannot be used, PyTorch is: RuntimeError: for this target"):
+        assert fallback.kernel_or(fails, lambda: 2) == 2
+    assert not fallback.usable(torch.zeros(1, device="meta"))
+
+    def has_no_room() -> int:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    with pytest.raises(torch.OutOfMemoryError):
+        fallback.kernel_or(has_no_room, lambda: 2)
+    assert fallback._refused == ["RuntimeError"]

@@ -1,0 +1,95 @@
+"""The compiled pass against the one in PyTorch: the same numbers, on any number of threads, from any picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from rawaug.kernels import raw_numba
+from rawaug.kernels.raw_torch import Camera, frame_of, look_up, unprocess
+
+NODES = 9
+
+
+def camera(batch: int, attention: bool, shading: bool, seed: int = 0) -> Camera:
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.rand(NODES, NODES, NODES, 4, generator=generator)
+    frames = [frame_of([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
+    return Camera(
+        table=table,
+        attention=2.0 * table.flip(0) if attention else torch.empty(0, 0, 0, 4),
+        colour=torch.rand(batch, 6, 3, generator=generator),
+        knee=0.9,
+        frame=torch.tensor(frames).reshape(batch, 6),
+        shading=torch.tensor([0.9, 0.4, 0.7]) if shading else torch.empty(0),
+        sites=torch.tensor([(1, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 2)]),
+    )
+
+
+def pictures(*shape: int) -> Tensor:
+    return torch.randint(256, shape, generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("attention", [False, True])
+@pytest.mark.parametrize("shading", [False, True])
+@pytest.mark.parametrize("white", [1.0, 0.2, float("inf")])
+def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float) -> None:
+    srgb, setting = pictures(3, 3, 6, 1100), camera(3, attention, shading)
+    for x in (srgb, srgb / 255.0):
+        torch.testing.assert_close(
+            raw_numba.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0
+        )
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 3), st.integers(0, 9), st.integers(0, 300))
+def test_any_size(batch: int, height: int, width: int) -> None:
+    srgb, setting = pictures(batch, 3, 2 * height, 2 * width), camera(batch, True, True)
+    torch.testing.assert_close(
+        raw_numba.unprocess(srgb, setting, 1.0), unprocess(srgb, setting, 1.0), atol=1e-4, rtol=0
+    )
+
+
+def test_same_bits_on_any_number_of_threads(threads: None) -> None:
+    srgb, setting = pictures(2, 3, 400, 500), camera(2, True, True)
+    results = []
+    for number in (1, 2, 3):
+        torch.set_num_threads(number)
+        results.append(raw_numba.unprocess(srgb, setting, 1.0))
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+def test_floats_beyond_the_cube_are_held_to_it_and_strides_do_not_matter() -> None:
+    wild = torch.tensor([-1e30, -0.5, 0.0, 0.5, 1.0, 1.5, 1e30, float("inf")]).repeat(3)[:, None].expand(1, 3, 24, 16)
+    setting = camera(1, True, False)
+    expected = raw_numba.unprocess(wild.clamp(0.0, 1.0), setting, 1.0)
+    assert torch.equal(raw_numba.unprocess(wild, setting, 1.0), expected)
+    raw_numba.unprocess(torch.full((1, 3, 4, 4), float("nan")), setting, 1.0)  # must not read outside the table
+
+
+def test_bands_in_pytorch_are_the_picture_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    srgb, setting = pictures(2, 3, 20, 16), camera(2, True, True)
+    whole = unprocess(srgb, setting, 1.0)
+    monkeypatch.setattr("rawaug.kernels.raw_torch._BAND", 6 * 16)
+    torch.testing.assert_close(unprocess(srgb, setting, 1.0), whole, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (65, 130), (40, 33), (7, 9)])
+def test_thumbnails_are_adaptive_averages_looked_up(size: tuple[int, int]) -> None:
+    srgb, table = pictures(2, 3, *size), camera(1, False, False).table
+    for small in ((7, 9), (5, 8), size):
+        expected = look_up(table, F.adaptive_avg_pool2d(srgb / 255.0, small))[:, :3]
+        torch.testing.assert_close(raw_numba.thumbnails(srgb, table, *small), expected, atol=1e-5, rtol=0)

@@ -1,0 +1,205 @@
+"""The augmentation: pairs that replay, and batches in the forms that people have."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from rawaug import bayer
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.params import AugmentParams, RawPair
+
+
+@pytest.fixture(scope="module")
+def isp() -> DictionaryISP:
+    return DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3))
+
+
+@pytest.fixture
+def augment(isp: DictionaryISP) -> RawAugment:
+    return RawAugment(isp, noise="cycleisp_sidd")
+
+
+@pytest.fixture
+def srgb() -> Tensor:
+    return torch.randint(256, (3, 3, 16, 20), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+def assert_same(a: Any, b: Any) -> None:
+    if isinstance(a, RawPair):
+        assert all(torch.equal(x, y) for x, y in zip(a[:3], b[:3], strict=True))
+        assert_same(a.params, b.params)
+    else:
+        assert isinstance(a, AugmentParams)
+        first, second = a.tensors(), b.tensors()
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("sampling", ["convex", "perturb", "chosen"])
+def test_parameters_replay_the_pair(isp: DictionaryISP, srgb: Tensor, sampling: Any) -> None:
+    augment = RawAugment(isp, sampling=sampling)
+    pair = augment(srgb)
+    assert pair.noisy.shape == pair.clean.shape == pair.variance.shape == (3, 4, 8, 10)
+    assert_same(augment.apply(srgb, pair.params), pair)
+
+
+def test_noise_keeps_its_sign_at_black_and_is_cut_at_white(augment: RawAugment) -> None:
+    black = augment(torch.zeros(4, 3, 64, 64)).noisy
+    white = augment(torch.ones(4, 3, 64, 64)).noisy
+    assert (black < 0).float().mean() > 0.4
+    assert white.max() <= 1.0
+
+
+def test_draws_differ_but_a_seed_repeats_them(isp: DictionaryISP, srgb: Tensor) -> None:
+    a, b = RawAugment(isp, seed=1), RawAugment(isp, seed=1)
+    first, second = a(srgb), a(srgb)
+    assert not torch.equal(first.clean, second.clean)
+    assert_same(b(srgb), first)
+
+
+def test_a_picture_does_not_depend_on_its_batch(augment: RawAugment, srgb: Tensor) -> None:
+    pair = augment(srgb)
+    alone = pair.params.map(lambda t: t[1:2])
+    torch.testing.assert_close(augment.apply(srgb[1:2], alone).noisy, pair.noisy[1:2])
+
+
+def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
+    dim = torch.full((500, 3, 4, 4), 0.2)  # far from the highlights that the gains spare
+    as_is, draws = RawAugment(isp, noise=(0.0, 0.0)), torch.Generator()
+    clean = as_is(dim, draws.manual_seed(1)).clean
+    for low, high in ((-1.0, -1.0), (-2.0, 1.0)):
+        augment = RawAugment(isp, noise=(0.0, 0.0), exposure=(low, high))
+        pair = augment(dim, draws.manual_seed(1))
+        stops = (pair.clean / clean).log2().mean((1, 2, 3))
+        assert low - 1e-4 <= stops.min() <= low + 0.02 and high - 0.02 <= stops.max() <= high + 1e-4
+        assert stops.mean().item() == pytest.approx((low + high) / 2, abs=0.15)
+        assert torch.equal(augment.apply(dim, pair.params).clean, pair.clean)
+
+
+def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
+    with pytest.raises(ValueError, match="convex, perturb, chosen"):
+        RawAugment(isp, sampling="random")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="lowest and the highest in stops"):
+        RawAugment(isp, exposure=(1.0, -1.0))
+
+
+def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
+    with pytest.raises(ValueError, match="3 pictures, the batch has 2"):
+        augment.apply(srgb[:2], augment.sample(srgb))
+
+
+def test_module_apply_still_visits_modules(augment: RawAugment) -> None:
+    seen: list[nn.Module] = []
+    nn.Sequential(augment).apply(seen.append)
+    assert augment.isp in seen
+
+
+@pytest.mark.parametrize("form", ["nhwc", "numpy", "list", "pil list"])
+def test_a_batch_of_any_form_is_the_same(augment: RawAugment, srgb: Tensor, form: str) -> None:
+    nhwc = srgb.permute(0, 2, 3, 1)
+    forms: dict[str, Any] = {
+        "nhwc": nhwc,
+        "numpy": nhwc.numpy(),
+        "list": list(srgb),
+        "pil list": [Image.fromarray(picture.numpy()) for picture in nhwc],
+    }
+    generator = torch.Generator()
+    expected = augment(srgb, generator.manual_seed(1))
+    assert_same(augment(forms[form], generator.manual_seed(1)), expected)
+
+
+def test_fields_pass_and_keys_name_the_pictures(augment: RawAugment, srgb: Tensor) -> None:
+    pair, labels = augment([srgb, torch.arange(3)])
+    assert isinstance(pair, RawPair) and labels.tolist() == [0, 1, 2]
+    batch = augment({"image": srgb, "id": ["a", "b", "c"]}, key="image")
+    assert isinstance(batch["image"], RawPair) and batch["id"] == ["a", "b", "c"]
+    assert augment((labels, srgb), key=1)[1].noisy.shape == (3, 4, 8, 10)
+
+
+def test_a_single_picture_makes_a_single_pair_that_replays(augment: RawAugment) -> None:
+    picture = Image.fromarray(np.random.default_rng(0).integers(256, size=(17, 21, 3), dtype=np.uint8))
+    pair = augment(picture)
+    assert pair.noisy.shape == (4, 8, 10) and pair.params.place.tolist() == [0, 0, 16, 20, 0]
+    assert_same(augment.apply(picture, pair.params), pair)
+    assert augment.sample(picture).place.shape == (5,)
+
+
+@pytest.mark.parametrize("sampling", ["convex", "perturb"])
+def test_raw_stays_float32_in_mixed_precision(isp: DictionaryISP, srgb: Tensor, sampling: Any) -> None:
+    augment, generator = RawAugment(isp, sampling=sampling), torch.Generator()
+    expected = augment(srgb, generator.manual_seed(0))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_same(augment(srgb, generator.manual_seed(0)), expected)
+
+
+class Transformed(Dataset[Tensor]):
+    """One picture over and over, augmented in the worker by the module's own generator."""
+
+    def __init__(self, augment: RawAugment) -> None:
+        self.augment = augment
+
+    def __len__(self) -> int:
+        return 8
+
+    def __getitem__(self, index: int) -> Tensor:
+        pair: RawPair = self.augment(torch.full((3, 4, 4), 0.5))
+        return pair.noisy
+
+
+def test_workers_do_not_repeat_each_other_nor_the_last_epoch(augment: RawAugment) -> None:
+    loader = DataLoader(Transformed(augment), num_workers=2, generator=torch.Generator().manual_seed(0))
+    drawn = [noisy.flatten().tolist() for _ in range(2) for noisy in loader]
+    assert len({tuple(values) for values in drawn}) == 16
+
+
+@pytest.mark.parametrize("place", ["before", "inside"])
+def test_kornia_before_it_and_around_it(augment: RawAugment, srgb: Tensor, place: str) -> None:
+    from kornia.augmentation import AugmentationSequential, RandomHorizontalFlip
+
+    flip = RandomHorizontalFlip(p=1.0)
+    before = nn.Sequential(AugmentationSequential(flip, data_keys=["input"]), augment)
+    pipeline = before if place == "before" else AugmentationSequential(flip, augment, data_keys=["input"])
+    pair = pipeline(srgb / 255.0)
+    assert isinstance(pair, RawPair)
+    assert_same(augment.apply((srgb / 255.0).flip(-1), pair.params), pair)
+
+
+def test_camera_noise_is_that_of_the_file(isp: DictionaryISP) -> None:
+    with pytest.raises(ValueError, match="fitted without measuring noise"):
+        RawAugment(isp, noise="camera")
+    measured = DictionaryISP()
+    measured.info["noise"] = {"shot_var": 2e-3, "read_var": 3e-5, "r2": 0.99}
+    params = RawAugment(measured, noise="camera")(torch.rand(2, 3, 8, 8)).params
+    torch.testing.assert_close(params.noise["shot_var"], torch.full((2,), 2e-3))
+    torch.testing.assert_close(params.noise["read_var"], torch.full((2,), 3e-5))
+
+
+def test_a_network_in_bfloat16_leaves_it_in_float32(isp: DictionaryISP, srgb: Tensor) -> None:
+    augment = RawAugment(copy.deepcopy(isp), seed=3)
+    whole = torch.nn.Sequential(augment, torch.nn.Conv2d(4, 4, 1)).to(torch.bfloat16)
+    assert whole[1].weight.dtype == torch.bfloat16
+    expected = RawAugment(isp, seed=3)(srgb)
+    assert torch.equal(augment(srgb).noisy, expected.noisy)
+
+
+def test_any_order_of_stages_makes_pairs(srgb: Tensor) -> None:
+    augment = RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))), noise=(0.0, 0.0))
+    pair = augment(srgb)
+    expected = augment.isp.reverse(srgb, pair.params.isp).raw.clamp(max=1.0)
+    torch.testing.assert_close(bayer.unpack(pair.clean, augment.isp.cfa), expected)
+
+
+@pytest.mark.parametrize("key", [-1, 1])
+def test_a_negative_index_names_the_pictures_too(augment: RawAugment, srgb: Tensor, key: int) -> None:
+    labels, pair = augment((["a", "b"], srgb), key=key)
+    assert labels == ["a", "b"] and isinstance(pair, RawPair)

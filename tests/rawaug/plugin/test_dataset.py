@@ -1,0 +1,281 @@
+"""Datasets of pairs: keyed by seed, epoch and index, whatever the loader does; streams too."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+
+from rawaug import bayer
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.params import RawPair
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")  # more workers than cores, on purpose
+
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def augment() -> RawAugment:
+    isp = DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3))
+    return RawAugment(isp, noise="cycleisp_sidd")
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[Tensor]:
+    """Pictures of different sizes, some sides odd."""
+    generator = torch.Generator().manual_seed(0)
+    return [torch.randint(256, (3, 21 + i, 34 - i), generator=generator, dtype=torch.uint8) for i in range(COUNT)]
+
+
+@pytest.fixture(scope="module")
+def expected(augment: RawAugment, pictures: list[Tensor]) -> Tensor:
+    """The noisy pictures of epoch 2, one by one."""
+    pairs = RawPairs(pictures, augment, crop=16, seed=7)
+    pairs.set_epoch(2)
+    return torch.stack([pairs[i].noisy for i in range(COUNT)])
+
+
+@pytest.mark.parametrize(
+    ("workers", "batch", "start_method", "start"),
+    [
+        (0, 1, None, 0),
+        (0, 5, None, 5),
+        (1, 3, "fork", 0),
+        (4, 2, "fork", 0),
+        (4, 5, "fork", 7),
+        (2, 2, "forkserver", 3),
+        (2, 3, "spawn", 0),
+    ],
+)
+def test_pairs_are_the_same_however_they_are_loaded(
+    augment: RawAugment,
+    pictures: list[Tensor],
+    expected: Tensor,
+    workers: int,
+    batch: int,
+    start_method: str | None,
+    start: int,
+) -> None:
+    pairs = RawPairs(pictures, augment, crop=16, seed=7)
+    pairs.set_epoch(2)
+    rest = range(start, COUNT)  # as a sampler that was resumed in the middle of the epoch
+    loader = DataLoader(pairs, batch, sampler=rest, num_workers=workers, multiprocessing_context=start_method)
+    assert torch.equal(torch.cat([pair.noisy for pair in loader]), expected[start:])
+
+
+def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=16)
+    views = set()
+    for i in range(COUNT):
+        top, left, height, width, view = pairs[i].params.place.tolist()
+        assert (height, width) == tuple(side // 2 * 2 for side in pictures[i].shape[1:])
+        patch = bayer.turn(pictures[i][:, top : top + 16, left : left + 16], view)
+        assert torch.equal(augment.apply(patch, pairs[i].params).noisy, pairs[i].noisy)
+        views.add(view)
+    assert len(views) > 3
+    upright = RawPairs(pictures, augment, crop=16, turns=False)
+    assert {int(upright[i].params.place[4]) for i in range(COUNT)} == {0}
+
+
+def test_another_epoch_or_seed_is_another_draw(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=16, seed=7)
+    first = pairs[0].clean
+    pairs.set_epoch(1)
+    assert not torch.equal(pairs[0].clean, first)
+    pairs.set_epoch(0)
+    assert torch.equal(pairs[0].clean, first)
+    assert not torch.equal(RawPairs(pictures, augment, crop=16, seed=8)[0].clean, first)
+
+
+def test_indices_are_those_of_a_sequence(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=16)
+    assert torch.equal(pairs[-1].noisy, pairs[COUNT - 1].noisy)
+    assert torch.equal(pairs[torch.tensor(3)].noisy, pairs[3].noisy)  # type: ignore[index]
+    with pytest.raises(IndexError):
+        pairs[COUNT]
+
+
+@pytest.mark.parametrize("kind", ["map-style", "stream"])
+def test_persistent_workers_see_the_epoch(augment: RawAugment, pictures: list[Tensor], kind: str) -> None:
+    dataset = RawPairs(pictures if kind == "map-style" else Counted(pictures, strided=True), augment, crop=16)
+    loader = DataLoader(dataset, num_workers=2, persistent_workers=True)
+    first = next(iter(loader)).clean
+    dataset.set_epoch(1)
+    again = next(iter(loader)).clean
+    assert not torch.equal(first, again)
+    pairs = RawPairs(pictures, augment, crop=16)
+    pairs.set_epoch(1)
+    assert torch.equal(again[0], pairs[0].clean)
+
+
+class ImageFolder(Dataset[Any]):
+    """The protocol of torchvision's: (picture, class) of a folder of folders, each through its transform."""
+
+    def __init__(self, root: Path, transform: Callable[[Any], Any] | None = None) -> None:
+        self.classes = sorted(folder.name for folder in root.iterdir())
+        self.samples = [(file, i) for i, name in enumerate(self.classes) for file in sorted((root / name).iterdir())]
+        self.transform = transform
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> tuple[Any, int]:
+        file, target = self.samples[index]
+        with file.open("rb") as stream:
+            picture = Image.open(stream).convert("RGB")
+        return (self.transform(picture) if self.transform else picture), target
+
+
+def test_an_image_folder(augment: RawAugment, tmp_path: Path) -> None:
+    for name in ("cat", "dog"):
+        (tmp_path / name).mkdir()
+        for i in range(2):
+            array = np.random.default_rng(i).integers(256, size=(20 + i, 25, 3), dtype=np.uint8)
+            Image.fromarray(array).save(tmp_path / name / f"{i}.png")
+    as_dataset = DataLoader(RawPairs(ImageFolder(tmp_path), augment, crop=16), batch_size=4)
+    pair, targets = next(iter(as_dataset))
+    assert pair.noisy.shape == (4, 4, 8, 8) and targets.tolist() == [0, 0, 1, 1]
+    as_transform = DataLoader(ImageFolder(tmp_path, transform=augment), batch_size=1)
+    assert [pair.noisy.shape for pair, _ in as_transform][:2] == [(1, 4, 10, 12), (1, 4, 10, 12)]
+
+
+def test_labels_and_fields_pass_through(augment: RawAugment) -> None:
+    picture = np.zeros((16, 16, 3), np.uint8)
+    pair, label = RawPairs([(picture, 3)], augment, crop=16)[0]
+    assert isinstance(pair, RawPair) and label == 3
+    sample = RawPairs([{"image": picture, "id": "x"}], augment, crop=16, key="image")[0]
+    assert isinstance(sample["image"], RawPair) and sample["id"] == "x"
+
+
+def test_small_pictures_and_odd_crops_are_refused(augment: RawAugment, pictures: list[Tensor]) -> None:
+    with pytest.raises(ValueError, match="picture 0: 20 x 34 is smaller than the crop 64 x 64"):
+        RawPairs(pictures, augment, crop=64)[0]
+    with pytest.raises(ValueError, match="even"):
+        RawPairs(pictures, augment, crop=15)
+    with pytest.raises(ValueError, match="picture 0: a float picture"):
+        RawPairs([torch.full((3, 8, 8), 255.0)], augment, crop=None)[0]
+
+
+def test_whole_pictures_lose_their_odd_line(augment: RawAugment, pictures: list[Tensor]) -> None:
+    assert RawPairs(pictures, augment, crop=None)[0].noisy.shape == (4, 10, 17)
+
+
+class Counted(IterableDataset[Any]):
+    """(number, picture) in order; ``strided`` divides them between workers, else each worker has all."""
+
+    def __init__(self, pictures: list[Tensor], strided: bool) -> None:
+        self.pictures, self.strided, self.epoch = pictures, strided, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[Any]:
+        info = get_worker_info()
+        mine = (info.id, None, info.num_workers) if info and self.strided else (0, None, 1)
+        return islice(iter(self.pictures), *mine)
+
+
+class Shards(IterableDataset[Any]):
+    """Dicts with a name, in four shards of three, whole shards to each worker."""
+
+    def __init__(self, pictures: list[Tensor]) -> None:
+        self.pictures = pictures
+
+    def __iter__(self) -> Iterator[Any]:
+        info = get_worker_info()
+        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        for shard in range(worker, 4, workers):
+            for i in range(3 * shard, 3 * shard + 3):
+                yield {"jpg": self.pictures[i], "__key__": f"{i:03d}"}
+
+
+def values(pairs: Any) -> set[float]:
+    return {float(pair.noisy.sum()) for pair in pairs}
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+@pytest.mark.parametrize("divided_by", ["dataset", "stream"])
+def test_a_stream_in_turns_keeps_its_draws(
+    augment: RawAugment, pictures: list[Tensor], workers: int, divided_by: str
+) -> None:
+    dataset = Counted(pictures, strided=divided_by == "dataset")
+    stream = RawPairStream(dataset, augment, crop=16, seed=7, divide=divided_by == "stream")
+    stream.set_epoch(2)
+    pairs = RawPairs(pictures, augment, crop=16, seed=7)
+    pairs.set_epoch(2)
+    got = [float(noisy.sum()) for pair in DataLoader(stream, num_workers=workers) for noisy in pair.noisy]
+    assert got == [
+        float(pairs[i].noisy.sum()) for i in range(COUNT)
+    ]  # one a batch: the order is that of the stream too
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_shards_keep_their_draws_by_identity(augment: RawAugment, pictures: list[Tensor], workers: int) -> None:
+    stream = RawPairStream(Shards(pictures), augment, crop=16, key="jpg", identity="__key__")
+    loaded = DataLoader(stream, batch_size=2, num_workers=workers)
+    got = {key: noisy for s in loaded for key, noisy in zip(s["__key__"], s["jpg"].noisy, strict=True)}
+    assert len(got) == COUNT
+    assert all(torch.equal(got[sample["__key__"]], sample["jpg"].noisy) for sample in stream)
+
+
+def test_workers_of_a_stream_share_no_draw(augment: RawAugment) -> None:
+    same = [torch.full((3, 16, 16), 128, dtype=torch.uint8)] * 6
+    stream = RawPairs(Counted(same, strided=False), augment, crop=16)
+    assert isinstance(stream, RawPairStream)
+    assert len(values(DataLoader(stream, num_workers=2))) == 12  # as plain PyTorch: each worker has all
+
+
+def test_an_iterable_is_a_stream_and_tells_its_dataset_the_epoch(augment: RawAugment, pictures: list[Tensor]) -> None:
+    dataset = Counted(pictures, strided=True)
+    stream = RawPairs(dataset, augment, crop=16)
+    stream.set_epoch(4)
+    assert dataset.epoch == 4
+    with pytest.raises(TypeError, match="no index"):
+        stream[0]
+    with pytest.raises(TypeError, match="Counted has no length"):
+        len(stream)
+    with pytest.raises(ValueError, match="identity='name'"):
+        next(iter(RawPairStream(Shards(pictures), augment, crop=16, key="jpg", identity="name")))
+
+
+FORKED_AFTER_LIBRAW = """
+import sys
+import rawpy, torch
+from torch.utils.data import DataLoader
+from rawaug import DictionaryISP, RawAugment, RawPairs
+
+pictures = []
+for path in sys.argv[1:]:
+    with rawpy.imread(path) as raw:
+        pictures.append(torch.from_numpy(raw.postprocess().copy()))
+pairs = RawPairs(pictures, RawAugment(DictionaryISP()), crop=128)
+list(pairs)  # the parent's threads have worked too
+for run in range(20):
+    loader = DataLoader(pairs, num_workers=2, multiprocessing_context="fork")
+    assert sum(pair.noisy.numel() for pair in loader) == len(pictures) * 4 * 64 * 64
+print("done")
+"""
+
+
+def test_forked_workers_do_not_hang_after_libraw_has_developed(bayer_dng: Callable[..., Path], tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(4096, size=(2, 512, 768), dtype=np.uint16)
+    files = [str(bayer_dng(tmp_path / f"{i}.dng", array)) for i, array in enumerate(numbers)]
+    many_threads = {key: value for key, value in os.environ.items() if key != "OMP_NUM_THREADS"}
+    command = [sys.executable, "-c", FORKED_AFTER_LIBRAW, *files]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=many_threads, check=False)
+    assert done.stdout == "done\n", done.stderr

@@ -1,0 +1,166 @@
+"""Wrapped loaders: pairs in place of pictures, all else as it was."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset
+
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.loader import wrap
+from rawaug.plugin.params import RawPair
+
+
+@pytest.fixture(scope="module")
+def augment() -> RawAugment:
+    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
+
+
+@pytest.fixture
+def srgb() -> Tensor:
+    return torch.randint(256, (6, 3, 16, 20), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+def different_sizes() -> list[Tensor]:
+    return [torch.full((3, 17 + i, 30 - i), 20 * i, dtype=torch.uint8) for i in range(4)]
+
+
+def batches_of(pictures: Any, size: int, **settings: Any) -> DataLoader[Any]:
+    return DataLoader(pictures, batch_size=size, **settings)
+
+
+def noisy(loader: Any) -> Tensor:
+    return torch.cat([pair.noisy for pair in loader])
+
+
+def test_wrapping_a_loader_is_one_line(augment: RawAugment, srgb: Tensor) -> None:
+    loader = DataLoader(TensorDataset(srgb, torch.arange(6)), batch_size=4)
+    wrapped = wrap(loader, augment)
+    batches = list(wrapped)
+    assert len(wrapped) == len(batches) == 2 and wrapped.batch_size == 4 and wrapped.dataset is loader.dataset
+    pair, labels = batches[0]
+    assert pair.noisy.shape == (4, 4, 8, 10) and labels.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_workers_do_not_change_the_pairs(augment: RawAugment, srgb: Tensor, workers: int) -> None:
+    expected = noisy(wrap(batches_of(srgb, 4), augment))
+    assert torch.equal(noisy(wrap(batches_of(srgb, 4, num_workers=workers), augment)), expected)
+
+
+def test_each_pass_is_another_epoch_that_can_be_had_again(augment: RawAugment, srgb: Tensor) -> None:
+    wrapped = wrap(batches_of(srgb, 2), augment)
+    first, second = noisy(wrapped), noisy(wrapped)
+    same = noisy(wrap([srgb[:1], srgb[:1]], augment))
+    assert not torch.equal(same[0], same[1])
+    assert not torch.equal(first, second)
+    wrapped.set_epoch(1)
+    assert torch.equal(noisy(wrapped), second)
+    resumed = wrap(batches_of(srgb[2:], 2), augment)
+    resumed.set_epoch(1, start=1)
+    assert torch.equal(noisy(resumed), second[2:])
+
+
+@pytest.mark.parametrize("form", ["list", "numpy", "tuples", "dict"])
+def test_pictures_of_different_sizes_with_a_crop(augment: RawAugment, form: str) -> None:
+    pictures = different_sizes()
+    batches: dict[str, Any] = {
+        "list": pictures,
+        "numpy": [picture.permute(1, 2, 0).numpy() for picture in pictures],
+        "tuples": (tuple(pictures), (0, 1, 2, 3)),
+        "dict": {"image": pictures, "id": [0, 1, 2, 3]},
+    }
+    loader = batches_of(range(4), 4, collate_fn=lambda _: batches[form])
+    (batch,) = wrap(loader, augment, key="image" if form == "dict" else None, crop=16)
+    if form in ("tuples", "dict"):
+        pair, ids = batch if form == "tuples" else (batch["image"], batch["id"])
+        assert list(ids) == [0, 1, 2, 3]
+    else:
+        pair = batch
+    assert isinstance(pair, RawPair) and pair.noisy.shape == (4, 4, 8, 8)
+    assert pair.params.place[:, 2:4].tolist() == [[16, 30], [18, 28], [18, 28], [20, 26]]
+
+
+def test_crops_are_where_the_parameters_say(augment: RawAugment) -> None:
+    ramp = torch.arange(40 * 50).reshape(1, 40, 50).expand(3, -1, -1) % 256
+    picture = ramp.to(torch.uint8)
+    (pair,) = wrap([[picture, picture]], augment, crop=16)
+    places = pair.params.place.tolist()
+    assert places[0] != places[1]
+    patches = torch.stack([picture[:, t : t + 16, left : left + 16] for t, left, *_ in places])
+    assert torch.equal(augment.apply(patches, pair.params).noisy, pair.noisy)
+
+
+def test_what_makes_no_batch_is_refused(augment: RawAugment) -> None:
+    with pytest.raises(ValueError, match=r"wrap\(..., crop=256\)"):
+        next(iter(wrap([different_sizes()], augment)))
+    with pytest.raises(ValueError, match="16 x 30 is smaller than the crop 20 x 20"):
+        next(iter(wrap([different_sizes()], augment, crop=20)))
+    with pytest.raises(ValueError, match="even"):
+        wrap([], augment, crop=15)
+
+
+def test_odd_sides_and_grey(augment: RawAugment) -> None:
+    grey = np.zeros((2, 9, 11, 1), np.uint8)
+    assert next(iter(wrap([grey], augment))).noisy.shape == (2, 4, 4, 5)
+
+
+def test_a_wrapped_loader_can_be_copied_and_pickled(augment: RawAugment, srgb: Tensor) -> None:
+    wrapped = wrap([srgb], augment)
+    for again in (copy.copy(wrapped), pickle.loads(pickle.dumps(wrapped))):
+        again.set_epoch(0)
+        wrapped.set_epoch(0)
+        assert torch.equal(noisy(again), noisy(wrapped))
+    with pytest.raises(AttributeError, match="nothing"):
+        wrapped.nothing  # noqa: B018 (raises)
+
+
+def test_fabric_sets_up_the_loader_that_is_wrapped(augment: RawAugment, srgb: Tensor) -> None:
+    fabric = Fabric(accelerator="cpu", devices=1)
+    loader = fabric.setup_dataloaders(batches_of(srgb, 3))
+    assert noisy(wrap(loader, augment, device=fabric.device)).shape == (6, 4, 8, 10)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="pinned memory and the copy to a GPU need one")
+def test_pinned_pictures_become_pairs_on_the_gpu(srgb: Tensor) -> None:
+    augment = RawAugment(DictionaryISP())
+    loader = DataLoader(TensorDataset(srgb, torch.arange(6)), batch_size=3, pin_memory=True, num_workers=2)
+    for pair, labels in wrap(loader, augment, device="cuda"):
+        assert pair.noisy.is_cuda and pair.variance.is_cuda and labels.is_pinned()
+
+
+def test_a_loader_of_single_pictures_makes_single_crops(augment: RawAugment) -> None:
+    pictures = [torch.rand(3, 24, 30) for _ in range(3)]
+    pairs = list(wrap(DataLoader(pictures, batch_size=None), augment, crop=16))  # type: ignore[arg-type]
+    assert [pair.noisy.shape for pair in pairs] == [(1, 4, 8, 8)] * 3
+
+
+@pytest.mark.parametrize("batch", [1, 3, 4, 5])
+def test_a_batch_of_grey_pictures_is_no_colour_picture(augment: RawAugment, batch: int) -> None:
+    grey = torch.rand(batch, 8, 10)
+    (pair,) = wrap(DataLoader(grey, batch_size=batch), augment)  # type: ignore[arg-type]
+    (expected,) = wrap([grey[:, None].expand(-1, 3, -1, -1)], augment)
+    assert torch.equal(pair.noisy, expected.noisy) and len(pair.noisy) == batch
+
+
+def test_processes_of_a_distributed_run_draw_apart(
+    augment: RawAugment, srgb: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (alone,) = wrap([srgb], augment)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    drawn: list[RawPair] = []
+    for rank in range(3):
+        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        drawn += wrap([srgb], augment)
+        drawn.append(RawAugment(augment.isp, seed=1)(srgb))
+    assert torch.equal(drawn[0].noisy, alone.noisy)
+    assert len({tuple(pair.params.isp.gains.flatten().tolist()) for pair in drawn}) == 6

@@ -1,0 +1,165 @@
+"""Pictures, batches and samples as people have them."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_batch, to_rgb_tensor
+
+ARRAY = np.random.default_rng(0).integers(256, size=(6, 8, 3), dtype=np.uint8)
+RGB = torch.from_numpy(ARRAY).permute(2, 0, 1)
+
+
+def forms() -> dict[str, Any]:
+    """The same picture in every form."""
+    alpha = np.full((6, 8, 1), 7, np.uint8)
+    return {
+        "numpy": ARRAY,
+        "numpy, mirrored twice": ARRAY[:, ::-1].copy()[:, ::-1],
+        "numpy chw": ARRAY.transpose(2, 0, 1),
+        "numpy rgba": np.concatenate([ARRAY, alpha], axis=2),
+        "tensor": RGB,
+        "tensor hwc": torch.from_numpy(ARRAY),
+        "tensor rgba": torch.cat([RGB, RGB[:1]]),
+        "pil": Image.fromarray(ARRAY),
+        "pil rgba": Image.fromarray(np.concatenate([ARRAY, alpha], axis=2)),
+    }
+
+
+@pytest.mark.parametrize("form", forms())
+def test_every_form_is_the_same_picture(form: str) -> None:
+    assert torch.equal(to_rgb_tensor(forms()[form]), RGB)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "1", "P"])
+def test_pil_modes_are_read_as_what_they_show(mode: str) -> None:
+    picture = Image.fromarray(ARRAY).convert(mode)
+    assert torch.equal(to_rgb_tensor(picture), torch.from_numpy(np.array(picture.convert("RGB"))).permute(2, 0, 1))
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "HSV", "LAB", "I"])
+def test_pil_modes_that_are_not_srgb_are_refused(mode: str) -> None:
+    with pytest.raises(ValueError, match=f"mode '{mode}'"):
+        to_rgb_tensor(Image.new(mode, (4, 4)))
+
+
+def test_grey_is_repeated() -> None:
+    for grey in (ARRAY[..., 0], ARRAY[..., :1], RGB[0], RGB[:1], Image.fromarray(ARRAY[..., 0])):
+        assert torch.equal(to_rgb_tensor(grey), RGB[:1].expand(3, -1, -1))
+
+
+@pytest.mark.parametrize("dtype", ["<u2", ">u2"])
+def test_16_bits_are_a_65535th_each(dtype: str) -> None:
+    array = np.array([[0, 1], [257, 65535]], dtype=dtype)
+    expected = torch.tensor([0.0, 1 / 65535, 257 / 65535, 1.0]).reshape(1, 2, 2).expand(3, -1, -1)
+    assert torch.equal(to_rgb_tensor(array), expected)
+    assert torch.equal(to_rgb_tensor(Image.fromarray(array.astype("<u2"))), expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_float_picture_keeps_its_values(dtype: Any) -> None:
+    array = np.array([[[0.25, 0.5, 1.0]]], dtype=dtype)
+    out = to_rgb_tensor(array)
+    assert out.dtype == torch.float32 and out.flatten().tolist() == [0.25, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("value", [255.0, -0.5, float("nan")])
+def test_floats_outside_the_display_range_are_refused(value: float) -> None:
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got"):
+        to_rgb_tensor(torch.full((3, 4, 4), value))
+
+
+def test_a_narrow_tensor_is_read_channels_first() -> None:
+    assert to_rgb_tensor(torch.zeros(3, 8, 4)).shape == (3, 8, 4)
+    assert to_rgb_tensor(np.zeros((3, 8, 4), np.uint8)).shape == (3, 3, 8)  # HWC with alpha
+
+
+@pytest.mark.parametrize("bad", [np.zeros((5, 6, 7)), np.zeros((2, 3, 4, 5)), "a.png", 3, None, np.zeros((4, 4), bool)])
+def test_what_is_no_picture_is_refused(bad: Any) -> None:
+    with pytest.raises(ValueError, match=r"a picture is .*, got"):
+        to_rgb_tensor(bad)
+
+
+def test_integers_other_than_bytes_are_refused() -> None:
+    with pytest.raises(ValueError, match="int32"):
+        to_rgb_tensor(np.zeros((4, 4, 3), np.int32))
+
+
+@pytest.mark.parametrize("batch", [RGB[None].expand(2, -1, -1, -1), np.stack([ARRAY, ARRAY]), [ARRAY, RGB], (RGB, RGB)])
+def test_batches_of_every_form(batch: Any) -> None:
+    assert torch.equal(to_rgb_batch(batch), torch.stack([RGB, RGB]))
+
+
+def test_a_batch_of_8_bits_and_floats_has_one_scale() -> None:
+    assert torch.equal(to_rgb_batch([RGB, RGB / 255.0]), torch.stack([RGB, RGB]) / 255.0)
+
+
+def test_pictures_that_make_no_batch_are_refused() -> None:
+    with pytest.raises(ValueError, match="6 x 8, 8 x 6; crop"):
+        to_rgb_batch([RGB, RGB.transpose(1, 2)])
+    with pytest.raises(ValueError, match="no pictures"):
+        to_rgb_batch([])
+    with pytest.raises(ValueError, match="a batch is"):
+        to_rgb_batch(torch.zeros(1, 2, 3, 4, 4))
+
+
+@given(st.integers(2, 9), st.integers(2, 9))
+def test_odd_sides_lose_a_line(height: int, width: int) -> None:
+    image = torch.zeros(3, height, width)
+    assert even_sided(image).shape == (3, height // 2 * 2, width // 2 * 2)
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 8), (3, 8, 0), (0, 3, 8, 8)])
+def test_what_holds_no_bayer_cell_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="2 x 2 or larger"):
+        even_sided(torch.zeros(shape))
+
+
+Named = namedtuple("Named", ["image", "label"])
+
+
+@pytest.mark.parametrize(
+    ("sample", "key", "expected"),
+    [
+        (RGB, None, "new"),
+        ((RGB, 3), None, ("new", 3)),
+        ([RGB, 3], None, ["new", 3]),
+        ((3, RGB), 1, (3, "new")),
+        (Named(RGB, 3), None, Named("new", 3)),
+        ({"image": RGB, "id": "x"}, "image", {"image": "new", "id": "x"}),
+    ],
+)
+def test_the_picture_is_found_and_replaced(sample: Any, key: Any, expected: Any) -> None:
+    where = find_picture(sample, key)
+    assert picked(sample, where) is RGB
+    out = replaced(sample, where, "new")
+    assert out == expected and type(out) is type(expected)
+
+
+def test_a_batch_that_is_a_list_of_pictures_is_not_taken_apart() -> None:
+    assert find_picture([RGB, RGB], None, batched=True) is None
+    assert find_picture([[RGB, RGB], [1, 2]], None, batched=True) == 0
+    assert find_picture([RGB[None], torch.zeros(1)], None, batched=True) == 0
+
+
+@pytest.mark.parametrize(
+    ("sample", "key", "message"),
+    [
+        ({"image": RGB, "id": 1}, None, "keys image, id"),
+        ({"image": RGB, "id": 1}, "picture", "got 'picture'"),
+        ((RGB, 1), 2, "tuples of 2"),
+        ((RGB, 1), "image", "index of the picture"),
+        (RGB, "image", "leave key out"),
+    ],
+)
+def test_a_key_that_fits_nothing_says_what_would(sample: Any, key: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        find_picture(sample, key)

@@ -1,0 +1,125 @@
+"""The engine as processes see it: a kill at any step changes nothing, nor does sharing a step among processes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+
+ROOT = Path(__file__).parents[3]
+
+SCRIPT = """
+import sys
+import warnings
+from pathlib import Path
+
+import torch
+
+warnings.filterwarnings("ignore")
+torch.set_num_threads(1)
+from safetensors.torch import save_file
+from rawaug.bayer import CFA
+from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, held_out
+from rawaug.training.estimators import Noisier, Neighbor2Neighbor
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.stream import TrainingStream
+from rawaug.training.loop import train
+
+folder, steps, devices, name = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
+generator = torch.Generator().manual_seed(0)
+frame = NoisyFrame("frame", torch.rand(1, 64, 64, generator=generator), 1e-3, 1e-4, CFA.RGGB)
+estimator = {"noisier": Noisier(1.0, correct=True), "neighbor2neighbor": Neighbor2Neighbor()}[name]
+stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
+config = TrainConfig(
+    steps=steps, batch=4, crop=32, warmup=2, loss="l2", ema=0.9, validate_every=1, checkpoint_every=3,
+    learning_rate=3e-3,
+)
+network = DenoiserConfig("UNet", {"width": 4, "scales": 2})
+net = train(stream, held_out([frame], CFA.RGGB), network, config, folder, 0, "cpu", devices, estimator=estimator)
+save_file(net.state_dict(), folder / f"end{sys.argv[5] if len(sys.argv) > 5 else ''}.safetensors")
+"""
+
+Environment = dict[str, str]
+
+
+def started(*arguments: str | int | Path, **environment: str) -> subprocess.Popen[bytes]:
+    """The script in a process of its own."""
+    settings: Environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **environment}
+    command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
+    return subprocess.Popen(command, env=settings, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def finished(*processes: subprocess.Popen[bytes]) -> None:
+    """Wait for their end; what they say if it is a bad one."""
+    for process in processes:
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors.decode()[-2000:]
+
+
+def logged(folder: Path) -> list[list[str]]:
+    """Rows of ``log.csv`` without the speed."""
+    return [row.split(",")[:3] for row in (folder / "log.csv").read_text().splitlines()]
+
+
+def rows_as_they_come(folder: Path, process: subprocess.Popen[bytes]) -> Iterator[int]:
+    """The last logged step, whenever it has changed."""
+    last = -1
+    while process.poll() is None:
+        path = folder / "log.csv"
+        count = path.read_text().count("\n") - 1 if path.is_file() else 0
+        if count != last:
+            last = count
+            yield count
+        time.sleep(0.001)
+
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unbroken")
+    finished(started(folder, STEPS, 1, "noisier"))
+    return folder
+
+
+def test_killed_at_a_random_step_it_ends_bit_for_bit_as_unbroken(unbroken: Path, tmp_path: Path) -> None:
+    step = random.Random().randint(4, STEPS - 15)
+    process = started(tmp_path, STEPS, 1, "noisier")
+    for done in rows_as_they_come(tmp_path, process):
+        if done >= step:
+            process.send_signal(signal.SIGKILL)
+            break
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, f"it was over before it could be killed at step {step}"
+    assert not (tmp_path / "end.safetensors").exists() and (tmp_path / "last.pt").is_file()
+    finished(started(tmp_path, STEPS, 1, "noisier"))
+    whole, resumed = (load_file(folder / "end.safetensors") for folder in (unbroken, tmp_path))
+    assert whole.keys() == resumed.keys()
+    assert all(bool((whole[key] == resumed[key]).all()) for key in whole), f"killed at step {step}"
+    assert logged(tmp_path) == logged(unbroken), f"killed at step {step}"
+
+
+@pytest.mark.parametrize("estimator", ["noisier", "neighbor2neighbor"])
+def test_two_processes_take_the_steps_of_one(estimator: str, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    together, alone = tmp_path / "together", tmp_path / "alone"
+    meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "NODE_RANK": "0"}
+    ranks = [started(together, 20, 2, estimator, rank, LOCAL_RANK=str(rank), **meeting) for rank in (0, 1)]
+    finished(*ranks, started(alone, 20, 1, estimator))
+    one, two = ([float(row[1]) for row in logged(folder)[1:]] for folder in (alone, together))
+    assert len(one) == 20
+    assert two == pytest.approx(one, abs=1e-5)
+    ends = [load_file(together / f"end{rank}.safetensors") for rank in (0, 1)]
+    assert all(bool((ends[0][key] == ends[1][key]).all()) for key in ends[0])

@@ -1,0 +1,155 @@
+"""What the estimators converge to, by least squares; and that corrections and neighbours are what they say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import denoisers
+from rawaug.training.estimators import (
+    NEIGHBOURS,
+    R2R,
+    Neighbor2Neighbor,
+    Noise2Noise,
+    Noisier,
+    SelfSupervised,
+    Supervised,
+    neighbours,
+    variance_of,
+)
+
+SHOT_VAR, READ_VAR = 2e-3, 1e-4
+SIGNAL_VAR = 4e-4
+
+
+def scene_and_shots(shots: int = 1, clean: Tensor | None = None, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Clean (4, 256, 256) of mean 0.4, variance SIGNAL_VAR, and noisy shots of it."""
+    generator = torch.Generator().manual_seed(seed)
+    if clean is None:
+        clean = 0.4 + SIGNAL_VAR**0.5 * torch.randn(4, 256, 256, generator=generator)
+    noise = torch.randn(shots, *clean.shape, generator=generator) * variance_of(clean, SHOT_VAR, READ_VAR).sqrt()
+    return clean, clean + noise
+
+
+def slope(target: Tensor, given: Tensor) -> float:
+    """Of the best linear estimate of ``target``: its covariance with ``given`` over the variance of ``given``."""
+    given = given - given.mean()
+    return float((target * given).mean() / given.square().mean())
+
+
+def trained_slope(estimator: SelfSupervised) -> tuple[float, float]:
+    """Slope that l2 training converges to, and the one that clean targets would give."""
+    clean, shots = scene_and_shots(estimator.shots)
+    drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(7))
+    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    return slope(sample.clean, sample.noisy), slope(clean, sample.noisy)
+
+
+@pytest.mark.parametrize("estimator", [Noise2Noise(), R2R(0.5), R2R(1.0)], ids=["noise2noise", "r2r-0.5", "r2r-1"])
+def test_unbiased_targets_teach_what_clean_ones_would(estimator: SelfSupervised) -> None:
+    taught, right = trained_slope(estimator)
+    assert taught == pytest.approx(right, abs=0.01)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0])
+def test_noisier_is_biased_and_its_correction_is_not(alpha: float) -> None:
+    taught, right = trained_slope(Noisier(alpha))
+    noise = SHOT_VAR * 0.4 + READ_VAR
+    assert taught - right == pytest.approx(noise / (SIGNAL_VAR + (1 + alpha**2) * noise), abs=0.01)
+    assert ((1 + alpha**2) * taught - 1) / alpha**2 == pytest.approx(right, abs=0.01 * (1 + alpha**-2))
+
+
+def test_targets_keep_the_mean_in_the_shadows() -> None:
+    """At 0.2 standard deviations above black, where clipping would show at once."""
+    clean, shots = scene_and_shots(2, torch.full((4, 256, 256), 2e-3))
+    tolerance = 4 * (5 * READ_VAR / clean.numel()) ** 0.5
+    for estimator in (Noisier(), Noise2Noise(), R2R(0.5)):
+        drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(3))
+        target = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn).clean
+        assert float((target - clean).mean()) == pytest.approx(0.0, abs=tolerance)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0, 2.0])
+def test_the_variance_map_is_that_of_the_input(alpha: float) -> None:
+    clean, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
+    for estimator in (Noisier(alpha), R2R(alpha)):
+        drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(5))
+        sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+        assert float(sample.variance.mean()) == pytest.approx(float((sample.noisy - clean).var()), rel=0.02)
+
+
+def test_inputs_are_clipped_at_white_and_targets_are_not() -> None:
+    shots = torch.ones(1, 4, 32, 32)
+    for estimator in (Noisier(), R2R()):
+        drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
+        sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+        assert sample.noisy.max() == 1.0 and sample.noisy.min() < 1.0
+    assert sample.clean.max() > 1.0  # r2r's
+
+
+def test_the_same_draw_gives_the_same_bits() -> None:
+    clean, shots = scene_and_shots(2)
+    for estimator in (Noisier(), R2R(), Noise2Noise(), Neighbor2Neighbor()):
+        drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(1))
+        first, again = (estimator.apply(shots, SHOT_VAR, READ_VAR, drawn) for _ in range(2))
+        assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("UNet", {"width": 4, "scales": 2}), ("DHDN", {"width": 4}), ("DnCNN", {"width": 8, "depth": 3})],
+)
+def test_the_correction_is_the_extrapolation_of_the_network(name: str, settings: dict[str, Any]) -> None:
+    net = denoisers.build(name, **settings)
+    net.initialise(seed=3)  # an untrained network's residual is zero
+    net.eval()
+    generator = torch.Generator().manual_seed(0)
+    noisy, variance = torch.rand(1, 4, 16, 16, generator=generator), torch.full((1, 4, 16, 16), 1e-3)
+    alpha = 0.5
+    with torch.no_grad():
+        taught, corrected = net(noisy, variance), Noisier(alpha, correct=True).corrected(net)(noisy, variance)
+        expected = ((1 + alpha**2) * taught - noisy) / alpha**2
+        torch.testing.assert_close(corrected, expected, rtol=1e-4, atol=1e-4)
+        assert torch.equal(net(noisy, variance), taught)  # the trained network itself is left as it was
+    assert Noisier(alpha).corrected(net) is net and Supervised().corrected(net) is net
+
+
+def test_neighbours_touch_and_differ() -> None:
+    """On a plane that holds its own coordinates, the two are one step apart, within one cell."""
+    rows, columns = torch.meshgrid(torch.arange(8.0), torch.arange(12.0), indexing="ij")
+    image = torch.stack([rows, columns, rows, columns])[None]
+    choice = Neighbor2Neighbor().sample(image.shape, torch.Generator().manual_seed(0))[None]
+    first, second = neighbours(image, choice)
+    assert first.shape == second.shape == (1, 4, 4, 6)
+    distance = (first - second).abs()
+    assert torch.equal(distance[:, 0] + distance[:, 1], torch.ones(1, 4, 6))
+    assert torch.equal(first // 2, second // 2)
+    assert set(choice.flatten().tolist()) == set(range(len(NEIGHBOURS)))
+
+
+def test_neighbours_of_odd_planes_leave_the_last_line_out() -> None:
+    first, _ = neighbours(torch.rand(1, 4, 9, 7), torch.zeros(1, 1, 4, 3, dtype=torch.int64))
+    assert first.shape == (1, 4, 4, 3)
+
+
+def test_the_neighbours_loss_of_the_identity() -> None:
+    """f = identity on a flat field: the second term's differences cancel, the first is twice the noise's variance."""
+    _, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
+    estimator = Neighbor2Neighbor(gamma=5.0)
+    drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
+    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    batch = type(sample)(*(x[None] for x in sample))
+    identity: Any = lambda noisy, variance: noisy  # noqa: E731
+    loss = estimator.loss(identity, batch, torch.nn.functional.mse_loss)
+    assert float(loss) == pytest.approx(2 * (SHOT_VAR * 0.4 + READ_VAR), rel=0.02)
+
+
+def test_impossible_settings_are_refused() -> None:
+    for make in (Noisier, R2R):
+        with pytest.raises(ValueError, match="alpha is positive"):
+            make(0.0)
+    with pytest.raises(ValueError, match="gamma"):
+        Neighbor2Neighbor(-1.0)

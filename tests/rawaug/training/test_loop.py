@@ -1,0 +1,132 @@
+"""The loop: it learns, and a run that was cut off ends as one that was not."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from rawaug.bayer import CFA
+from rawaug.data import demo_pairs
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import frozen_sample
+from rawaug.metrics import psnr
+from rawaug.noise import noise_model
+from rawaug.training import loop
+from rawaug.training.stream import RealCrops, TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+
+NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
+CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
+
+
+@pytest.fixture(scope="module")
+def stream() -> TrainingStream:
+    pairs = demo_pairs("train", count=2)
+    return TrainingStream(RealCrops(pairs, noise_model("cycleisp_sidd"), 32, pairs[0].cfa), None, 2, 0.0, seed=0)
+
+
+@pytest.fixture(scope="module")
+def validation() -> list[Sample]:
+    pair = demo_pairs("validation", count=1)[0]
+    return [frozen_sample(pair, noise_model("cycleisp_sidd"), CFA.GRBG, seed=0)]
+
+
+def test_it_learns_to_denoise(tmp_path: Path) -> None:
+    noise = noise_model((0.02, 1e-3))
+    pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    stream = TrainingStream(RealCrops([pair], noise, 32, pair.cfa), None, 4, 0.0, seed=0)
+    validation = [frozen_sample(pair, noise, pair.cfa, seed=0)]
+    network = DenoiserConfig("UNet", {"width": 8, "scales": 2, "deviation": True})
+    config = replace(CONFIG, steps=120, batch=4, ema=0.9)
+    net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
+    noisy = psnr(validation[0].noisy, validation[0].clean).item()
+    assert loop.validate(net, validation, torch.device("cpu")) > noisy + 2.0
+    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,samples_per_second"
+
+
+def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
+    stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "whole", device="cpu")
+
+    class Killed(Exception):
+        pass
+
+    steps = 0
+    plain = loop.LOSSES["l1"]
+
+    def dies(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        nonlocal steps
+        steps += 1
+        if steps == 8:  # after the checkpoint of step 5
+            raise Killed
+        return plain(a, b)
+
+    monkeypatch.setitem(loop.LOSSES, "l1", dies)
+    with pytest.raises(Killed):
+        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
+    monkeypatch.setitem(loop.LOSSES, "l1", plain)
+    resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
+    for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("choose", [True, False])
+def test_the_best_weights_are_kept_or_the_last(
+    choose: bool, stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores, seen = iter([40.0, 30.0]), []
+
+    def validate(net: torch.nn.Module, *_: object) -> float:
+        seen.append({key: value.clone() for key, value in net.state_dict().items()})
+        return next(scores)
+
+    monkeypatch.setattr(loop, "validate", validate)
+    kept = loop.train(stream, validation, NETWORK, CONFIG, tmp_path, device="cpu", choose=choose).state_dict()
+    assert all(torch.equal(kept[key], value) for key, value in seen[0 if choose else 1].items())
+
+
+def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Sample], tmp_path: Path) -> None:
+    config = replace(CONFIG, learning_rate=1e30, clip_norm=0.0, warmup=0)
+    with pytest.raises(ValueError, match="diverged"):
+        loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
+
+
+def test_the_rate_of_the_step_schedule_halves() -> None:
+    config = replace(CONFIG, schedule="step", halve_every=3, warmup=2)
+    assert [loop.learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
+
+
+def test_torchrun_s_processes_count(tmp_path: Path) -> None:
+    script = tmp_path / "meet.py"
+    script.write_text(
+        "from rawaug.training.loop import launched\n"
+        "fabric = launched('cpu', 1, '32-true')\n"
+        "print(f'{fabric.global_rank} of {fabric.world_size}', flush=True)\n"
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    meeting = ["--nnodes", "2", "--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", port]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", *meeting]
+    nodes = [
+        subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
+        for rank in (0, 1)
+    ]
+    told = "".join(node.communicate(timeout=120)[0] for node in nodes)
+    assert sorted(re.findall(r"\d of \d", told)) == [f"{rank} of 4" for rank in range(4)]
+
+
+def test_the_rate_warms_up_and_falls() -> None:
+    factors = [loop.learning_rate_factor(step, CONFIG) for step in range(CONFIG.steps + 1)]
+    assert factors[0] == 0.5 and factors[2] == 1.0
+    assert factors[-1] == pytest.approx(0.01)
+    assert all(a >= b for a, b in pairwise(factors[2:]))

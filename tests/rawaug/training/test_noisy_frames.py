@@ -1,0 +1,175 @@
+"""Noisy frames alone: the noise of a picture is frozen for good, and nothing of a clean frame is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data import demo_pairs, demo_photographs
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.experiment.arms import training_stream, validation_samples
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import psnr
+from rawaug.noise import FixedLevels, SensorNoise, noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, variance_of
+from rawaug.training.loop import train, validate
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
+from rawaug.training.stream import TrainingStream
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+
+LEVELS = (0.01, 1e-3)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[torch.Tensor]:
+    return [photograph[:, :120, :160] for photograph in demo_photographs("train").values()]
+
+
+@pytest.fixture(scope="module")
+def augment() -> RawAugment:
+    return RawAugment(DictionaryISP(), LEVELS)
+
+
+def test_two_epochs_see_the_same_base_noise(pictures: list[torch.Tensor], augment: RawAugment) -> None:
+    """Every crop that an epoch draws is a piece of one noisy frame; with fresh noise it would not be."""
+
+    class Bare(SelfSupervised):
+        def sample(self, shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
+            return torch.tensor(0)
+
+        def apply(self, shots: torch.Tensor, shot_var: float, read_var: float, drawn: torch.Tensor) -> Any:
+            return shots[0]
+
+    frame = FrozenPictures(pictures, augment, seed=3)[0]
+    known = set(frame.shots.flatten().tolist())
+    for epoch in range(2):
+        crops = NoisyCrops(FrozenPictures(pictures[:1], augment, seed=3), Bare(), 32, CFA.RGGB)
+        for k in range(3):
+            crop = crops.draw(torch.Generator().manual_seed(10 * epoch + k))
+            assert set(crop.flatten().tolist()) <= known
+
+
+def test_frames_depend_on_seed_and_index_alone(pictures: list[torch.Tensor], augment: RawAugment) -> None:
+    frames = FrozenPictures(pictures, augment, seed=3)
+    _ = frames[0]
+    assert torch.equal(frames[1].shots, FrozenPictures(pictures, augment, seed=3)[1].shots)
+    assert not torch.equal(frames[1].shots, FrozenPictures(pictures, augment, seed=4)[1].shots)
+    assert frames[1] is frames[1]
+    assert (frames[0].shot_var, frames[0].read_var) == pytest.approx(LEVELS)
+
+
+def test_two_shots_differ_by_independent_noise(pictures: list[torch.Tensor], augment: RawAugment) -> None:
+    frame = FrozenPictures(pictures, augment, seed=0, shots=2)[0]
+    first, second = frame.shots
+    alone = FrozenPictures(pictures, augment, seed=0)[0]
+    assert torch.equal(alone.shots[0], first)
+    dark = (first + second) / 2 < 0.5
+    expected = 2 * (frame.read_var + frame.shot_var * ((first + second) / 2).clamp_min(0))[dark].mean()
+    assert float((first - second)[dark].var()) == pytest.approx(float(expected), rel=0.05)
+
+
+def test_noise_of_unknown_levels_is_refused(pictures: list[torch.Tensor]) -> None:
+    with pytest.raises(ValueError, match="shot_var and read_var"):
+        FrozenPictures(pictures, RawAugment(DictionaryISP(), SensorNoise(FixedLevels(*LEVELS))), seed=0)
+
+
+def test_nothing_of_the_clean_frame_is_left() -> None:
+    """A pair with another clean frame and another sRGB, but the same capture, gives the same."""
+    pair = demo_pairs("train", count=1)[0]
+    other = replace(pair, raw=torch.rand_like(pair.raw), srgb=255 - pair.srgb)
+    for a, b in zip(vars(noisy_only(pair)).values(), vars(noisy_only(other)).values(), strict=True):
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    assert pair.noisy is not None and torch.equal(noisy_only(pair).raw, pair.noisy)
+
+
+def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch.Tensor]) -> None:
+    """Its samples and its validation are the same whatever the clean frames are."""
+    pairs = demo_pairs("train", count=2)
+    spoilt = [replace(pair, raw=torch.zeros_like(pair.raw), srgb=0 * pair.srgb) for pair in pairs]
+    recipe = Recipe(arms={"r2r": ArmConfig(0.5, estimator="r2r")}, train=TrainConfig(batch=2, crop=32))
+    isp, noise = DictionaryISP(), noise_model("cycleisp_sidd")
+
+    def seen(pairs: list[Pair]) -> list[torch.Tensor]:
+        known = [noisy_only(pair) for pair in pairs]
+        stream = training_stream(recipe, recipe.arms["r2r"], known, pictures, isp, noise, seed=0)
+        watched = validation_samples(recipe, known, pictures, isp, noise)
+        return [*stream[0], *stream[1], *watched[0]]
+
+    assert all(torch.equal(a, b) for a, b in zip(seen(pairs), seen(spoilt), strict=True))
+
+
+def test_frames_as_shot_need_measured_levels() -> None:
+    pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
+    assert noisy_only(pair) is pair
+    with pytest.raises(ValueError, match="train_00_astronaut: the levels"):
+        noisy_frame(pair, None)
+    assert noisy_frame(pair, {"shot_var": 1e-3, "read_var": 1e-5, "r2": 1.0}).read_var == 1e-5
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
+    rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None].expand(3, 40, 48)
+    frame = NoisyFrame("colours", bayer.mosaic(rgb, cfa), 0.0, 0.0, cfa)
+    crops = NoisyCrops([frame], Noisier(), 16, CFA.BGGR)
+    expected = torch.tensor([0.2, 0.5, 0.5, 0.8])[:, None, None].expand(4, 8, 8)
+    for seed in range(16):
+        assert torch.equal(crops.draw(torch.Generator().manual_seed(seed)).clean, expected)
+
+
+def test_what_an_estimator_lacks_is_named() -> None:
+    frame = NoisyFrame("small", torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
+    with pytest.raises(ValueError, match="small: Noise2Noise needs 2 shots"):
+        NoisyCrops([frame], Noise2Noise(), 16, CFA.RGGB).draw(torch.Generator())
+    with pytest.raises(ValueError, match="small: a frame of 32 x 32 is too small"):
+        NoisyCrops([frame], R2R(), 32, CFA.RGGB).draw(torch.Generator())
+
+
+def test_the_held_out_score_ranks_as_clean_frames_do() -> None:
+    """Scores against held-out noisy targets order blends of noisy and clean as their true errors do."""
+    pair = demo_pairs("validation", count=1)[0]
+    frame = noisy_frame(noisy_only(pair), None)
+    (sample,) = held_out([frame], pair.cfa)
+    clean = bayer.pack(pair.raw[None], pair.cfa)
+    errors = [float(((1 - t) * clean + t * sample.noisy - sample.clean).square().mean()) for t in (0.0, 0.1, 0.3, 1.0)]
+    assert errors == sorted(errors)
+    (again,) = held_out([frame], pair.cfa)
+    assert torch.equal(again.clean, sample.clean)
+
+
+def test_without_validation_pairs_pictures_are_watched(pictures: list[torch.Tensor]) -> None:
+    recipe = Recipe(
+        data=DataConfig(pairs=None, validation=None),
+        camera="universal",
+        arms={"convex": ArmConfig(1.0)},
+        train=TrainConfig(crop=32),
+    )
+    samples = validation_samples(recipe, [], pictures, DictionaryISP(), noise_model(LEVELS))
+    assert len(samples) == 16 and samples[0].noisy.shape == (1, 4, 16, 16)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [Noisier(1.0), Noisier(1.0, correct=True), Noise2Noise(), R2R(0.5), Neighbor2Neighbor(1.0)],
+    ids=["noisier", "noisier_corrected", "noise2noise", "r2r", "neighbor2neighbor"],
+)
+def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSupervised, tmp_path: Path) -> None:
+    y, x = torch.meshgrid(torch.linspace(0, 6, 128), torch.linspace(0, 6, 128), indexing="ij")
+    clean = (0.4 + 0.15 * torch.sin(x) * torch.cos(y)).expand(3, -1, -1)
+    shots = clean + torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0)) * (0.01 * clean + 1e-3).sqrt()
+    frame = NoisyFrame("smooth", shots[:2], 0.01, 1e-3, CFA.RGGB)
+    stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
+    config = TrainConfig(steps=120, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
+    network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
+    net = train(stream, held_out([frame], CFA.RGGB), network, config, tmp_path, device="cpu", estimator=estimator)
+    packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
+    sample = Sample(unseen, packed, variance_of(unseen, 0.01, 1e-3))
+    assert validate(net, [sample], torch.device("cpu")) > float(psnr(unseen, packed)) + 1.0

@@ -1,0 +1,86 @@
+"""The stream of samples: keyed, in the network's pattern, divided as the arm says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.bayer import CFA, aligned
+from rawaug.data import demo_pairs, demo_photographs
+from rawaug.data.pair import Pair
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.training.stream import RealCrops, StepSampler, TrainingStream
+
+
+def colour_pair(cfa: CFA) -> Pair:
+    """A frame that is 0.2 at red, 0.5 at green and 0.8 at blue sites."""
+    rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None].expand(3, 40, 48)
+    srgb = torch.zeros(3, 40, 48, dtype=torch.uint8)
+    return Pair("colours", srgb, bayer.mosaic(rgb, cfa), cfa, (1, 1, 1), torch.eye(3))
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
+    crops = RealCrops([colour_pair(cfa)], noise_model((0.0, 0.0)), crop=16, cfa=CFA.BGGR)
+    expected = torch.tensor([0.2, 0.5, 0.5, 0.8])[:, None, None].expand(4, 8, 8)
+    for seed in range(16):
+        sample = crops.draw(torch.Generator().manual_seed(seed))
+        assert torch.equal(sample.clean, expected)
+        assert torch.equal(sample.noisy, expected)
+
+
+@pytest.mark.parametrize("levels", [True, False])
+def test_a_captures_noise_is_never_renewed(levels: bool) -> None:
+    pair = demo_pairs("train", count=1)[0]
+    assert pair.noisy is not None
+    known = set(pair.noisy.flatten().tolist())
+    pair = pair if levels else replace(pair, shot_var=None, read_var=None)
+    crops = RealCrops([pair], noise_model("cycleisp_sidd"), crop=32, cfa=pair.cfa)
+    for seed in range(4):
+        assert set(crops.draw(torch.Generator().manual_seed(seed)).noisy.flatten().tolist()) <= known
+
+
+def test_frames_smaller_than_the_crop_are_named() -> None:
+    with pytest.raises(ValueError, match="colours: a frame of 40 x 48"):
+        RealCrops([colour_pair(CFA.RGGB)], noise_model((0.0, 0.0)), crop=64, cfa=CFA.RGGB)
+
+
+def test_alignment_starts_at_the_target_pattern() -> None:
+    mosaic = colour_pair(CFA.GRBG).raw
+    assert torch.equal(aligned(mosaic, CFA.GRBG, CFA.RGGB)[0, :2, :2], torch.tensor([[0.2, 0.5], [0.5, 0.8]]))
+
+
+def test_samples_depend_on_seed_and_index_alone() -> None:
+    pairs = demo_pairs("train", count=2)
+    real = RealCrops(pairs, noise_model("cycleisp_sidd"), 32, pairs[0].cfa)
+    augment = RawAugment(DictionaryISP())
+    pictures = RawPairs(list(demo_photographs("train").values()), augment, crop=32)
+    stream = TrainingStream(real, pictures, batch=4, augmented=0.5, seed=1)
+    later = stream[9].noisy
+    for index in (0, 5, 9):
+        _ = stream[index]
+    assert torch.equal(stream[9].noisy, later)
+    assert not torch.equal(stream[8].noisy, later)
+    assert stream.from_pictures == 2
+
+
+def test_an_arm_needs_its_sources() -> None:
+    with pytest.raises(ValueError, match=r"data\.pictures"):
+        TrainingStream(None, None, 4, 1.0, 0)
+    with pytest.raises(ValueError, match=r"data\.pairs"):
+        TrainingStream(None, None, 4, 0.0, 0)
+
+
+def test_processes_divide_a_step_and_a_resume_goes_on_in_it() -> None:
+    whole = [i for step in StepSampler(3, 5, 4) for i in step]
+    assert whole == list(range(12, 20))
+    parts = [i for rank in (0, 1) for step in StepSampler(3, 5, 4, rank, 2) for i in step]
+    assert sorted(parts) == whole
+    with pytest.raises(ValueError, match="multiple"):
+        StepSampler(0, 1, 3, 0, 2)
