@@ -9,6 +9,8 @@ names                                                                what       
 ``pmrid``                                                            OPPO Reno 10x                100 to 6400
 ``CanonEOS5D4`` ``CanonEOS700D`` ``CanonEOS70D`` ``NikonD850``
 ``SonyA7S2``                                                         ELD's cameras                100 to 6400
+``Nikon D750`` ``Sony ILCE-7M3`` and 367 more                        darktable's profiles         as measured
+``any camera``                                                       all profiles, each alike     as measured
 ===================================================================  ===========================  ============
 """
 
@@ -16,20 +18,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rawaug.camera_names import spelled
 from rawaug.noise.iso import EldLevels, Iso, PmridLevels, SiddLevels
 from rawaug.noise.levels import FixedLevels, NoiseLevels, Preset, published
 from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
+from rawaug.noise.profiles import ANY_CAMERA, ProfileLevels, profile_names
 
 
 def camera_names() -> list[str]:
-    """The measured cameras: names that take ``iso=``."""
+    """The cameras that were measured one by one: names that take ``iso=``, as those of the profiles do."""
     data = published()
     return [*data["sidd_noise_level_function"]["cameras"], "pmrid", *data["eld"]["cameras"]]
 
 
 def noise_names() -> list[str]:
     """Every name that :func:`noise_model` knows."""
-    return [*published()["presets"], *camera_names()]
+    return [*published()["presets"], *camera_names(), ANY_CAMERA, *profile_names()]
 
 
 def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels:
@@ -44,7 +48,7 @@ def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels
             return PmridLevels(iso)
         return SiddLevels(spec, iso) if spec in data["sidd_noise_level_function"]["cameras"] else EldLevels(spec, iso)
     if isinstance(spec, str) and spec not in data["presets"]:
-        raise ValueError(f"noise {spec!r} is unknown; use one of {', '.join(noise_names())}, or (shot_var, read_var)")
+        return _of_profile(spec, iso)
     if iso is not None:
         raise ValueError(
             f"noise {spec!r} has no law by ISO; leave iso out, or name a camera: {', '.join(camera_names())}"
@@ -54,6 +58,19 @@ def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels
     if not isinstance(spec, Sequence) or len(spec) != 2:
         raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
     return FixedLevels(*spec)
+
+
+def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
+    if spec.casefold() != ANY_CAMERA:
+        try:
+            spelled(spec, profile_names())
+        except ValueError as unknown:
+            listed = ", ".join([*published()["presets"], *camera_names()])
+            raise ValueError(
+                f"noise {spec!r} is unknown: {unknown}; use one of {listed}, {ANY_CAMERA!r}, maker and model of a "
+                "camera, or (shot_var, read_var)"
+            ) from None
+    return ProfileLevels(spec, iso)
 
 
 def noise_model(spec: str | Sequence[float] | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:

@@ -1,0 +1,114 @@
+r"""Lights that pictures are taken in, as white points: the Planckian and the daylight locus, and electric lamps.
+
+A light is drawn at a correlated colour temperature T, uniform in the reciprocal :math:`10^6 / T` (mired), in which
+equal steps look alike. On the Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature", 1985)
+
+.. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
+                   {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
+
+and v alike; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights lie
+a little off both: a step Duv along the normal of the locus in CIE 1960 (u, v), positive towards green. Fluorescent and
+LED lamps are those that the CIE tabulates.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+LAMPS: dict[str, tuple[float, float]] = {
+    "FL1": (0.31310, 0.33727), "FL2": (0.37208, 0.37529), "FL3": (0.40910, 0.39430), "FL4": (0.44018, 0.40329),
+    "FL5": (0.31379, 0.34531), "FL6": (0.37790, 0.38835), "FL7": (0.31292, 0.32933), "FL8": (0.34588, 0.35875),
+    "FL9": (0.37417, 0.37281), "FL10": (0.34609, 0.35986), "FL11": (0.38052, 0.37713), "FL12": (0.43695, 0.40441),
+    "LED-B1": (0.4560, 0.4078), "LED-B2": (0.4357, 0.4012), "LED-B3": (0.3756, 0.3723), "LED-B4": (0.3422, 0.3502),
+    "LED-B5": (0.3118, 0.3236), "LED-BH1": (0.4474, 0.4066), "LED-RGB1": (0.4557, 0.4211), "LED-V1": (0.4548, 0.4044),
+    "LED-V2": (0.3781, 0.3775),
+}  # fmt: skip
+"""Chromaticities (x, y) of the CIE's fluorescent and LED lamps, 2 degree observer: CIE 15:2018, tables T.3 and 12.
+
+LED-V1 is the chromaticity of its tabulated spectrum; the (0.4560, 0.4548) that is widely quoted is not.
+"""
+
+D65 = (0.31271, 0.32902)
+
+COLDEST, WARMEST = 10_000.0, 2_000.0
+"""Limits of the colour temperature, in kelvin."""
+DAYLIGHT_FROM = 4_000.0
+"""Below it the daylight locus is not defined."""
+LAMP_SHARE = 0.1
+DUV_SPREAD = 0.003
+"""Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
+
+
+def planckian(kelvin: Tensor) -> Tensor:
+    """Chromaticity ``(..., 2)`` of a black body at 1,000 to 15,000 K."""
+    t = kelvin.double()
+    u = (0.860117757 + 1.54118254e-4 * t + 1.28641212e-7 * t**2) / (1 + 8.42420235e-4 * t + 7.08145163e-7 * t**2)
+    v = (0.317398726 + 4.22806245e-5 * t + 4.20481691e-8 * t**2) / (1 - 2.89741816e-5 * t + 1.61456053e-7 * t**2)
+    return _xy_from_uv(torch.stack([u, v], dim=-1))
+
+
+def daylight(kelvin: Tensor) -> Tensor:
+    """Chromaticity ``(..., 2)`` of daylight at 4,000 to 25,000 K."""
+    t = 1e3 / kelvin.double()
+    warm = 0.244063 + 0.09911 * t + 2.9678 * t**2 - 4.6070 * t**3
+    cold = 0.237040 + 0.24748 * t + 1.9018 * t**2 - 2.0064 * t**3
+    x = torch.where(kelvin <= 7000, warm, cold)
+    return torch.stack([x, -3.0 * x**2 + 2.87 * x - 0.275], dim=-1)
+
+
+def off_locus(xy: Tensor, kelvin: Tensor, duv: Tensor) -> Tensor:
+    """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` along the normal of the Planckian locus at ``kelvin`` ``(...)``."""
+    along = _uv_from_xy(planckian(kelvin * 0.999)) - _uv_from_xy(planckian(kelvin * 1.001))
+    along = along / along.norm(dim=-1, keepdim=True)
+    normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)  # along runs to higher u, the normal to higher v
+    return _xy_from_uv(_uv_from_xy(xy) + duv[..., None] * normal)
+
+
+def white_point(xy: Tensor | tuple[float, float]) -> Tensor:
+    """XYZ ``(..., 3)`` with Y = 1 of chromaticities ``(..., 2)``.
+
+    Example:
+        >>> [round(value, 3) for value in white_point(D65).tolist()]
+        [0.95, 1.0, 1.089]
+    """
+    x, y = torch.as_tensor(xy, dtype=torch.float64).unbind(-1)
+    return torch.stack([x / y, torch.ones_like(x), (1.0 - x - y) / y], dim=-1)
+
+
+def sample_lights(
+    batch: int, generator: torch.Generator, kelvin: tuple[float, float] = (WARMEST, COLDEST), lamps: float = LAMP_SHARE
+) -> Tensor:
+    """White points ``(batch, 3)``, XYZ with Y = 1, float64.
+
+    Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
+    :data:`LAMPS` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
+
+    Args:
+        batch: number of lights.
+        generator: on the CPU.
+        kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
+        lamps: share of fluorescent and LED lamps, in [0, 1].
+
+    Raises:
+        ValueError: if a limit is outside its range.
+    """
+    if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1):
+        raise ValueError(f"lights are of 1000 to 15000 K, lamps a share in [0, 1]; got {kelvin} and {lamps}")
+    drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64)
+    duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64)
+    temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
+    by_day = (drawn[:, 1] < 0.5) & (temperature >= DAYLIGHT_FROM)
+    xy = torch.where(by_day[:, None], daylight(temperature.clamp_min(DAYLIGHT_FROM)), planckian(temperature))
+    lamp = torch.tensor(list(LAMPS.values()), dtype=torch.float64)[(drawn[:, 3] * len(LAMPS)).long()]
+    return white_point(off_locus(torch.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
+
+
+def _uv_from_xy(xy: Tensor) -> Tensor:
+    x, y = xy.unbind(-1)
+    return torch.stack([4.0 * x, 6.0 * y], dim=-1) / (-2.0 * x + 12.0 * y + 3.0)[..., None]
+
+
+def _xy_from_uv(uv: Tensor) -> Tensor:
+    u, v = uv.unbind(-1)
+    return torch.stack([3.0 * u, 2.0 * v], dim=-1) / (2.0 * u - 8.0 * v + 4.0)[..., None]
