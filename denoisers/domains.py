@@ -1,16 +1,17 @@
 r"""The domain in which a network meets noise of variance ``s y + r`` (s = ``shot_var``, r = ``read_var``).
 
-==========  =======================================================  ====================================================
-name        what the network sees                                    noise there
-==========  =======================================================  ====================================================
-linear      y                                                        as it comes; a noise map is the other input
-ksigma      :math:`u = y / s + r / s^2`, scaled to ISO 1600          variance u: one camera at one ISO, whatever it was
-anscombe    :math:`z = 2 \sqrt{u + 3/8}`                             variance 1 everywhere
-==========  =======================================================  ====================================================
+==========  ===============================================  ====================================================
+name        what the network sees                            noise there
+==========  ===============================================  ====================================================
+linear      y                                                as it comes; a noise map is the other input
+ksigma      :math:`u = y / s + r / s^2`, scaled to ISO 1600  variance u: one camera at one ISO, whatever it was
+anscombe    :math:`z = 2 \sqrt{u + 3/8}`                     variance 1 everywhere
+==========  ===============================================  ====================================================
 
-The two transforms need no noise map: after them every exposure of every camera is the same problem, and a network sees
-all of its training data at every noise level. A network is trained on the transformed *clean* signal, so the algebraic
-inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays invertible for any noise.
+After a transform every exposure of every camera is the same problem. The network is trained to give the transformed
+*clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays
+invertible for any noise. Photons are counted with s of at least :data:`LEAST_SHOT`; how much weaker the noise is than that
+can be a noise map, which is 1 otherwise.
 
 Sources: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020 (k-sigma; its anchor is ISO 1600
 of a Reno-10x on a scale with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
@@ -25,9 +26,11 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-_LEAST_SHOT = 1e-7
+LEAST_SHOT = 3e-4
+"""Least shot_var of the transforms: white at 3,300 photons. A network whose input had no bound would have to keep whites
+of ISO 100, 400 times their noise, apart from it."""
 _LEAST_RATIO = 1e-3
-"""Least shot_var, alone and as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
+"""Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
 
 def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,9 +94,9 @@ class KSigma(Domain):
 
 
 class Anscombe(Domain):
-    """The generalised Anscombe transform over 4: noise of deviation 1/4, whites at 5 (ISO 25,600) to 50 (ISO 100)."""
+    """The generalised Anscombe transform: noise of deviation 1, white at 10 (ISO 25,600) to 400 (ISO 100)."""
 
-    scale = 0.25
+    scale = 1.0
     offset = 0.375
 
     def encode(self, u: Tensor) -> Tensor:
@@ -117,4 +120,10 @@ def _photons(y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
 
 
 def _bounded(shot: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.maximum(shot.clamp_min(_LEAST_SHOT), _LEAST_RATIO * read.sqrt()), read
+    return torch.maximum(shot.clamp_min(LEAST_SHOT), _LEAST_RATIO * read.sqrt()), read
+
+
+def relative_deviation(y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+    """The noise's deviation over what a transform takes it for, in [0, 1]; below 1 where shot_var is below its bound."""
+    shot, read = _bounded(shot, read)
+    return (variance / (shot * y.clamp_min(0.0) + read).clamp_min(1e-20)).sqrt().clamp_max(1.0)

@@ -53,8 +53,7 @@ class Block(nn.Module):
         """Of any shape ``(B, width, h, w)``."""
         y = gate(self.conv2(self.conv1(self.norm1(x))))
         x = x + self.beta * self.conv3(y * self.attention(y.mean((2, 3), keepdim=True)))
-        y = x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
-        return y
+        return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
 
 
 class NAFNet(Denoiser):

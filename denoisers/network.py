@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from denoisers.domains import DOMAINS, levels_of
+from denoisers.domains import DOMAINS, levels_of, relative_deviation
 
 PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
@@ -37,7 +37,7 @@ def conv(
     groups: int = 1,
     padding: int | None = None,
 ) -> nn.Conv2d:
-    """A convolution that keeps the size (or divides it by ``stride``), its weights drawn by :meth:`Denoiser.initialise`."""
+    """A convolution that keeps the size (or divides it by ``stride``); :meth:`Denoiser.initialise` draws its weights."""
     settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
     return nn.utils.skip_init(
         nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings
@@ -128,11 +128,11 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} was made with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
-        noise_map = (variance.sqrt() if self.deviation else variance) if self.variance_map else None
         if self.domain == "linear":
-            return noisy + self._correction(noisy, noise_map)
+            return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
+        noise_map = relative_deviation(noisy.float(), variance.float(), *levels) if self.variance_map else None
         denoised = domain.inverse(signal + self._correction(signal, noise_map), *levels)
         return torch.where(variance > 0, denoised, noisy)
 

@@ -1,7 +1,7 @@
 r"""PMRID: a U-Net of separable convolutions for phones; ``z + P(z)`` in the k-sigma domain.
 
-Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each stage
-at half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
+Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at
+half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
 convolution 2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
 
 Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the

@@ -64,6 +64,13 @@ class Pair:
         shot_var, read_var = measured_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var)
 
+    def middle(self, side: int) -> Pair:
+        """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
+        top, left = ((size - side) // 4 * 2 if size > side else 0 for size in self.raw.shape[-2:])
+        rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
+        noisy = None if self.noisy is None else self.noisy[:, rows, columns]
+        return replace(self, srgb=self.srgb[:, rows, columns], raw=self.raw[:, rows, columns], noisy=noisy)
+
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])
         if tuple(image.shape) != expected or image.dtype != dtype:

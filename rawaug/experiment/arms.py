@@ -9,11 +9,13 @@ from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
-from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.training.camera_crops import CameraCrops
 from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
@@ -59,7 +61,6 @@ def training_stream(
         seed: of the run.
     """
     config, seed = recipe.train, derived_seed(seed, "stream")
-    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
     estimator = estimator_of(arm)
     real: Source | None = None
     synthetic: Source | None = None
@@ -68,14 +69,30 @@ def training_stream(
             frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
             real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
         if arm.augmented:
+            augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
             frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
             synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
     else:
         if pairs:
             real = RealCrops(pairs, noise, config.crop, isp.cfa)
         if arm.augmented:
-            synthetic = PictureCrops(RawPairs(pictures, augment, config.crop))
+            synthetic = picture_source(recipe, arm, pictures, isp, noise)
     return TrainingStream(real, synthetic, config.batch, arm.augmented, seed)
+
+
+def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: DictionaryISP, noise: NoiseModel) -> Source:
+    """Crops of the sRGB pictures as RAW of the ISP's cameras, or of published ones."""
+    crop = recipe.train.crop
+    if arm.sampling == "published":
+        return CameraCrops(pictures, CameraSampler(exposure=arm.exposure), noise, crop, isp.cfa, arm.zoom)
+    augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
+    return PictureCrops(RawPairs(pictures, augment, crop))
+
+
+def _of_atoms(arm: ArmConfig) -> Sampling:
+    if arm.sampling == "published":
+        raise ValueError("arms: sampling published is for supervised arms; use convex, perturb or chosen")
+    return arm.sampling
 
 
 def validation_samples(
@@ -91,7 +108,8 @@ def validation_samples(
         frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
         return held_out(frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED], isp.cfa)
     if pairs:
-        return [frozen_sample(pair, noise, isp.cfa, seed=0) for pair in pairs]
+        side = recipe.data.validation_crop
+        return [frozen_sample(pair.middle(side) if side else pair, noise, isp.cfa, seed=0) for pair in pairs]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
     return [Sample(*(x[None] for x in sample)) for sample in drawn]

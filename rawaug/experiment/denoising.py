@@ -22,6 +22,7 @@ from rawaug.commands.fit import fit
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
+from rawaug.data.remembered import Remembered
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     require_classical,
@@ -69,7 +70,8 @@ class _Run:
         source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
         self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
         _require_unseen(self.test, {"pairs": source, "validation": self.validation})
-        self.pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
+        pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
+        self.pictures = Remembered(pictures, self.data.memory_mb) if self.data.memory_mb else pictures
         self.pairs = list(source[: self.data.count])
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))

@@ -19,8 +19,10 @@ class DataConfig:
         pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null if there are none.
         count: how many of them are used; all if null.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
+        memory_mb: pictures are kept in memory once decoded, up to so many megabytes.
         validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
             watches it on RAW made from the pictures, which chooses no weights: those of the end are kept.
+        validation_crop: side of the middle of each validation frame that is looked at; null for the whole frame.
         test: pairs on which the result is measured; no stage sees them before.
         test_count: how many of them are used; all if null.
     """
@@ -28,7 +30,9 @@ class DataConfig:
     pairs: str | None = "demo:train"
     count: int | None = None
     pictures: str = "demo:"
+    memory_mb: int = 0
     validation: str | None = "demo:validation"
+    validation_crop: int | None = None
     test: str = "demo:test"
     test_count: int | None = None
 
@@ -39,7 +43,9 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`; or published, cameras, lights and tone
+            curves from the tables of the package, see :mod:`rawaug.isp.camera_sampling`.
+        zoom: of published: pictures are enlarged up to this factor, half of the time; 1 for none.
         strength: of ``perturb``.
         exposure: lowest and highest exposure of the RAW in stops.
         estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
@@ -50,7 +56,8 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen"] = "convex"
+    sampling: Literal["convex", "perturb", "chosen", "published"] = "convex"
+    zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] = (0.0, 0.0)
     estimator: Literal["supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"] = "supervised"
@@ -73,8 +80,8 @@ class Recipe:
         isp: how the dictionary ISP is fitted.
         camera: an ISP that is taken as it is, the name of a shipped one or a file; null fits one to ``data.pairs``.
         noise: what is added to clean RAW, in training and where a test frame has no noisy capture: the name of a preset
-            or of a measured camera, [shot_var, read_var], or "camera", the levels measured on the frames that the ISP
-            is fitted to.
+            or of a camera, a list of names of which each picture draws one, [shot_var, read_var], or "camera", the
+            levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
         train: the loop.
         arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
@@ -91,7 +98,7 @@ class Recipe:
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
     camera: str | None = None
-    noise: tuple[float, float] | str = "cycleisp_sidd"
+    noise: tuple[float, float] | str | list[str] = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)

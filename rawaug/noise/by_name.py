@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 from rawaug.camera_names import spelled
 from rawaug.noise.iso import EldLevels, Iso, PmridLevels, SiddLevels
-from rawaug.noise.levels import FixedLevels, NoiseLevels, Preset, published
+from rawaug.noise.levels import FixedLevels, MixedLevels, NoiseLevels, Preset, published
 from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
 from rawaug.noise.profiles import ANY_CAMERA, ProfileLevels, profile_names
 
@@ -36,8 +36,8 @@ def noise_names() -> list[str]:
     return [*published()["presets"], *camera_names(), ANY_CAMERA, *profile_names()]
 
 
-def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels:
-    """The levels of a name, or the fixed levels (shot_var, read_var).
+def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
+    """The levels of a name, of a mixture of names, or the fixed levels (shot_var, read_var).
 
     Raises:
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
@@ -49,6 +49,8 @@ def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels
         return SiddLevels(spec, iso) if spec in data["sidd_noise_level_function"]["cameras"] else EldLevels(spec, iso)
     if isinstance(spec, str) and spec not in data["presets"]:
         return _of_profile(spec, iso)
+    if not isinstance(spec, str) and spec and all(isinstance(name, str) for name in spec):
+        return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
     if iso is not None:
         raise ValueError(
             f"noise {spec!r} has no law by ISO; leave iso out, or name a camera: {', '.join(camera_names())}"
@@ -57,7 +59,7 @@ def noise_levels(spec: str | Sequence[float], *, iso: Iso = None) -> NoiseLevels
         return Preset(spec)
     if not isinstance(spec, Sequence) or len(spec) != 2:
         raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
-    return FixedLevels(*spec)
+    return FixedLevels(*(float(value) for value in spec))
 
 
 def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
@@ -73,11 +75,14 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
     return ProfileLevels(spec, iso)
 
 
-def noise_model(spec: str | Sequence[float] | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
+def noise_model(
+    spec: str | Sequence[float] | Sequence[str] | NoiseModel, *, iso: Iso = None, poisson: bool = False
+) -> NoiseModel:
     """The shot and read noise of a name or of (shot_var, read_var); a model is handed back as it is.
 
     Args:
-        spec: one of :func:`noise_names`, a pair of variances on the scale white = 1, or a :class:`NoiseModel`.
+        spec: one of :func:`noise_names`, a list of them (each picture draws one), a pair of variances on the scale
+            white = 1, or a :class:`NoiseModel`.
         iso: of a camera: one ISO, limits, or None for its whole measured range.
         poisson: exact photon statistics instead of the Gaussian.
 

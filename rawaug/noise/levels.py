@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from typing import Any, Protocol
@@ -62,6 +63,29 @@ class FixedLevels:
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         device = generator.device
         return torch.full((batch,), self.shot_var, device=device), torch.full((batch,), self.read_var, device=device)
+
+
+class MixedLevels:
+    """Levels of a random one of several laws, each picture's own; all weighted alike.
+
+    Example:
+        >>> shot_var, read_var = MixedLevels([FixedLevels(1e-3, 0.0), FixedLevels(2e-3, 0.0)]).sample(
+        ...     8, torch.Generator().manual_seed(0)
+        ... )
+        >>> sorted(set(shot_var.tolist())) == torch.tensor([1e-3, 2e-3]).tolist()
+        True
+    """
+
+    def __init__(self, laws: Sequence[NoiseLevels]) -> None:
+        if not laws:
+            raise ValueError("a mixture of noise levels has at least one law")
+        self.laws = laws
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        which = torch.randint(len(self.laws), (batch,), generator=generator, device=generator.device)
+        drawn = torch.stack([torch.stack(law.sample(batch, generator)) for law in self.laws])
+        shot_var, read_var = drawn[which, :, torch.arange(batch, device=which.device)].unbind(1)
+        return shot_var, read_var
 
 
 class Preset:

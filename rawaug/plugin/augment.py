@@ -59,7 +59,7 @@ class RawAugment(nn.Module):
     def __init__(
         self,
         isp: DictionaryISP,
-        noise: str | Sequence[float] | NoiseModel = "cycleisp_sidd",
+        noise: str | Sequence[float] | Sequence[str] | NoiseModel = "cycleisp_sidd",
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
@@ -212,7 +212,7 @@ def _float32(like: Tensor) -> torch.autocast:
     return torch.autocast(like.device.type, enabled=False)
 
 
-def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | NoiseModel) -> NoiseModel:
+def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] | NoiseModel) -> NoiseModel:
     """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels that stand in its file.
 
     Raises:

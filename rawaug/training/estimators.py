@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -34,8 +33,7 @@ from torch import Tensor, nn
 
 from denoisers.network import Denoiser
 from rawaug.data.sample import Sample
-
-Criterion = Callable[[Tensor, Tensor], Tensor]
+from rawaug.training.criteria import Criterion
 
 
 def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:

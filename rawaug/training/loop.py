@@ -12,12 +12,12 @@ import csv
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
@@ -26,15 +26,10 @@ from denoisers.network import Denoiser
 from rawaug.data.sample import Sample
 from rawaug.metrics import psnr
 from rawaug.seeding import derived_seed
+from rawaug.training.criteria import LOSSES, weighed
 from rawaug.training.estimators import Supervised
 from rawaug.training.stream import StepSampler, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
-
-LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "l1": nn.functional.l1_loss,
-    "l2": nn.functional.mse_loss,
-    "charbonnier": lambda a, b: ((a - b) ** 2 + 1e-6).sqrt().mean(),
-}
 
 
 def train(
@@ -92,7 +87,8 @@ def train(
     bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=journal is None)
     for step, batch in enumerate(bar, start=start + 1):
         sample = type(batch)(*(x.to(fabric.device, memory_format=layout) for x in batch))
-        loss = estimator.loss(step_model, sample, LOSSES[config.loss], step / config.steps)
+        criterion = weighed(LOSSES[config.loss], config.weigh, sample)
+        loss = estimator.loss(step_model, sample, criterion, step / config.steps)
         optimiser.zero_grad(set_to_none=True)
         fabric.backward(loss)
         if config.clip_norm:

@@ -32,6 +32,7 @@ class TrainConfig:
         schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
         halve_every: steps.
         loss: l1, l2 or charbonnier.
+        weigh: how the loss weighs light and shade: linear, stabilised or mixed; see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
         validate_every: steps between two looks at the validation pairs, the best weights on which are kept.
@@ -50,6 +51,7 @@ class TrainConfig:
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: int = 20000
     loss: Literal["l1", "l2", "charbonnier"] = "l1"
+    weigh: Literal["linear", "stabilised", "mixed"] = "linear"
     ema: float = 0.99
     clip_norm: float = 0.1
     validate_every: int = 100

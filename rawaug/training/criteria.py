@@ -1,0 +1,58 @@
+r"""What the distance between a denoised and a clean RAW is: a norm, and how it weighs light and shade.
+
+==============  ====================================================================================================
+``weigh``       what is compared
+==============  ====================================================================================================
+linear          the RAW itself: shadows, whose errors are small, hardly count
+stabilised      :math:`2 \sqrt{y / s + r / s^2 + 3/8}`, where noise has deviation 1 in shadow and light alike
+mixed           the mean of both, the linear one divided by the noise's mean deviation in the picture
+==============  ====================================================================================================
+
+with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, both
+being near a square root. The minimum of l1 is the median, which a curve does not move; that of l2 is the mean, and in the
+stabilised domain it is not the mean of the RAW.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import MappingProxyType
+
+from torch import Tensor, nn
+
+from denoisers.domains import DOMAINS, Anscombe, levels_of
+from rawaug.data.sample import Sample
+
+Criterion = Callable[[Tensor, Tensor], Tensor]
+"""Of a denoised and a clean (or target) RAW, a scalar."""
+
+LOSSES: MappingProxyType[str, Criterion] = MappingProxyType(
+    {
+        "l1": nn.functional.l1_loss,
+        "l2": nn.functional.mse_loss,
+        "charbonnier": lambda a, b: ((a - b) ** 2 + 1e-6).sqrt().mean(),
+    }
+)
+
+
+def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
+    """``loss`` with light and shade weighed as ``weigh`` says, for the noise of ``sample``'s pictures ``(B, 4, h, w)``.
+
+    Raises:
+        ValueError: if there is no such weighing.
+    """
+    if weigh == "linear":
+        return loss
+    if weigh not in ("stabilised", "mixed"):
+        raise ValueError(f"train.weigh {weigh!r} is none of linear, stabilised, mixed")
+    levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
+
+    def stabilised(denoised: Tensor, clean: Tensor) -> Tensor:
+        a, b = (root.forward(y, *levels) / Anscombe.scale for y in (denoised, clean))
+        return loss(a, b)
+
+    def mixed(denoised: Tensor, clean: Tensor) -> Tensor:
+        deviation = sample.variance.sqrt().mean((1, 2, 3), keepdim=True).clamp_min(1e-12)
+        return 0.5 * (stabilised(denoised, clean) + loss(denoised / deviation, clean / deviation))
+
+    return stabilised if weigh == "stabilised" else mixed
