@@ -10,8 +10,8 @@ anscombe    :math:`z = 2 \sqrt{u + 3/8}`                     variance 1 everywhe
 
 After a transform every exposure of every camera is the same problem. The network is trained to give the transformed
 *clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays
-invertible for any noise. Photons are counted with s of at least :data:`LEAST_SHOT`; how much weaker the noise is than that
-can be a noise map, which is 1 otherwise.
+invertible for any noise. Photons are counted with s of at least :data:`LEAST_SHOT`; a noise map then holds the noise's
+deviation relative to that, which is 1 for stronger noise.
 
 Sources: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020 (k-sigma; its anchor is ISO 1600
 of a Reno-10x on a scale with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 LEAST_SHOT = 3e-4
-"""Least shot_var of the transforms: white at 3,300 photons. A network whose input had no bound would have to keep whites
-of ISO 100, 400 times their noise, apart from it."""
+"""Least shot_var of the transforms, white at 3,300 photons: the input of a network needs a bound, and white at ISO 100 is
+400 times its noise."""
 _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
@@ -124,6 +124,6 @@ def _bounded(shot: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def relative_deviation(y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-    """The noise's deviation over what a transform takes it for, in [0, 1]; below 1 where shot_var is below its bound."""
+    """The noise's deviation over what a transform takes it for, in [0, 1]: below 1 where shot_var is below its bound."""
     shot, read = _bounded(shot, read)
     return (variance / (shot * y.clamp_min(0.0) + read).clamp_min(1e-20)).sqrt().clamp_max(1.0)

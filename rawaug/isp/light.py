@@ -1,8 +1,8 @@
 r"""Lights that pictures are taken in, as white points: the Planckian and the daylight locus, and electric lamps.
 
 A light is drawn at a correlated colour temperature T, uniform in the reciprocal :math:`10^6 / T` (mired), in which
-equal steps look alike. On the Planckian locus (Krystek, "An algorithm to calculate correlated colour
-temperature", 1985)
+equal steps look alike. On the Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature",
+1985)
 
 .. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
                    {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
@@ -59,7 +59,7 @@ def daylight(kelvin: Tensor) -> Tensor:
 
 
 def off_locus(xy: Tensor, kelvin: Tensor, duv: Tensor) -> Tensor:
-    """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` across the Planckian locus at ``kelvin`` ``(...)``."""
+    """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` along the Planckian locus' normal at ``kelvin`` ``(...)``."""
     along = _uv_from_xy(planckian(kelvin * 0.999)) - _uv_from_xy(planckian(kelvin * 1.001))
     along = along / along.norm(dim=-1, keepdim=True)
     normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)  # along runs to higher u, the normal to higher v
