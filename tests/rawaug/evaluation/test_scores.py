@@ -10,17 +10,17 @@ import pytest
 import torch
 
 import denoisers
+from rawaug.commands.evaluate import evaluate
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import (
     classical_method,
     compared,
-    evaluate,
     frozen_levels,
     frozen_sample,
     score_method,
-    write_json,
 )
 from rawaug.evaluation.tables import print_scores
+from rawaug.files import write_json
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
