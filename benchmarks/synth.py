@@ -25,8 +25,8 @@ from typing import Any
 import torch
 
 from rawaug.commands import synth
-from rawaug.commands.pair_files import augment_file, sha256
 from rawaug.data import demo_pictures
+from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture, write_picture
 
 COPIES = 8
@@ -58,7 +58,7 @@ def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dic
     """Mpix/s of decoding and of each format, and each format's time over that of decoding."""
     pictures = synth._pictures(folder, Path(os.devnull))
     megapixels = sum(decode(picture) for picture in pictures) / 1e6
-    weights, best = sha256(augment_file("universal")), dict.fromkeys(("decode", *formats), float("inf"))
+    weights, best = sha256(find_weights("universal")), dict.fromkeys(("decode", *formats), float("inf"))
     for name in [*best] * repeats:
         with tempfile.TemporaryDirectory() as out:
             form: Any = "npz" if name == "decode" else name

@@ -38,7 +38,7 @@ def test_a_recipe_runs_by_its_name_from_any_folder(site: Path, tmp_path: Path) -
 
 
 def test_recipes_weights_and_tables_are_in_it(site: Path) -> None:
-    there = {file.relative_to(site).as_posix() for file in site.rglob("*") if file.is_file()}
+    existing = {file.relative_to(site).as_posix() for file in site.rglob("*") if file.is_file()}
     source = site.parent / "source"
     wanted = {
         Path(above, file.relative_to(source)).as_posix()
@@ -46,4 +46,4 @@ def test_recipes_weights_and_tables_are_in_it(site: Path) -> None:
         for file in (source / folder).rglob("*")
         if file.is_file()
     }
-    assert len(wanted) > 100 and wanted <= there, sorted(wanted - there)
+    assert len(wanted) > 100 and wanted <= existing, sorted(wanted - existing)

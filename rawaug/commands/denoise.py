@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 from torch.nn import functional as F
@@ -23,11 +24,11 @@ import denoisers
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.commands.pair_files import sha256
 from rawaug.commands.synth import require_same_settings
 from rawaug.data.raw_folder import EXTENSIONS
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import denoise
+from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.seeding import keyed_generator
@@ -38,6 +39,25 @@ Noise = str | Sequence[float]
 _NO_NOISE = (0.0, 0.0)
 
 
+def add_arguments(parser: Any) -> None:
+    """The command's arguments."""
+    parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
+    parser.add_argument("out", type=str, help="the DNG to write, or a folder")
+    parser.add_argument("--denoiser", type=str, required=True, help="a .safetensors file of rawaug run")
+    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
+    parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
+    parser.add_argument("--self-ensemble", action="store_true", help="average eight views: eight times the work")
+
+
+def run(arguments: Any) -> None:
+    """Denoise, and print what was done."""
+    a = arguments
+    if Path(a.source).is_dir():
+        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    else:
+        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+
+
 @dataclass(frozen=True)
 class Denoised:
     """What was done to a file.
@@ -45,7 +65,7 @@ class Denoised:
     Attributes:
         source, out: the files.
         shot_var, read_var: the noise that was reckoned with.
-        told_by: ``"profile"``, ``"estimate"``, or what was asked for.
+        noise_source: ``"profile"``, ``"estimate"``, or what was asked for.
         below_zero: share of sites whose result was below the digital number 0, and became 0.
         seconds: reading and writing included.
     """
@@ -54,7 +74,7 @@ class Denoised:
     out: Path
     shot_var: float
     read_var: float
-    told_by: str
+    noise_source: str
     below_zero: float
     seconds: float
 
@@ -64,7 +84,7 @@ class DenoisedFolder:
     """What a run over a folder did."""
 
     files: list[Denoised] = field(default_factory=list)
-    there: int = 0
+    existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
 
 
@@ -162,12 +182,12 @@ def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: 
         raise ValueError(f"{out}: is the file to denoise; give another name")
     model, cfa = loaded
     frame = read_raw(source)
-    shot_var, read_var, told_by = levels_of(frame, noise) if model.variance_map else (*_NO_NOISE, "not needed")
+    shot_var, read_var, noise_source = levels_of(frame, noise) if model.variance_map else (*_NO_NOISE, "not needed")
     mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
     below = _clip_below_zero(mosaic, frame)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_dng(out, replace(frame, mosaic=mosaic, noise_profile=None), source)
-    return Denoised(source, out, shot_var, read_var, told_by, below, time.perf_counter() - start)
+    return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
@@ -206,7 +226,7 @@ def denoise_folder(
     result = DenoisedFolder()
     for file, target in tqdm(targets.items(), desc="denoise", unit="file"):
         if target.exists():
-            result.there += 1
+            result.existing += 1
             continue
         try:
             result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble))
@@ -235,10 +255,10 @@ def _targets(source: Path, out: Path) -> dict[Path, Path]:
 def print_denoised(result: DenoisedFolder) -> None:
     """A line a file, and the broken ones by name."""
     for done in result.files:
-        levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.told_by})"
+        levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below the digital number 0, written as 0" if done.below_zero else ""
         print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
-    if result.there or result.broken:
-        print(f"{len(result.files)} denoised, {result.there} there already, {len(result.broken)} broken")
+    if result.existing or result.broken:
+        print(f"{len(result.files)} denoised, {result.existing} there already, {len(result.broken)} broken")
     for file, reason in result.broken.items():
         print(f"broken: {reason}" if Path(file).stem in reason else f"broken: {file}: {reason}")

@@ -18,6 +18,42 @@ from rawaug.noise import NoiseEstimate, plot_noise
 WATCHED_PATCHES = 4
 
 
+def add_arguments(parser: Any) -> None:
+    """The command's arguments."""
+    parser.add_argument("data", type=str, nargs="+", help="folders of RAW files, files, or one kind:path")
+    jpeg_help = "take the camera's JPEG of the same stem for the sRGB; false takes LibRaw's rendering always"
+    parser.add_argument("--camera-jpeg", type=bool, default=True, help=jpeg_help)
+    held_out_help = "frames that the fit does not see: their PSNR_r is shown while it runs"
+    parser.add_argument("--held-out", type=str | None, default=None, help=held_out_help)
+    parser.add_argument("--out", type=str, required=True, help="the .safetensors file to write")
+    noise_help = "also measure the camera's noise, for noise: camera; auto goes on where the frames do not show it"
+    parser.add_argument("--noise", type=Literal["auto", "on", "off"], default="auto", help=noise_help)
+    parser.add_argument("--dark", type=str | None, default=None, help="folder of dark frames, for the read variance")
+    parser.add_class_arguments(FitConfig)
+
+
+def run(arguments: Any) -> None:
+    """Fit, write the file and say how it went."""
+    settings = vars(arguments)
+    data, out = settings.pop("data"), settings.pop("out")
+    if Path(out).suffix != ".safetensors":
+        raise ValueError(f"--out {out}: the file must end in .safetensors")
+    figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    isp = fit(data, noise_figure=figure, state=f"{out}.state", **settings)
+    isp.info["data"] = data
+    isp.save(out)
+    print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
+    for score in isp.info.get("held_out", [])[-1:]:
+        print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")
+    if "noise_not_measured" in isp.info:
+        print(f"noise not measured: {isp.info['noise_not_measured']}")
+    if "noise" in isp.info:
+        noise = isp.info["noise"]
+        levels = f"shot_var {noise['shot_var']:.3g}, read_var {noise['read_var']:.3g}"
+        print(f"noise: {levels}, R^2 {noise['r2']:.3f}: {figure}")
+
+
 def fit(
     source: str | Path | Sequence[str | Path] | Sequence[Pair],
     progress: bool = True,

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import denoisers
-from rawaug.evaluation.scores import read_header
-from rawaug.isp.model import DictionaryISP, find_weights
+from rawaug.files import find_weights, read_header
+from rawaug.isp.model import DictionaryISP
+
+
+def add_arguments(parser: Any) -> None:
+    """The command's arguments."""
+    parser.add_argument("weights", type=str, help="a .safetensors file, or the name of a shipped ISP")
+
+
+def run(arguments: Any) -> None:
+    """Print the description."""
+    print(describe(arguments.weights))
 
 
 def describe(weights: str | Path) -> str:

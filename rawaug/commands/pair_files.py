@@ -14,22 +14,19 @@ darkest noisy value needs, so that nothing is clipped at black; the clean file h
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from rawaug import bayer
 from rawaug._version import __version__
+from rawaug.files import find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
@@ -57,7 +54,6 @@ class Origin:
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
     """Write a pair ``(4, h, w)`` and its parameters to files whose names begin with ``stem``."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
     if format == "dng":
         _write_dngs(stem, pair, augment)
     elif format == "npz":
@@ -65,9 +61,8 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
     else:
         _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment)
         _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment)
-    tensors = {name: value.contiguous() for name, value in pair.params.tensors().items()}
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
-    _whole(params_file(stem), lambda file: file.write(_in_one_order(save(tensors, header))))
+    write_tensors(pair.params.tensors(), header, params_file(stem))
 
 
 def params_file(stem: Path) -> Path:
@@ -91,14 +86,13 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
         >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
     """
     drawn = load_params(params)
-    with safe_open(str(params), framework="pt") as file:
-        header = file.metadata()
+    header = read_header(params)
     if "origin" not in header:
         raise ValueError(f"{params}: parameters of a pair that rawaug synth did not write; use RawAugment.apply")
     origin = Origin(**json.loads(header["origin"]))
     augment = augmentation(str(isp or origin.isp), origin.noise)
     found = Path(picture or origin.picture)
-    if sha256(augment_file(str(isp or origin.isp))) != origin.isp_sha256:
+    if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
         raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one that made this pair")
     srgb = even_sided(read_picture(found))
     if sha256(found) != origin.picture_sha256:
@@ -112,50 +106,24 @@ def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -
     return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)
 
 
-def augment_file(isp: str) -> Path:
-    """The file of an ISP's weights."""
-    from rawaug.isp.model import find_weights
-
-    return find_weights(isp)
-
-
-def sha256(path: Path) -> str:
-    """Of a file, in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
-
-
-def _whole(path: Path, write: Callable[[Any], Any]) -> None:
-    """Write a file whole or not at all."""
-    partial = _beside(path, ".partial")
-    with partial.open("wb") as file:
-        write(file)
-    partial.replace(path)
-
-
-def _in_one_order(safetensors: bytes) -> bytes:
-    """The same file with its header sorted: the library writes metadata in an order that changes from run to run."""
-    end = 8 + int.from_bytes(safetensors[:8], "little")
-    header = json.dumps(json.loads(safetensors[8:end]), sort_keys=True).encode()
-    header += b" " * (-len(header) % 8)
-    return len(header).to_bytes(8, "little") + header + safetensors[end:]
 
 
 def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
     import tifffile
 
     mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
-    _whole(path, lambda file: tifffile.imwrite(file, mosaic, photometric="minisblack", metadata=None))
+    with replacing(path) as partial:
+        tifffile.imwrite(partial, mosaic, photometric="minisblack", metadata=None)
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     noise = pair.params.noise
     arrays: dict[str, Any] = {key: noise[key].numpy() for key in ("shot_var", "read_var") if key in noise}
     arrays |= {"clean": pair.clean.numpy(), "noisy": pair.noisy.numpy(), "cfa": np.array(str(augment.isp.cfa))}
-    _whole(_beside(stem, ".npz"), lambda file: np.savez(file, **arrays))
+    with replacing(_beside(stem, ".npz")) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:

@@ -25,6 +25,21 @@ _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
+def add_arguments(parser: Any) -> None:
+    """The command's arguments."""
+    parser.add_argument("picture", type=str, help="an sRGB picture")
+    parser.add_argument("--out", type=str, required=True, help="the PNG to write; the atoms go to NAME-atoms.png")
+    parser.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
+    parser.add_argument("--count", type=int, default=4, help="augmented RAWs to draw")
+    parser.add_argument("--seed", type=int, default=0, help="of these")
+
+
+def run(arguments: Any) -> None:
+    """Draw, and print the paths of the figures."""
+    for path in preview(arguments.picture, arguments.isp, arguments.out, arguments.count, arguments.seed):
+        print(path)
+
+
 def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 4, seed: int = 0) -> list[Path]:
     """Draw both figures.
 

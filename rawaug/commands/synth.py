@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tqdm.auto import tqdm
@@ -27,20 +27,39 @@ from tqdm.auto import tqdm
 from rawaug.commands.pair_files import (
     Format,
     Origin,
-    augment_file,
     augmentation,
     params_file,
     replay,
-    sha256,
     write_pair,
 )
 from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
 from rawaug.seeding import keyed_generator
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
+
+
+def add_arguments(parser: Any) -> None:
+    """The command's arguments."""
+    parser.add_argument("pictures", type=str, help="folder of sRGB pictures")
+    parser.add_argument("out", type=str, help="folder to write")
+    parser.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
+    parser.add_argument("--per-image", type=int, default=1, help="pairs a picture")
+    parser.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
+    noise_help = "a preset, a measured camera, camera (as fitted), or [shot_var, read_var]"
+    parser.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
+    parser.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
+    parser.add_argument("--seed", type=int, default=0, help="of all draws")
+    parser.add_argument("--workers", type=int | None, default=None, help="processes; as many as cores by default")
+
+
+def run(arguments: Any) -> None:
+    """Make the pairs, and print a table."""
+    settings = vars(arguments)
+    print_synthesis(synth(settings.pop("pictures"), settings.pop("out"), **settings))
 
 
 @dataclass(frozen=True)
@@ -71,7 +90,7 @@ class Synthesis:
     out: Path
     pictures: int = 0
     made: int = 0
-    there: int = 0
+    existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
@@ -109,7 +128,7 @@ def synth(
     start = time.perf_counter()
     weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
     levels = noise if isinstance(noise, str) else list(noise)
-    settings = _Settings(format, weights, sha256(augment_file(weights)), levels, sampling, seed)
+    settings = _Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
     if format not in ("dng", "npz", "tiff") or per_image < 1:
@@ -120,7 +139,7 @@ def synth(
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
     tasks = list(_tasks(pictures, source, out, per_image))
-    result.there = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
+    result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
     todo = [task for task in tasks if task.numbers]
     for task, error in tqdm(_done(todo, settings, workers), total=len(todo), desc="synth", unit="picture"):
         if error is None:
@@ -178,10 +197,7 @@ def require_same_settings(path: Path, settings: dict[str, object]) -> None:
             if settings.get(key) != value:
                 raise ValueError(f"{path}: made with {key} {value}, not {settings.get(key)}; choose another folder")
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(settings, indent=1) + "\n")
-    partial.replace(path)
+    write_json(settings, path)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------
@@ -253,7 +269,7 @@ def print_synthesis(result: Synthesis) -> None:
     table = Table(title=str(result.out))
     for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
         table.add_column(column, justify="right")
-    numbers = (result.pictures, result.made, result.there, len(result.broken))
+    numbers = (result.pictures, result.made, result.existing, len(result.broken))
     table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
     Console(width=100).print(table)
     for reason in result.broken.values():

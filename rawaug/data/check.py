@@ -162,8 +162,8 @@ def _fivek(numbers: set[str]) -> str:
     for camera in CAMERAS:
         for split in ("train", "test"):
             wanted = fivek_numbers(camera, split)
-            if there := len(numbers.intersection(wanted)):
-                parts.append(f"{camera} {split} {there} of {len(wanted)}")
+            if existing := len(numbers.intersection(wanted)):
+                parts.append(f"{camera} {split} {existing} of {len(wanted)}")
     return f" (FiveK: {', '.join(parts)})" if parts else ""
 
 

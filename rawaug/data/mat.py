@@ -110,8 +110,8 @@ class _Missing(ValueError):
     """A variable that is not there: no damage."""
 
 
-def _missing(path: Path, name: str, there: list[str]) -> _Missing:
-    return _Missing(f"{path}: holds no variable {name}, but {', '.join(there) or 'none'}")
+def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
+    return _Missing(f"{path}: holds no variable {name}, but {', '.join(existing) or 'none'}")
 
 
 def _plain(node: Any, file: Any) -> Any:

@@ -54,8 +54,8 @@ class Zurich(LazyPairs):
         self.files = sorted((folder / "huawei_raw").glob("*.png"), key=lambda file: (len(file.stem), file.stem))
         if not self.files:
             raise ValueError(f"{folder / 'huawei_raw'}: holds no PNG")
-        there = {file.name for file in (folder / "canon").glob("*.jpg")}
-        missing = [file for file in self.files if f"{file.stem}.jpg" not in there]
+        existing = {file.name for file in (folder / "canon").glob("*.jpg")}
+        missing = [file for file in self.files if f"{file.stem}.jpg" not in existing]
         if missing:
             raise FileNotFoundError(
                 f"{folder / 'canon' / missing[0].stem}.jpg: is missing, with {len(missing) - 1} others"

@@ -7,16 +7,12 @@ more on sRGB, after one fixed development (:func:`rawaug.data.development.develo
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -24,18 +20,13 @@ import denoisers
 from denoisers.classical import Classical, Stabilised
 from denoisers.network import Denoiser
 from rawaug import bayer
-from rawaug._version import __version__
 from rawaug.bayer import CFA, aligned
-from rawaug.data import open_pairs
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
-from rawaug.evaluation.page import Page, shown_on_page
-from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import METRICS, Row
-from rawaug.isp.model import DictionaryISP, find_weights
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
-from rawaug.noise import NoiseModel, anscombe, noise_model
+from rawaug.noise import NoiseModel, anscombe
 from rawaug.seeding import keyed_generator
 
 TILE, OVERLAP = 384, 64
@@ -58,24 +49,6 @@ class Score:
     ssim_noisy: float | None = None
     psnr_srgb_noisy: float | None = None
     ssim_srgb_noisy: float | None = None
-
-
-def read_header(path: str | Path) -> dict[str, str]:
-    """The metadata of a weights file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a rawaug weights file.
-    """
-    path = find_weights(path)
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            header = dict(file.metadata() or {})
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a safetensors file ({error}); fit or train it again") from error
-    if header.get("format") != "rawaug":
-        raise ValueError(f"{path}: a safetensors file, but not rawaug's; give one written by rawaug fit or rawaug run")
-    return header
 
 
 def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
@@ -146,79 +119,6 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
     return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
-def evaluate(
-    weights: str | Path,
-    data: str,
-    self_ensemble: bool = False,
-    noise: str | Sequence[float] | None = None,
-    seed: int = 0,
-    classical: Sequence[str] = (),
-    device: str = "cpu",
-    report: str | Path | None = None,
-) -> dict[str, Any]:
-    """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
-
-    Args:
-        weights: an ISP's or a denoiser's; the file says which.
-        data: a folder of RAW files, or ``kind:path``.
-        self_ensemble: average a denoiser over eight views; its scores without stand under ``plain``.
-        noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
-            with.
-        seed: of that noise.
-        classical: classical denoisers to score beside it on the same noise, see :data:`CLASSICAL`.
-        device: where the denoiser runs.
-        report: HTML file to write: scores and pictures of a denoiser.
-
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
-            is for denoisers and the file is an ISP's.
-    """
-    require_classical(classical)
-    weights = find_weights(weights)
-    kind = read_header(weights)["kind"]
-    pairs = open_pairs(data, split="test")
-    if kind == "isp":
-        if self_ensemble or noise is not None or classical or report is not None:
-            raise ValueError(f"{weights}: is an ISP; self-ensemble, noise, classical and report are for denoisers")
-        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
-        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
-    else:
-        model, info = denoisers.load(weights)
-        levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
-        model = model.to(device)
-        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
-        if report is not None:
-            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
-            page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
-            for pair in shown_on_page(pairs):
-                page.add_frame(row_of({"denoised": model}, pair, levels, cfa, seed), cfa)
-            page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
-    return {"kind": kind, "data": data, **result, "weights_sha256": digest, "version": __version__}
-
-
-def _denoiser_result(
-    model: Denoiser,
-    pairs: Sequence[Pair],
-    noise: NoiseModel,
-    cfa: CFA,
-    seed: int,
-    self_ensemble: bool,
-    classical: Sequence[str],
-) -> dict[str, Any]:
-    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
-    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
-    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
-    if self_ensemble:
-        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
-        result |= {"plain": plain, **summary([score for score, *_ in scored])}
-    else:
-        result |= plain
-    if classical:
-        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
-    return result
-
-
 CLASSICAL: dict[str, Callable[[], Classical]] = {
     "NonLocalMeans": denoisers.NonLocalMeans,
     "Wavelet": denoisers.Wavelet,
@@ -284,12 +184,3 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
             result[key] = sum(known) / len(known)
             result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
     return result
-
-
-def write_json(result: dict[str, Any], path: str | Path) -> None:
-    """Write a result whole or not at all, making its folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(result, indent=1) + "\n")
-    partial.replace(path)

@@ -20,7 +20,7 @@ from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.evaluation.scores import write_json
+from rawaug.files import write_json
 from rawaug.isp import conditioning
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp

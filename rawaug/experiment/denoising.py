@@ -6,7 +6,6 @@ a run that was stopped goes on where it was.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -30,12 +29,12 @@ from rawaug.evaluation.scores import (
     score_classical,
     score_denoiser,
     summary,
-    write_json,
 )
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
-from rawaug.isp.model import DictionaryISP, find_weights
+from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
+from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
@@ -98,7 +97,7 @@ class _Run:
         if self.recipe.camera is not None:
             weights = find_weights(self.recipe.camera)
             isp = DictionaryISP.from_pretrained(weights)
-            isp.info["key"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            isp.info["key"] = sha256(weights)
             return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
         settings = {**asdict(self.recipe.isp), "seed": seed}
@@ -146,7 +145,7 @@ class _Run:
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
-        digest = hashlib.sha256((place / "denoiser.safetensors").read_bytes()).hexdigest()
+        digest = sha256(place / "denoiser.safetensors")
         key = fingerprint(digest, self.data.test, stamps(self.test))
         path = place / "evaluation.json"
         if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
@@ -230,11 +229,6 @@ def _identities(pairs: Sequence[Pair]) -> set[str]:
     return {pair.name for pair in pairs}
 
 
-def fingerprint(*settings: Any) -> str:
-    """A fingerprint of settings: equal if and only if the stage would do the same."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
 def _discard_other_checkpoint(place: Path, key: str) -> None:
     """A checkpoint of other settings cannot be gone on from."""
     place.mkdir(parents=True, exist_ok=True)
@@ -259,8 +253,6 @@ def stamps(pairs: Sequence[Pair]) -> list[str]:
 
 
 def _sampled(pair: Pair) -> str:
-    digest = hashlib.sha256(repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode())
-    for image in (pair.srgb, pair.raw, pair.noisy):
-        if image is not None:
-            digest.update(image.flatten()[::4099].contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
+    images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
+    return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]

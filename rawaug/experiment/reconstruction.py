@@ -22,9 +22,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pair import Pair
-from rawaug.evaluation.scores import frozen_sample, write_json
+from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread
-from rawaug.experiment.denoising import fingerprint
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.methods import (
     FAMILIES,
@@ -35,6 +34,7 @@ from rawaug.experiment.methods import (
     mosaic_only_psnr,
     score_rows,
 )
+from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model

@@ -19,6 +19,7 @@ import torch
 
 from rawaug._version import __version__
 from rawaug.bayer import CFA
+from rawaug.files import replacing
 from rawaug.io.carried_tags import CarriedTags, Entry, Tag, append_directory, read_carried_tags
 from rawaug.io.gain_map import opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
@@ -69,12 +70,11 @@ def write_dng(
     own = _camera(frame) if _DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
     tags = own | carried.tags | _tags_of_the_pixels(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
-    partial = path.with_name(f"{path.name}.partial")
-    with damage_told(Path(source)) if source is not None else nullcontext():
-        _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
-    for name, entries in directories.items():
-        append_directory(partial, name, entries)
-    partial.replace(path)
+    with replacing(path) as partial:
+        with damage_told(Path(source)) if source is not None else nullcontext():
+            _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
+        for name, entries in directories.items():
+            append_directory(partial, name, entries)
 
 
 def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]) -> None:

@@ -14,20 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.files import find_weights, read_tensors, write_tensors
 from rawaug.isp import conditioning, stages
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
 from rawaug.isp.dictionary import ColourDictionary, GainDictionary
 from rawaug.isp.encoder import Encoder, thumbnail
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.seeding import initialised_from
-
-WEIGHTS_DIR = Path(__file__).parents[1] / "weights"
 
 
 class DirectionNetworks(nn.Module):
@@ -236,13 +233,9 @@ class DictionaryISP(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write weights, configuration and ``info`` to one safetensors file, atomically."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         header = {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(self.config))}
         header["info"] = json.dumps(self.info)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_bytes(save({key: value.contiguous() for key, value in self.state_dict().items()}, header))
-        partial.replace(path)
+        write_tensors(self.state_dict(), header, path)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> DictionaryISP:
@@ -253,12 +246,7 @@ class DictionaryISP(nn.Module):
             ValueError: if the file is not that of an ISP.
         """
         path = find_weights(name)
-        try:
-            with safe_open(str(path), framework="pt") as file:
-                header = file.metadata() or {}
-                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        except SafetensorError as error:
-            raise ValueError(f"{path}: not a readable safetensors file ({error}); fit or copy it again") from error
+        header, state = read_tensors(path, "fit or copy it again")
         if header.get("kind") != "isp":
             raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
@@ -277,16 +265,3 @@ class DictionaryISP(nn.Module):
         isp.load_state_dict(state)
         isp.info = info
         return isp.eval()
-
-
-def find_weights(name: str | Path) -> Path:
-    """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package.
-
-    Raises:
-        FileNotFoundError: naming the shipped ones.
-    """
-    path = Path(name) if Path(name).suffix else WEIGHTS_DIR / f"{name}.safetensors"
-    if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in WEIGHTS_DIR.glob("*.safetensors")))
-        raise FileNotFoundError(f"{name}: no such weights; give a .safetensors file or a shipped ISP ({shipped})")
-    return path

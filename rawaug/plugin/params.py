@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
+from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.setting import ISPParams
 
 _KIND = "augment_params"
@@ -76,12 +75,8 @@ class RawPair(NamedTuple):
 
 def save_params(params: AugmentParams, path: str | Path) -> None:
     """Write parameters to a safetensors file, atomically."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {name: value.detach().cpu().contiguous() for name, value in params.tensors().items()}
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(tensors, {"format": "rawaug", "kind": _KIND}))
-    partial.replace(path)
+    tensors = {name: value.detach().cpu() for name, value in params.tensors().items()}
+    write_tensors(tensors, {"format": "rawaug", "kind": _KIND}, path)
 
 
 def load_params(path: str | Path) -> AugmentParams:
@@ -93,12 +88,8 @@ def load_params(path: str | Path) -> AugmentParams:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file of parameters")
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            kind = (file.metadata() or {}).get("kind", "no rawaug parameters")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except SafetensorError as error:
-        raise ValueError(f"{path}: not a readable safetensors file ({error}); save the parameters again") from error
+    header, tensors = read_tensors(path, "save the parameters again")
+    kind = header.get("kind", "no rawaug parameters")
     if kind != _KIND:
         raise ValueError(f"{path}: holds {kind}, not the parameters of an augmentation")
     try:

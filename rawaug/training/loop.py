@@ -24,6 +24,7 @@ from tqdm.auto import tqdm
 import denoisers
 from denoisers.network import Denoiser
 from rawaug.data.sample import Sample
+from rawaug.files import replacing
 from rawaug.metrics import psnr
 from rawaug.seeding import derived_seed
 from rawaug.training.criteria import LOSSES, weighed
@@ -169,9 +170,8 @@ def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, sched
 
 def write_atomically(state: dict[str, Any], path: Path) -> None:
     """A checkpoint is there whole or not at all: a kill leaves the one before."""
-    partial = path.with_name(path.name + ".partial")
-    torch.save(state, partial)
-    partial.replace(path)
+    with replacing(path) as partial:
+        torch.save(state, partial)
 
 
 class Journal:

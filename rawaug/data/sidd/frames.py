@@ -38,7 +38,7 @@ class SiddFrames(LazyPairs):
     """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set too where it lies there.
 
     Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
-    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is develop_mosaic as the dataset's makers did.
+    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is developed as the dataset's makers did.
 
     Args:
         path: contains the folders of the scene instances, at any depth. Those of validation and benchmark are left out.

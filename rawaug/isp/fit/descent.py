@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from rawaug.files import read_tensors, write_tensors
 from rawaug.seeding import keyed_generator
 
 SAVE_SECONDS = 10.0
@@ -129,21 +128,14 @@ class Descent:
             for moment, value in moments.get(index, {}).items():
                 self._tensors[f"{stage}/{name}/{moment}"] = value.clone()
         header = {"key": self.key, "steps": json.dumps(self._steps), "watched": json.dumps(self.watched)}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        partial = self.path.with_name(self.path.name + ".new")
-        partial.write_bytes(save({name: value.contiguous() for name, value in self._tensors.items()}, header))
-        partial.replace(self.path)
+        write_tensors(self._tensors, header, self.path)
 
     def _load(self, path: Path) -> None:
-        try:
-            with safe_open(str(path), framework="pt") as file:
-                header = file.metadata() or {}
-                if header.get("key") == self.key:
-                    self._steps = json.loads(header["steps"])
-                    self.watched = {k: Watched(*values) for k, values in json.loads(header["watched"]).items()}
-                    self._tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        except SafetensorError as error:
-            raise ValueError(f"{path}: the state of a stopped fit cannot be read ({error}); delete it") from error
+        header, tensors = read_tensors(path, "delete this state of a stopped fit")
+        if header.get("key") == self.key:
+            self._steps = json.loads(header["steps"])
+            self.watched = {k: Watched(*values) for k, values in json.loads(header["watched"]).items()}
+            self._tensors = tensors
 
     @torch.no_grad()
     def _restore(self, stage: str, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> int:

@@ -16,7 +16,6 @@ makes it hold up with a handful of frames (``docs/fit.md``).
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from rawaug._version import __version__
+from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import SMALL, ISPConfig
 from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
@@ -92,11 +92,9 @@ def _path(state: str | Path | None) -> Path | None:
 
 def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[Shot]) -> str:
     """What a kept state belongs to: the version, the settings, the very pixels and what the files say of them."""
-    told = [(shot.name, shot.camera, shot.white_balance) for shot in shots]
-    digest = hashlib.sha256(repr((__version__, config, told)).encode())
-    digest.update(samples.srgb.numpy().tobytes())
-    digest.update(samples.target.numpy().tobytes())
-    return digest.hexdigest()
+    known = [(shot.name, shot.camera, shot.white_balance) for shot in shots]
+    settings = repr((__version__, config, known)).encode()
+    return digest(settings, samples.srgb.numpy().tobytes(), samples.target.numpy().tobytes())
 
 
 def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:

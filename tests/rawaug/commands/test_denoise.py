@@ -78,7 +78,7 @@ def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
 def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
     source = shot(tmp_path / "a.dng", bayer_dng, orientation=6)
     result = denoise_file(source, tmp_path / "out" / "b.dng", identity)
-    assert (result.shot_var, result.read_var, result.told_by) == (*LEVELS, "profile") and result.below_zero == 0
+    assert (result.shot_var, result.read_var, result.noise_source) == (*LEVELS, "profile") and result.below_zero == 0
     before, after = read_raw(source), read_raw(tmp_path / "out" / "b.dng")
     assert torch.equal(before.mosaic, after.mosaic)
     for key in ("cfa", "black", "white", "white_balance", "camera", "orientation", "iso", "daylight"):
@@ -129,8 +129,8 @@ def test_levels_are_estimated_without_a_profile() -> None:
     frame = RawFrame(
         noisy.clamp(max=1), CFA.RGGB, (64.0,) * 4, 1023.0, (1.0,) * 3, (1.0,) * 3, torch.eye(3), "x", None, None, 0, "a"
     )
-    shot_var, read_var, told_by = levels_of(frame)
-    assert told_by == "estimate" and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
+    shot_var, read_var, noise_source = levels_of(frame)
+    assert noise_source == "estimate" and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
 
 
 def test_folders_are_resumed(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
@@ -144,7 +144,7 @@ def test_folders_are_resumed(tmp_path: Path, bayer_dng: Dng, identity: Path) -> 
     assert len(first.broken) == 1 and "broken.nef" in next(iter(first.broken.values()))
     (out / "sub/a.dng").unlink()
     second = denoise_folder(source, out, identity)
-    assert (len(second.files), second.there) == (1, 1)
+    assert (len(second.files), second.existing) == (1, 1)
     with pytest.raises(ValueError, match=r"denoise\.json: made with noise auto, not estimate"):
         denoise_folder(source, out, identity, noise="estimate")
     with pytest.raises(ValueError, match="choose a folder outside"):

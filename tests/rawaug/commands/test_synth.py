@@ -42,7 +42,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("format", ["dng", "npz", "tiff"])
 def test_every_format_replays_bit_for_bit(tmp_path: Path, pictures: Path, format: str) -> None:
     result = synth(pictures, tmp_path, format=format, per_image=2, workers=0)  # type: ignore[arg-type]
-    assert (result.pictures, result.made, result.there) == (5, 8, 0)
+    assert (result.pictures, result.made, result.existing) == (5, 8, 0)
     assert list(result.broken) == ["broken.jpg"] and "broken.jpg" in result.broken["broken.jpg"]
     stems = sorted(str(file.relative_to(tmp_path).with_suffix("")) for file in tmp_path.rglob("*.safetensors"))
     assert stems == [f"{stem}_{k}" for stem in ("a_jpg", "a_png", "c", "sub/b") for k in (0, 1)]
@@ -73,7 +73,7 @@ def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -
         file.unlink()
     (parts / "c_1_clean.dng.partial").write_bytes(b"a run that was killed here")
     again = synth(pictures, parts, per_image=2, workers=0)
-    assert (again.made, again.there) == (5, 3)
+    assert (again.made, again.existing) == (5, 3)
     assert contents(parts) == contents(whole)
     assert synth(pictures, parts, per_image=2, workers=0).made == 0
     other = synth(pictures, tmp_path / "other", seed=1, workers=0).out

@@ -10,17 +10,17 @@ import pytest
 import torch
 
 import denoisers
+from rawaug.commands.evaluate import evaluate
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import (
     classical_method,
     compared,
-    evaluate,
     frozen_levels,
     frozen_sample,
     score_method,
-    write_json,
 )
 from rawaug.evaluation.tables import print_scores
+from rawaug.files import write_json
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -81,7 +81,7 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
 
 
 def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.evaluation.scores.open_pairs", lambda data, split: demo_pairs("test", count=2))
+    monkeypatch.setattr("rawaug.commands.evaluate.open_pairs", lambda data, split: demo_pairs("test", count=2))
     result = evaluate(identity, "demo:test", classical=["Wavelet", "TotalVariation"])
     for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
         scores = result["classical"][name]

@@ -1,0 +1,158 @@
+"""The house: CONTRIBUTING.md lists its files, no name stands twice, arrows between rooms point one way, no circles."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for file in (ROOT / part).rglob("*.py"))
+OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
+"""Re-exports for one release: the only files whose name may stand twice."""
+
+BASE = {"bayer", "files", "metrics", "seeding", "_version"}
+CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
+MAY_IMPORT: dict[str, set[str]] = {
+    "_version": set(),
+    "bayer": {"seeding"},
+    "files": set(),
+    "metrics": set(),
+    "seeding": set(),
+    "denoisers": {"bayer"},
+    "kernels": {"bayer"},
+    "noise": BASE | {"kernels"},
+    "isp": BASE | {"kernels", "denoisers"},
+    "io": BASE,
+    "data": BASE | {"io"},
+    "plugin": CAMERA,
+    "evaluation": CAMERA | {"plugin", "data", "io"},
+    "training": CAMERA | {"plugin", "data", "io"},
+    "commands": CAMERA | {"plugin", "data", "io", "evaluation", "training"},
+    "experiment": CAMERA | {"plugin", "data", "io", "evaluation", "training", "commands"},
+    "cli": BASE | {"commands", "experiment"},
+}
+
+
+def module_of(file: Path) -> str:
+    parts = file.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(file): file for file in FILES}
+
+
+def room_of(module: str) -> str:
+    first, *rest = module.split(".")
+    return rest[0] if first == "rawaug" and rest else first
+
+
+def imported(file: Path) -> Iterator[str]:
+    """The modules of the project that a file imports, in functions and for type checkers too."""
+    for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"{file}: relative imports are not used"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            assert all(alias.name != "*" for alias in node.names), f"{file}: star imports are not used"
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "import_module":
+            names = [str(arg.value) for arg in node.args if isinstance(arg, ast.Constant)]
+        else:
+            continue
+        for name in names:
+            if name in MODULES:
+                yield name
+            elif name.rpartition(".")[0] in MODULES:
+                yield name.rpartition(".")[0]
+
+
+IMPORTS = {module: set(imported(file)) - {module} for module, file in MODULES.items() if file not in OLD_PATHS}
+LAZY = {"rawaug", "denoisers"}
+"""Their names load on first use."""
+
+
+def test_the_tree_lists_every_file_and_no_other() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (tree,) = re.findall(r"```text\n(rawaug/.*?)```", text, flags=re.DOTALL)
+    listed: list[Path] = []
+    folders: list[str] = []
+    for line in tree.splitlines():
+        match = re.fullmatch(r"( *)(\S+) +\S.*", line)
+        assert match, f"a line of the tree names a file or folder and says what it is: {line!r}"
+        indent, name = match.groups()
+        folders = folders[: len(indent) // 2]
+        if name.endswith("/"):
+            folders.append(name.rstrip("/"))
+        else:
+            listed.append(Path(*folders, name))
+    assert sorted(listed) == FILES
+    assert len(set(listed)) == len(listed)
+
+
+def test_no_file_name_stands_twice() -> None:
+    names = Counter(file.name for file in FILES if file.name != "__init__.py" and file not in OLD_PATHS)
+    assert [name for name, count in names.items() if count > 1] == []
+    assert not {"utils.py", "common.py"} & names.keys()
+
+
+@pytest.mark.parametrize("module", sorted(IMPORTS.keys() - LAZY))
+def test_arrows_point_one_way(module: str) -> None:
+    room = room_of(module)
+    wrong = {other for other in IMPORTS[module] - {"rawaug"} if room_of(other) not in MAY_IMPORT[room] | {room}}
+    assert not wrong, f"{module} may not import {', '.join(sorted(wrong))}"
+
+
+def test_no_circles() -> None:
+    graph = {module: others - LAZY for module, others in IMPORTS.items() if module not in LAZY}
+    list(TopologicalSorter(graph).static_order())  # CycleError names the circle
+    rooms: dict[str, set[str]] = {}
+    for module, others in graph.items():
+        rooms.setdefault(room_of(module), set()).update(room_of(other) for other in others)
+    list(TopologicalSorter({room: others - {room} for room, others in rooms.items()}).static_order())
+
+
+@pytest.mark.parametrize(
+    ("code", "allowed"),
+    [
+        ("import rawaug", set()),
+        ("import denoisers", set()),
+        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer"}),
+        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise"}),
+        ("from rawaug import DictionaryISP", {"bayer", "seeding", "files", "isp", "kernels"}),
+    ],
+)
+def test_importing_one_part_loads_no_other(code: str, allowed: set[str]) -> None:
+    script = f"import sys; {code}; print(*(m for m in sys.modules if m.split('.')[0] in ('rawaug', 'denoisers')))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert {room_of(module) for module in done.stdout.split()} - LAZY <= allowed | {"_version"}
+
+
+@pytest.mark.parametrize("package", sorted(LAZY))
+def test_every_public_name_can_be_had(package: str) -> None:
+    module = __import__(package)
+    assert set(module.__all__) <= set(dir(module))
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match="no_such_name"):
+        module.no_such_name  # noqa: B018
+
+
+def test_old_import_paths_give_the_same_objects() -> None:
+    import rawaug
+    import rawaug.augment
+    import rawaug.loader
+    import rawaug.pairs
+    import rawaug.params
+
+    assert rawaug.augment.RawAugment is rawaug.RawAugment
+    assert rawaug.pairs.RawPairs is rawaug.RawPairs
+    assert rawaug.loader.wrap is rawaug.wrap
+    assert rawaug.params.RawPair is rawaug.RawPair
