@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 LEAST_SHOT = 3e-4
-"""Least shot_var of the transforms, white at 3,300 photons: the input of a network needs a bound, and white at ISO 100 is
-400 times its noise."""
+"""Least shot_var of the transforms, white at 3,300 photons: inputs need a bound, and white at ISO 100 is 400
+times its noise."""
 _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
@@ -124,6 +124,6 @@ def _bounded(shot: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def relative_deviation(y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-    """The noise's deviation over what a transform takes it for, in [0, 1]: below 1 where shot_var is below its bound."""
+    """The noise's deviation over what a transform takes it for: below 1 where shot_var is below its bound."""
     shot, read = _bounded(shot, read)
     return (variance / (shot * y.clamp_min(0.0) + read).clamp_min(1e-20)).sqrt().clamp_max(1.0)

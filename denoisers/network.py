@@ -37,7 +37,7 @@ def conv(
     groups: int = 1,
     padding: int | None = None,
 ) -> nn.Conv2d:
-    """A convolution that keeps the size (or divides it by ``stride``); :meth:`Denoiser.initialise` draws its weights."""
+    """A convolution that keeps the size, or divides it by ``stride``; :meth:`Denoiser.initialise` draws its weights."""
     settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
     return nn.utils.skip_init(
         nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings

@@ -9,8 +9,8 @@ mixed           the mean of both, the linear one divided by the noise's mean dev
 ==============  ====================================================================================================
 
 with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, both
-being near a square root. The minimum of l1 is the median, which a curve does not move; that of l2 is the mean, and in the
-stabilised domain it is not the mean of the RAW.
+being near a square root. The minimum of l1 is the median, which a curve does not move; that of l2 is the mean, and in
+the stabilised domain it is not the mean of the RAW.
 """
 
 from __future__ import annotations
