@@ -23,6 +23,8 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
+from rawaug.kernels.raw_torch import through_curves
+
 STEPS = 8
 """Entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
@@ -58,17 +60,7 @@ def tone_tables(names: Sequence[str] | None = None) -> Tensor:
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Pictures ``(B, C, H, W)``, uint8 or float in [0, 1], through one table ``(B, 2041)`` each; float32."""
-    if srgb.dtype == torch.uint8:
-        return _take(tables[:, ::STEPS], srgb.int())
-    position = srgb.clamp(0.0, 1.0) * (NODES - 1)
-    left = position.int().clamp_max(NODES - 2)
-    low, high = _take(tables, left), _take(tables, left + 1)
-    return torch.lerp(low, high, position - left)
-
-
-def _take(tables: Tensor, index: Tensor) -> Tensor:
-    taken = [table.index_select(0, own.flatten()) for table, own in zip(tables, index, strict=True)]
-    return torch.stack(taken).reshape(index.shape)
+    return through_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
 
 
 @cache
