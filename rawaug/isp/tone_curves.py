@@ -20,7 +20,6 @@ from importlib import resources
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from rawaug.kernels.raw_torch import through_curves
@@ -80,6 +79,8 @@ def _inverse_smoothstep(code: Tensor) -> Tensor:
 
 def _through(points: Sequence[Sequence[float]]) -> Callable[[np.ndarray], np.ndarray]:
     """The monotone cubic through ``points`` (camera, display), from black: a measured one may start at an offset."""
+    from scipy.interpolate import PchipInterpolator  # slow to import, and needed by nothing else
+
     light, display = np.array(points).T
     display[0] = 0.0
     curve: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(light, display)
