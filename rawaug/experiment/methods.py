@@ -25,7 +25,7 @@ from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
-from rawaug.isp.stages import as_float
+from rawaug.isp.stages import as_float, placed
 from rawaug.metrics import PATCH, psnr
 from rawaug.seeding import keyed_generator
 
@@ -61,21 +61,13 @@ def fit_family(
     start = time.perf_counter()
     if family.startswith("dictionary"):
         isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
-        return Fitted(isp, time.perf_counter() - start, _in_use(isp))
+        return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
     method = BASELINES[family]
     start_of: dict[str, Any] = {"seed": seed} if issubclass(method, CropTrainedISP) else {}
     model = method(cfa=pairs[0].cfa, **start_of)
     seconds, crop, batch = budget
     fit_baseline(model, pairs, seconds, crop=crop, batch=batch, seed=seed)
     return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
-
-
-def _in_use(isp: DictionaryISP) -> int:
-    """Parameters that the reverse pass uses: encoders count where they look at the picture."""
-    parts = {name: p for name, p in isp.named_parameters() if not name.startswith("forward_networks")}
-    if not isp.encoders_in_use:
-        parts = {name: p for name, p in parts.items() if "_encoder.layers" not in name}
-    return sum(p.numel() for p in parts.values())
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
@@ -131,7 +123,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in (height, width))
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return conditioning.with_raw_samples(isp, x, blind, readings, isp.place(x))
+    return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
 
 
 @torch.enable_grad()
