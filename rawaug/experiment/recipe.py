@@ -43,11 +43,11 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`; or published, cameras, lights and tone
-            curves from the tables of the package, see :mod:`rawaug.isp.camera_sampling`.
-        zoom: of published: pictures are enlarged up to this factor, half of the time; 1 for none.
+        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
+            :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
-        exposure: lowest and highest exposure of the RAW in stops.
+        exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
             :mod:`rawaug.training.estimators`.
         alpha: of noisier and r2r: strength of the extra noise.
@@ -56,10 +56,10 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen", "published"] = "convex"
+    sampling: Literal["convex", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
-    exposure: tuple[float, float] = (0.0, 0.0)
+    exposure: tuple[float, float] | None = None
     estimator: Literal["supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"] = "supervised"
     alpha: float = 1.0
     correct: bool = False

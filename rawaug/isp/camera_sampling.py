@@ -1,7 +1,7 @@
 r"""Camera-consistent sampling: one draw is a camera in a light, not a colour matrix and gains on their own.
 
-.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L), \quad (C, M) = D_{cam} w,
-    \quad T = \textstyle\sum_k v_k T_k
+.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
+    \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
 
 with h Brooks' highlight-preserving inverse gains (:func:`rawaug.isp.stages.inverse_gains`), a mixture w of a few camera
 atoms (:class:`rawaug.isp.dictionary.CameraDictionary`), a light L (:mod:`rawaug.isp.light`), a mixture v of a few
@@ -14,10 +14,14 @@ hull; therefore few are mixed at a time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from rawaug.isp.cameras import white_balance
+from rawaug.camera_names import spelled
+from rawaug.isp.cameras import published_cameras, white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
 from rawaug.isp.light import COLDEST, LAMP_SHARE, WARMEST, sample_lights
 from rawaug.isp.model import DictionaryISP
@@ -63,16 +67,18 @@ class CameraSampler:
 
     @torch.no_grad()
     def sample(self, batch: int, generator: torch.Generator) -> ISPParams:
-        """Settings of ``batch`` pictures, from a generator on the CPU; no weights of gains, which follow from the light.
+        """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light.
 
         Raises:
             ValueError: if no light gives a camera plausible gains.
         """
         weights, balance = self._cameras_in_light(batch, generator)
         matrix = self.cameras.combine(weights)
-        tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(matrix) if self.tone_atoms else None
         gains = (balance / balance.amin(dim=1, keepdim=True)).to(matrix)
-        return ISPParams(weights, gains[:, :0], matrix, gains, gains[:, :0] if tones is None else tones)
+        tones = none = gains[:, :0]
+        if self.tone_atoms:
+            tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(matrix)
+        return ISPParams(weights, none, matrix, gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Weights ``(B, N)`` and balances ``(B, 3)``; draws with gains beyond what is plausible are drawn again."""
@@ -95,3 +101,33 @@ def plausible(balance: Tensor) -> Tensor:
     """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
     low, high = PLAUSIBLE_GAINS
     return ((balance >= low) & (balance <= high)).all(dim=1)
+
+
+@torch.no_grad()
+def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
+    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones.
+
+    Raises:
+        ValueError: if one is not listed, or the ISP's atoms are no cameras.
+
+    Example:
+        >>> universal = DictionaryISP.from_pretrained("universal")
+        >>> len(of_cameras(universal, "Nikon D750").colour.atoms())
+        1
+    """
+    if not isinstance(isp.colour, CameraDictionary):
+        raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
+    listed = published_cameras()
+    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
+    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), encoders=False))
+    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
+    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
+    narrowed.load_state_dict(kept | own)
+    assert isinstance(narrowed.colour, CameraDictionary)
+    narrowed.colour.set_cameras(listed.named(known))
+    narrowed.info = {**isp.info, "cameras": known}
+    return narrowed.to(isp.colour.matrices.device).eval()
+
+
+def _of_colour(key: str) -> bool:
+    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)

@@ -71,7 +71,7 @@ class ColourDictionary(nn.Module):
 
 
 class CameraDictionary(ColourDictionary):
-    """N cameras: matrices from sRGB to white-balanced camera RGB whose rows sum to 1, and each one's white balance in D65.
+    """N cameras: matrices from sRGB to white-balanced camera RGB, rows of sum 1, and the white balance of each in D65.
 
     Matrix and balance together are the matrix from XYZ, so that the gains of a mixture follow from any light:
 

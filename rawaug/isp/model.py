@@ -24,13 +24,13 @@ from rawaug.isp import (
     stages,
 )
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import ColourDictionary, GainDictionary
+from rawaug.isp.curve_stage import ToneCurve
+from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, ToneDictionary
 from rawaug.isp.encoder import Encoder, Encoders, thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.stage import Stage, stage_class
 from rawaug.seeding import derived_seed, initialised_from
-
 
 S = TypeVar("S", bound=Stage)
 
@@ -54,7 +54,7 @@ class DictionaryISP(nn.Module):
         self._config = config or ISPConfig()
         self.info: dict[str, Any] = {}
         with initialised_from(seed):
-            self.colour = ColourDictionary(self.config.colour_atoms)
+            self.colour = (CameraDictionary if self.config.cameras else ColourDictionary)(self.config.colour_atoms)
             self.gain = GainDictionary(self.config.gain_atoms)
             made = [stage_class(name)(self.config) for name in self.config.stages]
             self.stages = nn.ModuleDict({stage.name: stage for stage in made})
@@ -123,10 +123,24 @@ class DictionaryISP(nn.Module):
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
-    def params_from_weights(self, colour_weights: Tensor, gain_weights: Tensor) -> ISPParams:
-        """Parameters from given weights ``(B, N)`` and ``(B, M)``."""
+    def params_from_weights(
+        self, colour_weights: Tensor, gain_weights: Tensor, tone_weights: Tensor | None = None
+    ) -> ISPParams:
+        """Parameters from given weights ``(B, N)``, ``(B, M)`` and ``(B, K)``; of the typical tone by default."""
         matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
-        return ISPParams(colour_weights, gain_weights, matrix, gains)
+        if tone_weights is None:
+            tone_weights = self.typical_tones().expand(len(matrix), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
+
+    @property
+    def tone(self) -> ToneDictionary | None:
+        """The dictionary of tone curves; None where the curve is learned."""
+        stage = self.find(ToneCurve)
+        return stage.dictionary if stage else None
+
+    def typical_tones(self) -> Tensor:
+        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
+        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""

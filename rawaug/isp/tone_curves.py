@@ -62,6 +62,15 @@ def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     return through_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
 
 
+def to_code(linear: Tensor, tables: Tensor) -> Tensor:
+    """The way back: linear light ``(B, C, H, W)``, held to [0, 1], to sRGB codes in [0, 1], float32."""
+    light = linear.clamp(0.0, 1.0).flatten(1).to(tables)
+    right = torch.searchsorted(tables, light).clamp(1, NODES - 1)
+    low, high = tables.gather(1, right - 1), tables.gather(1, right)
+    share = ((light - low) / (high - low).clamp_min(1e-12)).clamp(0.0, 1.0)
+    return ((right - 1 + share) / (NODES - 1)).reshape(linear.shape)
+
+
 @cache
 def _tables() -> dict[str, Tensor]:
     code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)

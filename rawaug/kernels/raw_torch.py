@@ -52,18 +52,20 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
     """One row of :attr:`Camera.frame`.
 
     Args:
-        place: top, left, height, width of the full frame, and the view in which the crop was turned (none if left out).
+        place: top, left, height, width of the full frame, the view in which the crop was turned, and the side of the
+            square that was enlarged to it (neither if left out).
         height, width: of the picture as it is, turned.
         centre: y and x of the mask's centre in the coordinates of :func:`rawaug.isp.stages.place_in_frame`.
     """
-    top, left, frame_height, frame_width, view = (*place, 0)[:5]
+    top, left, frame_height, frame_width, view, side = (*place, 0, 0)[:6]
+    step = side / height if side else 1.0
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
 
     def position(i: int, j: int) -> tuple[float, float]:
         i, j = height - 1 - i if view & 2 else i, width - 1 - j if view & 1 else j
         row, column = (j, i) if view & 4 else (i, j)
-        y = (row + top + 0.5 - frame_height / 2) / half_diagonal - centre[0]
-        return y, (column + left + 0.5 - frame_width / 2) / half_diagonal - centre[1]
+        y = ((row + 0.5) * step + top - frame_height / 2) / half_diagonal - centre[0]
+        return y, ((column + 0.5) * step + left - frame_width / 2) / half_diagonal - centre[1]
 
     (y, x), down, right = position(0, 0), position(1, 0), position(0, 1)
     return [y, x, down[0] - y, down[1] - x, right[0] - y, right[1] - x]

@@ -1,6 +1,7 @@
 r"""Online augmentation: sRGB pictures in, noisy/clean RAW pairs out.
 
-``y = isp^-1(x; C, g)`` with the camera setting (C, g) drawn from the hull of the dictionaries' atoms, then
+``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
+atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.camera_sampling`), then
 ``noisy ~ N(y, shot_var y + read_var)``, clipped at white, never at black (Conde et al., AAAI 2022, "Dictionary
 Augmentations").
 
@@ -19,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from rawaug.isp.camera_sampling import EXPOSURE, CameraSampler, of_cameras
 from rawaug.isp.dictionary import convex_weights, perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
@@ -38,14 +40,16 @@ class RawAugment(nn.Module):
         isp: the fitted camera; is put in eval mode, without gradients.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
-        sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
-            ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
+        sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
+            ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
+            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
+            ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction on: what
             is to go on where it stopped passes a generator, or takes RawPairs or wrap.
-        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly; ``(0, 0)`` is that of the
-            camera which the ISP knows. Cameras differ in the headroom that they leave above their JPEG's white: for
-            training that is to serve others, (-1.5, 0).
+        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. By default that of the
+            camera which the ISP knows, ``(0, 0)``, or ``(-1, 0.2)`` if its cameras are published ones, whose headroom
+            above their pictures' white is not. For a fitted camera that is to serve others, (-1.5, 0).
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -63,17 +67,20 @@ class RawAugment(nn.Module):
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
-        exposure: tuple[float, float] = (0.0, 0.0),
+        exposure: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
             raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
         if not strength >= 0:
             raise ValueError(f"strength is a standard deviation, at least 0, got {strength}")
+        if exposure is None:
+            exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
         self.isp = isp.eval().requires_grad_(False)
         self.baked = reverse_pass(self.isp)
+        self.sampler = CameraSampler(self.isp) if isp.config.cameras else None
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
@@ -82,9 +89,28 @@ class RawAugment(nn.Module):
         self._calls = 0
 
     @classmethod
-    def from_pretrained(cls, isp: str | Path | DictionaryISP, **settings: Any) -> RawAugment:
-        """From the name of a shipped ISP, a path, or an ISP; ``settings`` as in the constructor."""
-        return cls(isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp), **settings)
+    def from_pretrained(
+        cls, isp: str | Path | DictionaryISP, camera: str | Sequence[str] | None = None, **settings: Any
+    ) -> RawAugment:
+        """From the name of a shipped ISP, a path, or an ISP.
+
+        Args:
+            isp: the name, path or ISP.
+            camera: maker and model of a published camera, or several, in place of the ISP's colour atoms; for an ISP of
+                published cameras, such as ``universal``.
+            settings: as in the constructor.
+
+        Raises:
+            FileNotFoundError: if there is no such ISP.
+            ValueError: if a camera is not listed, or the ISP was fitted to frames.
+
+        Example:
+            >>> augment = RawAugment.from_pretrained("universal", camera="Nikon D750")
+            >>> augment.isp.info["cameras"]
+            ['Nikon D750']
+        """
+        loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
+        return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
@@ -107,16 +133,17 @@ class RawAugment(nn.Module):
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         config, device = self.isp.config, srgb.device
         if self.sampling == "convex":
-            colour, gain = (
-                convex_weights(len(srgb), n, generator).to(device) for n in (config.colour_atoms, config.gain_atoms)
-            )
+            if self.sampler is not None:
+                return self.sampler.sample(len(srgb), generator)
+            atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
+            drawn = [convex_weights(len(srgb), n, generator).to(device) for n in atoms]
         else:
             chosen = self.baked.choose(srgb)
             if self.sampling == "chosen":
                 return chosen
-            colour = perturb(chosen.colour_weights, self.strength, generator)
-            gain = perturb(chosen.gain_weights, self.strength, generator)
-        return self.isp.params_from_weights(colour, gain)
+            weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
+            drawn = [perturb(w, self.strength, generator) for w in weights]
+        return self.isp.params_from_weights(*drawn)
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""

@@ -7,14 +7,17 @@ any start method, any batch size, and after a resume in the middle of an epoch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sized
 from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
+from rawaug.kernels.threads import one_thread
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_tensor
@@ -32,9 +35,12 @@ class RawPairs(Dataset[Any]):
         seed: of all draws.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
         turns: whether to draw flips and quarter turns; whole pictures are only flipped.
+        zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
+            scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
-        ValueError: if the crop is odd, or, on access, if a picture is smaller than the crop or none.
+        ValueError: if the crop is odd, the zoom less than 1 or without a crop, or, on access, if a picture is smaller
+            than the crop or none.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -56,9 +62,12 @@ class RawPairs(Dataset[Any]):
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
+        zoom: float = 1.0,
     ) -> None:
+        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
+            raise ValueError(f"zoom is at least 1, and more than 1 needs a crop; got {zoom} with crop={crop}")
         self.dataset, self.augment, self.crop, self.seed, self.key = dataset, augment, crop, seed, key
-        self.turns = turns
+        self.turns, self.zoom = turns, zoom
         if crop is not None:
             bayer.RandomCrop(int(crop))  # an odd one is told here, not in a worker
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # persistent workers see it change
@@ -98,7 +107,7 @@ class RawPairs(Dataset[Any]):
         where = find_picture(sample, self.key)
         try:
             picture = even_sided(to_rgb_tensor(picked(sample, where)))
-            place = random_place(picture, self.crop, self.turns, generator)
+            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         patch = placed(picture, place, self.crop)[None]
@@ -119,7 +128,7 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         identity: name or index of the field that tells a sample from all others, such as ``"__key__"``; its draws are
             keyed by this.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
-        augment, crop, seed, key, turns: as for :class:`RawPairs`.
+        augment, crop, seed, key, turns, zoom: as for :class:`RawPairs`.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -138,8 +147,9 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         turns: bool = True,
         identity: str | int | None = None,
         divide: bool = False,
+        zoom: float = 1.0,
     ) -> None:
-        super().__init__(dataset, augment, crop, seed, key, turns)
+        super().__init__(dataset, augment, crop, seed, key, turns, zoom)
         self.identity, self.divide = identity, divide
 
     def __iter__(self) -> Iterator[Any]:
@@ -163,14 +173,22 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         return value if isinstance(value, int) else str(value)
 
 
-def random_place(picture: Tensor, crop: int | None, turns: bool, generator: torch.Generator) -> Tensor:
+def random_place(
+    picture: Tensor, crop: int | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+) -> Tensor:
     """Where a crop of ``(3, H, W)`` stands and how it is turned: ``(5,)`` top, left, height, width (H, W) and view.
+
+    With a zoom ``(6,)``: the last is the side of the square that is enlarged to the crop.
 
     Raises:
         ValueError: if the picture is smaller than the crop.
     """
     height, width = picture.shape[-2:]
     size = (crop, crop) if crop else (height, width)
+    if crop and zoom > 1.0:
+        share, drawn = torch.rand(2, generator=generator).tolist()
+        side = crop if share < 0.5 else math.ceil(crop / 2 * zoom**-drawn) * 2
+        return torch.cat([random_place(picture, side, turns, generator), torch.tensor([side])])
     corner = bayer.RandomCrop(size).sample(height, width, generator)
     turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=size[0] == size[1])
     view = turn.sample(generator) if turns else torch.tensor(0)
@@ -183,8 +201,19 @@ def placed(picture: Tensor, place: Tensor, crop: int | None) -> Tensor:
     Raises:
         ValueError: if the picture is not of the size that it was drawn for.
     """
-    top, left, height, width, view = place.tolist()
+    top, left, height, width, view, side = (*place.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the place is one in a picture of {height} x {width}, not {tuple(picture.shape[-2:])}")
-    patch = bayer.crop(picture, top, left, crop or height, crop or width)
+    patch = bayer.crop(picture, top, left, side or crop or height, side or crop or width)
+    if crop and side not in (0, crop):
+        patch = enlarged(patch, crop)
     return bayer.turn(patch, view).contiguous()
+
+
+def enlarged(patch: Tensor, side: int) -> Tensor:
+    """``(3, h, h)`` to ``(3, side, side)`` of the same type, bicubic."""
+    with one_thread():  # the same bits everywhere
+        larger = F.interpolate(patch[None].float(), size=(side, side), mode="bicubic", align_corners=False)[0]
+    if patch.dtype == torch.uint8:
+        return larger.round_().clamp_(0, 255).to(torch.uint8)
+    return larger.clamp_(0.0, 1.0).to(patch.dtype)

@@ -21,7 +21,8 @@ class AugmentParams(NamedTuple):
         isp: camera settings.
         noise: levels and seeds of the noise.
         place: ``(B, 5)`` top, left, height, width, view: where in which full frame the picture stands, and how it was
-            turned after the crop (see :func:`rawaug.bayer.turn`).
+            turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the side of the square that was
+            enlarged to the crop.
     """
 
     isp: ISPParams

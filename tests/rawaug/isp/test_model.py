@@ -106,7 +106,7 @@ def test_encoders_look_at_the_picture_only_when_enabled(srgb: torch.Tensor) -> N
 
 def test_what_is_off_is_neither_in_the_module_nor_in_the_file(tmp_path: Path) -> None:
     isp = DictionaryISP(ISPConfig(stages=("tone", "gamma", "colour", "gains"), attention=False))
-    assert not [name for name in isp.state_dict() if "layers" in name and "network" not in name or "shading" in name]
+    assert not [name for name in isp.state_dict() if ("layers" in name and "network" not in name) or "shading" in name]
     assert count(isp) < 6000
     isp.save(tmp_path / "camera.safetensors")
     assert (tmp_path / "camera.safetensors").stat().st_size < 40_000
