@@ -54,28 +54,5 @@ def _describe_isp(path: Path) -> str:
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
     lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
-    lines += [f"  {key}: {json.dumps(value)}" for key, value in {**model.config, **info}.items()]
-    return "\n".join(lines)
-
-
-def _millions(model: DictionaryISP | denoisers.Denoiser) -> str:
-    return f"{sum(p.numel() for p in model.parameters()) / 1e6:.3f}"
-
-
-def _describe_isp(path: Path) -> str:
-    isp = DictionaryISP.from_pretrained(path)
-    config = isp.config
-    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, makes {isp.cfa} RAW"]
-    lines.append(f"  stages: {' '.join(config.stages)} mosaic; encoders {'on' if config.encoders else 'off'}")
-    weights = isp.reverse_encoders.gain.prior.softmax(0)
-    lines.append("  gain atoms (digital, red, blue; constant weight):")
-    for atom, weight in zip(isp.gain.atoms().tolist(), weights.tolist(), strict=True):
-        lines.append("    " + "  ".join(f"{value:6.3f}" for value in atom) + f"   {weight:.3f}")
-    lines.append("  colour atoms (sRGB to camera, rows l1-normalised):")
-    for matrix in isp.colour.atoms().tolist():
-        lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
-    if "shading" in config.stages:
-        mean, precision = isp.shading.mean.tolist(), isp.shading.precision.flatten().tolist()
-        lines.append(f"  shading: mean {mean}, precision {[round(p, 3) for p in precision]}")
     lines += [f"  {key}: {json.dumps(value)}" for key, value in isp.info.items()]
     return "\n".join(lines)

@@ -31,7 +31,6 @@ from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.stage import Stage, stage_class
 from rawaug.seeding import derived_seed, initialised_from
 
-
 S = TypeVar("S", bound=Stage)
 
 
@@ -109,7 +108,7 @@ class DictionaryISP(nn.Module):
         return self.config.encoders
 
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
-        """Make encoders that look at the picture, drawn from ``seed``, or remove them; those there are stay as they are.
+        """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
 
         Without them the learned constants decide.
         """
