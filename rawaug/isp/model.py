@@ -24,9 +24,10 @@ from rawaug.isp import (
     stages,
 )
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import ColourDictionary, GainDictionary
+from rawaug.isp.dictionary import ColourDictionary, GainDictionary, convex_weights
 from rawaug.isp.encoder import Encoder, Encoders, thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.stage import Stage, stage_class
 from rawaug.seeding import derived_seed, initialised_from
@@ -34,7 +35,7 @@ from rawaug.seeding import derived_seed, initialised_from
 S = TypeVar("S", bound=Stage)
 
 
-class DictionaryISP(nn.Module):
+class DictionaryISP(ReverseISP):
     """A learned, interpretable camera.
 
     Args:
@@ -48,10 +49,11 @@ class DictionaryISP(nn.Module):
         torch.Size([2, 1, 64, 96])
     """
 
+    name = "dictionary"
+
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
         self._config = config or ISPConfig()
-        self.info: dict[str, Any] = {}
         with initialised_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
             self.gain = GainDictionary(self.config.gain_atoms)
@@ -229,6 +231,27 @@ class DictionaryISP(nn.Module):
             if seen is not None and stage.makes > 1:
                 seen[f"x{stage.makes - 1}"] = x
         return x
+
+    def make(self, srgb: Tensor, setting: ISPParams | None = None, place: Tensor | None = None) -> Tensor:
+        """The mosaic of :meth:`reverse`."""
+        return self.reverse(srgb, setting, place=place).raw
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        """The mosaic under settings uniform in the hull of the dictionaries, ``srgb`` taken for full frames."""
+        counts = (self.config.colour_atoms, self.config.gain_atoms)
+        colour, gain = (convex_weights(len(srgb), n, generator).to(srgb.device) for n in counts)
+        return self.make(srgb, self.params_from_weights(colour, gain))
+
+    def cycle(self, srgb: Tensor) -> Tensor:
+        """Through the mosaic, within [0, 1], and back."""
+        result = self.reverse(srgb)
+        return self.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
+
+    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor:
+        """What the stages alone lose."""
+        x = stages.as_float(srgb)
+        params = self.choose(x)
+        return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
 
     def linear(self, x: Tensor) -> Tensor:
         """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
