@@ -53,8 +53,6 @@ def _describe_isp(path: Path) -> str:
     lines.append("  colour atoms (sRGB to camera, rows l1-normalised):")
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
-    if "shading" in config.stages:
-        mean, precision = isp.shading.mean.tolist(), isp.shading.precision.flatten().tolist()
-        lines.append(f"  shading: mean {mean}, precision {[round(p, 3) for p in precision]}")
+    lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
     lines += [f"  {key}: {json.dumps(value)}" for key, value in isp.info.items()]
     return "\n".join(lines)

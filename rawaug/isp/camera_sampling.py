@@ -14,17 +14,12 @@ hull; therefore few are mixed at a time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
-from rawaug.camera_names import spelled
-from rawaug.isp.cameras import published_cameras, white_balance
+from rawaug.isp.cameras import white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
 from rawaug.isp.light import COLDEST, LAMP_SHARE, WARMEST, sample_lights
-from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
@@ -40,28 +35,28 @@ class CameraSampler:
     """Draws settings of an ISP whose colour atoms are published cameras.
 
     Args:
-        isp: the ISP.
+        cameras: the atoms of colour.
+        tone_atoms: number of tone curves; 0 where the tone is learned.
         cameras_mixed, tones_mixed: how many atoms are mixed in a draw, at most; drawn with replacement.
         kelvin: lowest and highest colour temperature of the light.
         lamps: share of fluorescent and LED lamps.
 
     Raises:
-        ValueError: if the ISP's atoms are no cameras, or fewer than one is to be mixed.
+        ValueError: if fewer than one is to be mixed.
     """
 
     def __init__(
         self,
-        isp: DictionaryISP,
+        cameras: CameraDictionary,
+        tone_atoms: int,
         cameras_mixed: int = CAMERAS_MIXED,
         tones_mixed: int = TONES_MIXED,
         kelvin: tuple[float, float] = (WARMEST, COLDEST),
         lamps: float = LAMP_SHARE,
     ) -> None:
-        if not isinstance(isp.colour, CameraDictionary):
-            raise ValueError("a camera is drawn from an ISP of published cameras, such as universal")
         if min(cameras_mixed, tones_mixed) < 1:
             raise ValueError(f"at least one camera and one tone make a draw, got {cameras_mixed} and {tones_mixed}")
-        self.cameras, self.tone_atoms = isp.colour, isp.config.tone_atoms
+        self.cameras, self.tone_atoms = cameras, tone_atoms
         self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
         self.kelvin, self.lamps = kelvin, lamps
 
@@ -101,33 +96,3 @@ def plausible(balance: Tensor) -> Tensor:
     """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
     low, high = PLAUSIBLE_GAINS
     return ((balance >= low) & (balance <= high)).all(dim=1)
-
-
-@torch.no_grad()
-def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones.
-
-    Raises:
-        ValueError: if one is not listed, or the ISP's atoms are no cameras.
-
-    Example:
-        >>> universal = DictionaryISP.from_pretrained("universal")
-        >>> len(of_cameras(universal, "Nikon D750").colour.atoms())
-        1
-    """
-    if not isinstance(isp.colour, CameraDictionary):
-        raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
-    listed = published_cameras()
-    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
-    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), encoders=False))
-    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
-    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
-    narrowed.load_state_dict(kept | own)
-    assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.named(known))
-    narrowed.info = {**isp.info, "cameras": known}
-    return narrowed.to(isp.colour.matrices.device).eval()
-
-
-def _of_colour(key: str) -> bool:
-    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)

@@ -23,11 +23,19 @@ from rawaug.isp import (
     paper_stages,  # noqa: F401 - registers the stages
     stages,
 )
+from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.curve_stage import ToneCurve
-from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, ToneDictionary
+from rawaug.isp.dictionary import (
+    CameraDictionary,
+    ColourDictionary,
+    GainDictionary,
+    ToneDictionary,
+    convex_weights,
+)
 from rawaug.isp.encoder import Encoder, Encoders, thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.stage import Stage, stage_class
 from rawaug.seeding import derived_seed, initialised_from
@@ -35,7 +43,7 @@ from rawaug.seeding import derived_seed, initialised_from
 S = TypeVar("S", bound=Stage)
 
 
-class DictionaryISP(nn.Module):
+class DictionaryISP(ReverseISP):
     """A learned, interpretable camera.
 
     Args:
@@ -49,10 +57,11 @@ class DictionaryISP(nn.Module):
         torch.Size([2, 1, 64, 96])
     """
 
+    name = "dictionary"
+
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
         self._config = config or ISPConfig()
-        self.info: dict[str, Any] = {}
         with initialised_from(seed):
             self.colour = (CameraDictionary if self.config.cameras else ColourDictionary)(self.config.colour_atoms)
             self.gain = GainDictionary(self.config.gain_atoms)
@@ -109,7 +118,7 @@ class DictionaryISP(nn.Module):
         return self.config.encoders
 
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
-        """Make encoders that look at the picture, drawn from ``seed``, or remove them; those there are stay as they are.
+        """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
 
         Without them the learned constants decide.
         """
@@ -131,6 +140,18 @@ class DictionaryISP(nn.Module):
         if tone_weights is None:
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
+
+    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
+        """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
+
+        A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
+        atoms with uniform weights.
+        """
+        if isinstance(self.colour, CameraDictionary):
+            return CameraSampler(self.colour, self.config.tone_atoms).sample(batch, generator)
+        config, device = self.config, self.colour.matrices.device
+        atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
+        return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
 
     @property
     def tone(self) -> ToneDictionary | None:
@@ -244,6 +265,24 @@ class DictionaryISP(nn.Module):
             if seen is not None and stage.makes > 1:
                 seen[f"x{stage.makes - 1}"] = x
         return x
+
+    def make(self, srgb: Tensor, setting: ISPParams | None = None, place: Tensor | None = None) -> Tensor:
+        """The mosaic of :meth:`reverse`."""
+        return self.reverse(srgb, setting, place=place).raw
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        return self.make(srgb, self.draw_setting(len(srgb), generator))
+
+    def cycle(self, srgb: Tensor) -> Tensor:
+        """Through the mosaic, within [0, 1], and back."""
+        result = self.reverse(srgb)
+        return self.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
+
+    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor:
+        """What the stages alone lose."""
+        x = stages.as_float(srgb)
+        params = self.choose(x)
+        return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
 
     def linear(self, x: Tensor) -> Tensor:
         """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""

@@ -1,6 +1,6 @@
 r"""What a stage of the ISP is: one image to the next in both directions, and its share of the baked pass.
 
-The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``.
+The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
 A stage that is the same for every picture goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
 on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` batch by batch (:meth:`Stage.adjust`).
 

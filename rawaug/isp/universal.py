@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rawaug.camera_names import spelled
 from rawaug.isp.camera_sampling import plausible
 from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.config import ISPConfig
@@ -83,6 +85,32 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     return isp.eval()
 
 
+@torch.no_grad()
+def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
+    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones.
+
+    Raises:
+        ValueError: if one is not listed, or the ISP's atoms are no cameras.
+
+    Example:
+        >>> universal = DictionaryISP.from_pretrained("universal")
+        >>> len(of_cameras(universal, "Nikon D750").colour.atoms())
+        1
+    """
+    if not isinstance(isp.colour, CameraDictionary):
+        raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
+    listed = published_cameras()
+    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
+    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), encoders=False))
+    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
+    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
+    narrowed.load_state_dict(kept | own)
+    assert isinstance(narrowed.colour, CameraDictionary)
+    narrowed.colour.set_cameras(listed.named(known))
+    narrowed.info = {**isp.info, "cameras": known}
+    return narrowed.to(isp.colour.matrices.device).eval()
+
+
 def camera_points(xyz_to_camera: Tensor) -> Tensor:
     """Cameras as points ``(N, 9)`` whose squared distance is the error of their linear colour on photographs."""
     return colour_coordinates(colour_matrix(xyz_to_camera), torch.tensor(COLOURS))
@@ -112,6 +140,10 @@ def chosen_atoms(points: Tensor, count: int) -> Choice:
 def held(points: Tensor, atoms: Tensor, decibel: float = 45.0) -> float:
     """Share of ``points`` within ``decibel`` of the hull of ``atoms``, to four digits."""
     return round((psnr(nearest_in_hull(points, atoms)[1]) >= decibel).double().mean().item(), 4)
+
+
+def _of_colour(key: str) -> bool:
+    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
 
 
 def _triplets(gains: Tensor) -> Tensor:

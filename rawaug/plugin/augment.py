@@ -13,18 +13,20 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypeVar, overload
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.isp.camera_sampling import EXPOSURE, CameraSampler, of_cameras
-from rawaug.isp.dictionary import convex_weights, perturb
+from rawaug.isp.camera_sampling import EXPOSURE
+from rawaug.isp.dictionary import perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
+from rawaug.isp.universal import of_cameras
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
@@ -36,8 +38,10 @@ Sampling = Literal["convex", "perturb", "chosen"]
 class RawAugment(nn.Module):
     """sRGB batches to RAW pairs.
 
+    It has no parameters and adds nothing to the ``state_dict`` of a surrounding network.
+
     Args:
-        isp: the fitted camera; is put in eval mode, without gradients.
+        isp: the fitted camera; a frozen copy is taken, later changes do not reach it.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
@@ -78,9 +82,9 @@ class RawAugment(nn.Module):
             exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
-        self.isp = isp.eval().requires_grad_(False)
-        self.baked = reverse_pass(self.isp)
-        self.sampler = CameraSampler(self.isp) if isp.config.cameras else None
+        self.isp = frozen(isp)
+        self.baked = frozen(reverse_pass(isp))
+        self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
@@ -131,19 +135,13 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        config, device = self.isp.config, srgb.device
         if self.sampling == "convex":
-            if self.sampler is not None:
-                return self.sampler.sample(len(srgb), generator)
-            atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
-            drawn = [convex_weights(len(srgb), n, generator).to(device) for n in atoms]
-        else:
-            chosen = self.baked.choose(srgb)
-            if self.sampling == "chosen":
-                return chosen
-            weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
-            drawn = [perturb(w, self.strength, generator) for w in weights]
-        return self.isp.params_from_weights(*drawn)
+            return self.isp.draw_setting(len(srgb), generator)
+        chosen = self.baked.choose(srgb)
+        if self.sampling == "chosen":
+            return chosen
+        weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
+        return self.isp.params_from_weights(*(perturb(w, self.strength, generator) for w in weights))
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""
@@ -215,7 +213,7 @@ class RawAugment(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the module is."""
-        return next(self.isp.parameters()).device
+        return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
         """``(B, 3, H, W)`` with even sides; what is no tensor yet goes to the module's device."""
@@ -232,6 +230,27 @@ class RawAugment(nn.Module):
         self._calls += 1
         worker = get_worker_info()
         return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
+
+
+M = TypeVar("M", bound=nn.Module)
+
+
+def frozen(module: M) -> M:
+    """A copy in eval mode whose tensors are buffers outside of ``state_dict``; the module stays as it is."""
+    copy = deepcopy(module).eval()
+    for part in copy.modules():
+        tensors = {**part._parameters, **part._buffers}
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                delattr(part, name)
+                part.register_buffer(name, tensor.detach(), persistent=False)
+    return copy
+
+
+def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Checkpoints of version 0.1 hold the ISP."""
+    for name in [name for name in state if name.startswith((f"{prefix}isp.", f"{prefix}baked."))]:
+        del state[name]
 
 
 def _float32(like: Tensor) -> torch.autocast:

@@ -152,10 +152,12 @@ class _Fit:
         if wanted != "on":
             self._descend_on_curve("curve", without=shading)
         if shading is None or wanted == "off":
-            return self._remove(shading)
+            self._remove(shading)
+            return
         mean, precision = fall_off(self._curved(self.samples), self.samples, self.colour.product())
         if wanted == "auto" and not takes_light(mean, precision):
-            return self._remove(shading)
+            self._remove(shading)
+            return
         error = self._error()
         before = {name: tensor.detach().clone() for name, tensor in self._few_numbers(without=shading).items()}
         shading.mask.set(mean, precision)
