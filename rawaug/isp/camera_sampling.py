@@ -3,13 +3,14 @@ r"""Camera-consistent sampling: one draw is a camera in a light, not a colour ma
 .. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
     \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
 
-with h Brooks' highlight-preserving inverse gains (:func:`rawaug.isp.stages.inverse_gains`), a mixture w of a few camera
-atoms (:class:`rawaug.isp.dictionary.CameraDictionary`), a light L (:mod:`rawaug.isp.light`), a mixture v of a few
-inverse tone curves, and e an exposure in stops. The smallest gain is 1, as cameras and LibRaw have it, lest clipped RAW
-develop to a coloured white.
+with h Brooks' highlight-preserving inverse gains (:func:`rawaug.isp.stages.inverse_gains`), w a mixture of two of the
+cameras that the hull of the atoms was made for (:class:`rawaug.isp.dictionary.CameraDictionary`), a light L
+(:mod:`rawaug.isp.light`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest gain
+is 1, as cameras and LibRaw have it, lest clipped RAW develop to a coloured white.
 
-Weights follow the Dirichlet distribution of concentration 1/2. Flat weights of many atoms crowd the middle of their
-hull; therefore few are mixed at a time.
+Shares of a mixture follow the Dirichlet distribution of concentration 1/2, which crowds its ends: most draws are near
+one camera, and tone is near one curve or between two. Flat weights of all atoms would crowd the middle of the hull, and
+a few atoms at a time its corners, where cameras are rare.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ PLAUSIBLE_GAINS = (0.4, 6.0)
 """Red and blue gains over green that are kept; a matrix made for D65 says nothing of light that needs more."""
 EXPOSURE = (-1.0, 0.2)
 """Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published."""
-CAMERAS_MIXED = 4
+CAMERAS_MIXED = 2
 TONES_MIXED = 3
 _ROUNDS = 100
 
@@ -37,7 +38,7 @@ class CameraSampler:
     Args:
         cameras: the atoms of colour.
         tone_atoms: number of tone curves; 0 where the tone is learned.
-        cameras_mixed, tones_mixed: how many atoms are mixed in a draw, at most; drawn with replacement.
+        cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
         kelvin: lowest and highest colour temperature of the light.
         lamps: share of fluorescent and LED lamps.
 
@@ -77,11 +78,12 @@ class CameraSampler:
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Weights ``(B, N)`` and balances ``(B, 3)``; draws with gains beyond what is plausible are drawn again."""
-        device, atoms = self.cameras.matrices.device, len(self.cameras.matrices)
-        weights, balance = torch.empty(batch, atoms).double(), torch.empty(batch, 3).double()
+        device, known = self.cameras.matrices.device, self.cameras.known.cpu().double()
+        weights, balance = torch.empty(batch, known.shape[1]).double(), torch.empty(batch, 3).double()
         open_ = torch.arange(batch)
         for _ in range(_ROUNDS):
-            weights[open_] = sparse_weights(len(open_), atoms, self.cameras_mixed, generator)
+            shares = sparse_weights(len(open_), len(known), self.cameras_mixed, generator)
+            weights[open_] = shares @ known
             light = sample_lights(len(open_), generator, self.kelvin, self.lamps)
             balance[open_] = white_balance(self.cameras.xyz_to_camera(weights[open_].to(device)).cpu(), light)
             open_ = open_[~plausible(balance[open_])]

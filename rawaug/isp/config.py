@@ -26,7 +26,8 @@ class ISPConfig:
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights.
         tone_atoms: K, inverse tone curves in the dictionary of the stage ``curve``; 0 without it.
-        cameras: whether the colour atoms are published cameras, whose gains follow from the light.
+        cameras: P, published cameras that are mixtures of the colour atoms, whose gains follow from the light; 0 where
+            the atoms are fitted.
     """
 
     colour_atoms: int = 16
@@ -38,7 +39,7 @@ class ISPConfig:
     attention: bool = True
     knee: float = HIGHLIGHT_KNEE
     tone_atoms: int = 0
-    cameras: bool = False
+    cameras: int = 0
 
     def __post_init__(self) -> None:
         CFA(self.cfa)

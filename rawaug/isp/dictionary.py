@@ -81,21 +81,27 @@ class CameraDictionary(ColourDictionary):
     Attributes:
         matrices: ``(N, 3, 3)``, rows divided by their sums on use.
         light: ``(N, 2)`` log of the red and blue multipliers in D65.
-        typical: ``(N,)`` weights where nothing is known of the camera.
+        known: ``(P, N)`` weights of the cameras that the hull was made for. Atoms are the odd ones among them: they
+            make the hull wide, but few cameras are like these.
     """
 
-    typical: Tensor
+    known: Tensor
 
-    def __init__(self, atoms: int) -> None:
+    def __init__(self, atoms: int, known: int) -> None:
         super().__init__(atoms)
-        self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
+        self.register_buffer("known", torch.full((known, atoms), 1.0 / atoms))
+
+    @property
+    def typical(self) -> Tensor:
+        """Weights ``(N,)`` where nothing is known of the camera: the mean of the known ones."""
+        return self.known.mean(dim=0)
 
     @torch.no_grad()
-    def set_cameras(self, xyz_to_camera: Tensor, typical: Tensor | None = None) -> None:
-        """Take matrices ``(N, 3, 3)`` from XYZ to camera for the atoms, and ``typical`` weights ``(N,)``."""
+    def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
+        """Take matrices ``(N, 3, 3)`` from XYZ to camera for the atoms, and weights ``(P, N)`` of the known cameras."""
         self.matrices.copy_(colour_matrix(xyz_to_camera))
         self.light.copy_(log_light(white_balance(xyz_to_camera, white_point(D65))))
-        self.typical.copy_(torch.full_like(self.typical, 1.0 / len(self.typical)) if typical is None else typical)
+        self.known.copy_(known)
 
     def atoms(self) -> Tensor:
         """``(N, 3, 3)``, rows of sum 1."""

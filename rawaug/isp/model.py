@@ -63,7 +63,9 @@ class DictionaryISP(ReverseISP):
         super().__init__()
         self._config = config or ISPConfig()
         with initialised_from(seed):
-            self.colour = (CameraDictionary if self.config.cameras else ColourDictionary)(self.config.colour_atoms)
+            self.colour = ColourDictionary(self.config.colour_atoms)
+            if self.config.cameras:
+                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
             self.gain = GainDictionary(self.config.gain_atoms)
             made = [stage_class(name)(self.config) for name in self.config.stages]
             self.stages = nn.ModuleDict({stage.name: stage for stage in made})

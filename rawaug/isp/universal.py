@@ -51,7 +51,8 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     """
     cameras, names, tables = published_cameras(), tone_names(), tone_tables()
     distinct = cameras.distinct()
-    colour = chosen_atoms(camera_points(distinct), colour_atoms)
+    points = camera_points(distinct)
+    colour = chosen_atoms(points, colour_atoms)
     tone = chosen_atoms(tone_points(tables), len(names) if tone_atoms is None else tone_atoms)
     inverse = inverse_gains_in_any_light(distinct)
     gain = chosen_atoms(inverse / 3**0.5, gain_atoms)
@@ -61,23 +62,23 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
             gain_atoms=len(gain.atoms),
             stages=STAGES,
             tone_atoms=len(tone.atoms),
-            cameras=True,
+            cameras=len(distinct),
         )
     )
     assert isinstance(isp.colour, CameraDictionary) and isp.tone is not None
-    isp.colour.set_cameras(distinct[colour.atoms], colour.typical)
+    isp.colour.set_cameras(distinct[colour.atoms], nearest_in_hull(points, points[colour.atoms])[0])
     isp.tone.curves.copy_(tables[tone.atoms])
     isp.tone.typical.copy_(tone.typical)
     with torch.no_grad():
         isp.gain.log_gains.copy_(_triplets(1.0 / inverse[gain.atoms]).log())
     for encoders in (isp.reverse_encoders, isp.forward_encoders):
-        encoders.colour.set_prior(colour.typical)
+        encoders.colour.set_prior(isp.colour.typical)
         encoders.gain.set_prior(gain.typical)
     isp.info |= {
         "cameras": [_name_of(distinct[index], cameras.names, cameras.xyz_to_camera) for index in colour.atoms],
         "tones": [names[index] for index in tone.atoms],
         "holds": {
-            "cameras": held(camera_points(cameras.xyz_to_camera), camera_points(distinct[colour.atoms])),
+            "cameras": held(camera_points(cameras.xyz_to_camera), points[colour.atoms]),
             "gains": held(inverse / 3**0.5, inverse[gain.atoms] / 3**0.5),
             "tones": held(tone_points(tables), tone_points(tables[tone.atoms])),
         },
@@ -101,12 +102,12 @@ def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
         raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
     listed = published_cameras()
     known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
-    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), encoders=False))
+    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
     kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
     own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
     narrowed.load_state_dict(kept | own)
     assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.named(known))
+    narrowed.colour.set_cameras(listed.named(known), torch.eye(len(known)))
     narrowed.info = {**isp.info, "cameras": known}
     return narrowed.to(isp.colour.matrices.device).eval()
 
@@ -121,9 +122,9 @@ def tone_points(tables: Tensor) -> Tensor:
     return tables[:, ::STEPS].double() / 16.0
 
 
-def inverse_gains_in_any_light(xyz_to_camera: Tensor) -> Tensor:
+def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gains") -> Tensor:
     """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``."""
-    generator = keyed_generator("universal gains")
+    generator = keyed_generator(key)
     camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (LIGHTS,), generator=generator)]
     balance = white_balance(camera, sample_lights(LIGHTS, generator))
     balance = balance[plausible(balance)]
