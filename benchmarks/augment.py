@@ -168,8 +168,8 @@ def machine(threads: int) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix for 12")
-    parser.add_argument("--json", type=Path, help="write all figures here")
+    parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix instead of 12")
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, help="runs of each method")
     parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)

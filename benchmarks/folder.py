@@ -92,7 +92,7 @@ def main() -> int:
     parser.add_argument("--files", type=int, default=20_000)
     parser.add_argument("--damaged", type=float, default=0.01, help="share of them")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--quick", action="store_true", help="2,000 files")
     args = parser.parse_args()
     args.files = min(args.files, 2000) if args.quick else args.files

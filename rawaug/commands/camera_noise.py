@@ -41,7 +41,7 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
     estimate = estimate_noise(mosaics, cfa, read_var=read_var)
     if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
         raise ValueError(
-            f"noise: the frames do not lie on one line (R^2 {estimate.r2:.2f}); measure one camera at one ISO at a time"
+            f"noise: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); use one camera at one ISO"
         )
     return estimate
 

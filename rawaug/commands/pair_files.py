@@ -88,12 +88,12 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     drawn = load_params(params)
     header = read_header(params)
     if "origin" not in header:
-        raise ValueError(f"{params}: parameters of a pair that rawaug synth did not write; use RawAugment.apply")
+        raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
     origin = Origin(**json.loads(header["origin"]))
     augment = augmentation(str(isp or origin.isp), origin.noise)
     found = Path(picture or origin.picture)
     if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
-        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one that made this pair")
+        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one this pair was made with")
     srgb = even_sided(read_picture(found))
     if sha256(found) != origin.picture_sha256:
         raise ValueError(f"{params}: the picture {found} has changed since this pair was made")
@@ -169,7 +169,7 @@ def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, floa
     grey = matrix.sum(1)
     balance = (isp.gains if "gains" in stages else torch.ones(3)) / grey
     if not balance.min() > 0:
-        raise ValueError(f"this camera setting has no positive grey, {balance.tolist()}; a DNG cannot tell it")
+        raise ValueError(f"a DNG cannot store the white balance {balance.tolist()} of this pair; it must be positive")
     red, green, blue = balance.tolist()
     return (red / green, 1.0, blue / green), torch.linalg.inv(matrix / grey[:, None]), math.log2(green)
 

@@ -45,15 +45,15 @@ __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("pictures", type=str, help="folder of sRGB pictures")
-    parser.add_argument("out", type=str, help="folder to write")
+    parser.add_argument("out", type=str, help="output folder")
     parser.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
-    parser.add_argument("--per-image", type=int, default=1, help="pairs a picture")
-    parser.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
-    noise_help = "a preset, a measured camera, camera (as fitted), or [shot_var, read_var]"
+    parser.add_argument("--per-image", type=int, default=1, help="pairs per picture")
+    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
+    noise_help = "a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var]"
     parser.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
     parser.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws")
-    parser.add_argument("--workers", type=int | None, default=None, help="processes; as many as cores by default")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--workers", type=int | None, default=None, help="number of processes; by default one per core")
 
 
 def run(arguments: Any) -> None:
@@ -117,8 +117,8 @@ def synth(
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
         sampling: of camera settings, as in :class:`rawaug.RawAugment`.
         seed: of all draws.
-        workers: processes; as many as cores by default, 0 for none but this one. They start by forkserver or spawn: a
-            script guards its main part by ``if __name__ == "__main__":``.
+        workers: number of processes; by default one per core; 0 works in this process. They start by forkserver or spawn, so a
+            script needs ``if __name__ == "__main__":`` around its main part.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
@@ -132,9 +132,9 @@ def synth(
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
     if format not in ("dng", "npz", "tiff") or per_image < 1:
-        raise ValueError(f"format is dng, npz or tiff, and per_image at least 1; got {format} and {per_image}")
+        raise ValueError(f"format must be dng, npz or tiff and per_image at least 1, got {format} and {per_image}")
     if workers is not None and workers < 0:
-        raise ValueError(f"workers is at least 0, got {workers}")
+        raise ValueError(f"workers must be at least 0, got {workers}")
     augmentation(weights, levels, sampling)  # a wrong name is told here, not by a worker
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
@@ -157,10 +157,10 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     if not source.is_dir():
         raise FileNotFoundError(f"{source}: no such folder of pictures")
     if out.resolve().is_relative_to(source):
-        raise ValueError(f"{out}: the pairs would lie among the pictures of {source}; choose a folder outside")
+        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     pictures = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
     if not pictures:
-        raise ValueError(f"{source}: holds no picture; known are {', '.join(EXTENSIONS)}")
+        raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
     return pictures
 
 
@@ -172,7 +172,9 @@ def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Ite
         bare = picture.with_suffix("")
         own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
         if taken.setdefault(own, picture) != picture:
-            raise ValueError(f"{picture}: its pairs would have the names of those of {taken[own].name}; rename one")
+            raise ValueError(
+                f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
+            )
         stem = out / own.relative_to(source)
         missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
         yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
@@ -221,7 +223,7 @@ def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Itera
         for future in as_completed(futures):
             yield futures[future], future.result()
     except BrokenProcessPool:
-        raise OSError("a worker died, for lack of memory?; the same command goes on; try fewer --workers") from None
+        raise OSError("a worker died, perhaps out of memory; run it again to resume, with fewer --workers") from None
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -70,17 +70,17 @@ class PartReport:
         self.broken += [line for line in other.broken if line not in self.broken]
 
     def __str__(self) -> str:
-        examined = "" if self.examined == self.items else f", {self.examined} of them examined"
+        examined = "" if self.examined == self.items else f", {self.examined} examined"
         lines = [f"{self.what}: {self.items}{examined}"]
         for name in ("sizes", "cfas", "cameras", "levels"):
             counts: Counter[str] = getattr(self, name)
             if counts:
-                more = f", {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+                more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
                 shown = ", ".join(f"{value} ({count})" for value, count in counts.most_common(_SHOWN))
                 lines.append(f"  {name}: {shown}{more}")
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
-        lines.append(f"  broken: {len(self.broken) or 'none'}")
+        lines.append(f"  damaged: {len(self.broken) or 'none'}")
         return "\n".join([*lines, *(f"    {line}" for line in self.broken)])
 
 
@@ -114,10 +114,10 @@ def check(path: str | Path, first: int | None = None) -> DataReport:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file() and path.suffix in (".csv", ".mat"):
-        return DataReport(path, [_part("submission to SIDD", lambda: list(check_submission(path)), first)])
+        return DataReport(path, [_part("SIDD submission", lambda: list(check_submission(path)), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
-        raise ValueError(f"{path}: holds no dataset, RAW file or picture that is known; see the page on datasets")
+        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
     return DataReport(path, [_part(what, open_part, first) for what, open_part in known])
 
 
@@ -130,11 +130,11 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
         yield "SIDD, validation blocks", lambda: SiddBlocks(path)
     if "BenchmarkNoisyBlocksRaw.mat" in files:
-        yield "SIDD, benchmark blocks (noisy alone)", lambda: SiddBenchmark(path)
+        yield "SIDD, benchmark blocks (noisy only)", lambda: SiddBenchmark(path)
     if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
         yield "SIDD+, validation blocks", lambda: SiddPlusBlocks(path)
     if (path / "info.mat").is_file():
-        yield "DND, boxes (noisy alone)", lambda: Dnd(path)
+        yield "DND, boxes (noisy only)", lambda: Dnd(path)
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
@@ -194,7 +194,7 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
     for facts in found:
         part.add(facts)
     if len(found) < part.examined:
-        part.broken.append(f"nothing is read after {_CRASHES} crashes; replace these files first")
+        part.broken.append(f"stopped after {_CRASHES} crashes; replace these files first")
         part.examined = len(found)
     return part
 
@@ -232,7 +232,7 @@ def _facts(items: Any, count: int) -> list[PartReport]:
             if not (crash := re.search(r"DataLoader worker.*(killed by signal.*|exited.*)", str(error))):
                 raise
             crashes += 1
-            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes its decoder ({crash[1]})"]))
+            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes the decoder ({crash[1]})"]))
     return found
 
 

@@ -28,7 +28,7 @@ def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
     """
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ _XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
-        raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is no matrix from XYZ to a camera")
+        raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is not a valid XYZ-to-camera matrix")
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
 
 

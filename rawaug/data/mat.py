@@ -38,7 +38,7 @@ def mat_version(path: str | Path) -> str:
         return "7.3"
     if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
         return "5"
-    raise ValueError(f"{path}: is no MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
+    raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
@@ -54,7 +54,7 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
     """
     value = _read(Path(path), name, plain=False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: {name} is no numeric array, but {type(value).__name__}")
+        raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
     return value
 
 
@@ -111,7 +111,7 @@ class _Missing(ValueError):
 
 
 def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
-    return _Missing(f"{path}: holds no variable {name}, but {', '.join(existing) or 'none'}")
+    return _Missing(f"{path}: has no variable {name}; its variables are: {', '.join(existing) or 'none'}")
 
 
 def _plain(node: Any, file: Any) -> Any:

@@ -63,7 +63,7 @@ class Page:
 
     def add_curves(self, png: bytes) -> None:
         """A figure as :func:`draw_curves` makes it."""
-        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'curves of training')}</p>", "<h2>Pictures</h2>"]
+        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'training curves')}</p>", "<h2>Pictures</h2>"]
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
@@ -80,7 +80,7 @@ class Page:
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"<figcaption>whole frame, clean; the window is at row {2 * top}, column {2 * left}</figcaption>"
+        caption = f"<figcaption>whole frame, clean; window at row {2 * top}, column {2 * left}</figcaption>"
         figures.append(f"<figure>{_picture(encode_png(whole), 'whole frame')}{caption}</figure>")
         self.parts.append(f'<h3>{html.escape(row.pair.name)}</h3><div class="frame">{"".join(figures)}</div>')
 

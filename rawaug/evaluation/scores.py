@@ -136,7 +136,7 @@ def require_classical(names: Sequence[str]) -> None:
     """
     for name in names:
         if name not in CLASSICAL:
-            raise ValueError(f"classical: {name} is unknown; there are {', '.join(CLASSICAL)}")
+            raise ValueError(f"classical: {name} is unknown; use one of {', '.join(CLASSICAL)}")
 
 
 def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:

@@ -95,11 +95,11 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
 def _require_colour(frame: RawFrame, path: Path) -> None:
     gains = (*frame.white_balance, *frame.daylight)
     if not all(math.isfinite(gain) and gain > 0 for gain in gains):
-        raise ValueError(f"{path}: white balance and daylight gains are positive, got {gains}")
+        raise ValueError(f"{path}: white balance and daylight gains must be positive, got {gains}")
     if not abs(float(torch.linalg.det(frame.color_matrix.double()))) > 1e-6:
-        raise ValueError(f"{path}: the colour matrix has no inverse, which a DNG needs")
+        raise ValueError(f"{path}: the colour matrix is singular; a DNG needs its inverse")
     if frame.orientation not in _EXIF_ORIENTATIONS:
-        raise ValueError(f"{path}: orientation is LibRaw's flip, one of 0 to 7, got {frame.orientation}")
+        raise ValueError(f"{path}: orientation must be a LibRaw flip from 0 to 7, got {frame.orientation}")
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
@@ -110,9 +110,11 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     """
     height, width = frame.mosaic.shape[-2:]
     if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
-        raise ValueError(f"{path}: a mosaic to write is (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
+        raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
-        raise ValueError(f"{path}: levels are 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
+        raise ValueError(
+            f"{path}: levels must satisfy 0 <= black < white <= 65535, got {frame.black} and {frame.white}"
+        )
     numbers = np.empty((height, width), np.uint16)
     for (i, j), black in zip(CFA(frame.cfa).sites, frame.black, strict=True):
         plane = frame.mosaic[0, i::2, j::2].double().mul_(frame.white - black).add_(black).round_()
@@ -203,7 +205,7 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
     numbers = []
     for value in values:
         if not abs(value) <= _LARGEST:
-            raise ValueError(f"{value:g} does not fit a DNG; check the frame's gains, matrix and exposure")
+            raise ValueError(f"{value:g} does not fit a DNG rational; check the frame's gains, matrix and exposure")
         fits = min(denominator, int(_LARGEST / max(abs(value), 1)))
         numbers += [round(value * fits), fits]
     return tuple(numbers)

@@ -65,7 +65,7 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
                 maps.append(_parse(opcodes[place : place + size], on_mosaic))
             place += size
     except struct.error as error:
-        raise ValueError(f"the opcode list is cut short ({error})") from None
+        raise ValueError(f"the opcode list is truncated ({error})") from None
     return tuple(maps)
 
 
@@ -74,11 +74,13 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     rows, columns, points_v, points_h, *grid, map_planes = rest
     size = points_v * points_h * map_planes
     if size == 0 or min(rows, columns) == 0 or len(body) < _GRID.size + 4 * size:
-        raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is not whole")
+        raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is incomplete")
     gains = np.frombuffer(body, ">f4", size, _GRID.size).reshape(points_v, points_h, map_planes)
     spaced = all(spacing > 0 for spacing, points in zip(grid[:2], (points_v, points_h), strict=True) if points > 1)
     if not (spaced and np.isfinite(grid).all() and np.isfinite(gains).all() and gains.min() > 0):
-        raise ValueError(f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and least gain {gains.min():g} is no map")
+        raise ValueError(
+            f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and smallest gain {gains.min():g} is invalid"
+        )
     return GainMap(
         area=(top, left, bottom, right),
         pitch=(rows, columns),

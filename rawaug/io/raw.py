@@ -139,7 +139,9 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
         )
     height, width = frame.mosaic.shape[-2:]
     if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
-        raise ValueError(f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}; no pair")
+        raise ValueError(
+            f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}, so they do not match"
+        )
     return frame, torch.from_numpy(pixels[:height, :width]).permute(2, 0, 1).contiguous()
 
 
@@ -156,17 +158,17 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
             size = path.stat().st_size
             if tags.mosaic_end is not None and tags.mosaic_end > size:  # LibRaw would not say what is wrong
                 raise OSError(
-                    f"{path}: cannot be read as RAW: it is cut short, {size} bytes of {tags.mosaic_end}; copy it again"
+                    f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic_end} bytes; copy it again"
                 )
             raw.unpack()
             yield raw, tags
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise OSError(
-            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and of a known camera"
+            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and from a supported camera"
         ) from error
     except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
-        raise ValueError(f"{path}: holds no Bayer mosaic ({error}); only Bayer RAW can be used") from error
+        raise ValueError(f"{path}: has no Bayer mosaic ({error}); only Bayer RAW is supported") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
 
@@ -222,7 +224,7 @@ def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
     """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(2, 2)``: 0 to 3 are R, G, B, G."""
     pattern = raw.raw_pattern
     if pattern is None or pattern.shape != (2, 2) or raw.color_desc != b"RGBG" or set(pattern.flat) != {0, 1, 2, 3}:
-        raise ValueError(f"{path}: holds no Bayer mosaic but {_kind(raw)}; only Bayer RAW can be used")
+        raise ValueError(f"{path}: has no Bayer mosaic but {_kind(raw)}; only Bayer RAW is supported")
     return np.asarray(raw.raw_colors_visible[:2, :2])
 
 

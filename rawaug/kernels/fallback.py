@@ -48,5 +48,7 @@ def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> R
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
         _refused.append(type(error).__name__)
         reason = (str(error).splitlines() or [""])[-1]
-        warnings.warn(f"rawaug's GPU kernel cannot be used, PyTorch is: {type(error).__name__}: {reason}", stacklevel=3)
+        warnings.warn(
+            f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
+        )
         return fallback()

@@ -52,7 +52,7 @@ def _measure(planes: Tensor) -> Tensor:
     """(read_var, row_var, offsets of R, Gr, Gb, B) of packed ``(4, h, w)``."""
     lowest = planes == planes.min()
     if float(lowest.double().mean()) > _PILED_UP:
-        raise ValueError("a dark frame piles up at its lowest value: clipped at black, it does not show the noise")
+        raise ValueError("a dark frame is clipped at black, so its noise cannot be measured")
     difference = planes.diff(dim=-1)
     scale = 1.4826 * difference.abs().median()
     regular = difference.abs() <= _OUTLIER * scale if scale > 0 else torch.ones_like(difference, dtype=torch.bool)

@@ -98,11 +98,11 @@ class NoiseModel(ABC):
 def require_batch(clean: Tensor, params: Params) -> None:
     """Raise ValueError unless ``clean`` is ``(B, 4, h, w)`` in float32 or float64 and every parameter has length B."""
     if clean.ndim != 4 or clean.shape[1] != 4 or clean.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"noise is made on packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
+        raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
     for name, value in params.items():
         if value.shape[:1] != clean.shape[:1]:
             raise ValueError(
-                f"noise parameter {name!r} has shape {tuple(value.shape)}, the batch has {len(clean)} pictures"
+                f"noise parameter {name!r} has shape {tuple(value.shape)}, but the batch has {len(clean)} pictures"
             )
 
 

@@ -71,12 +71,14 @@ class RawPairs(Dataset[Any]):
 
     def __len__(self) -> int:
         if not isinstance(self.dataset, Sized):
-            raise TypeError(f"{type(self.dataset).__name__} has no length, so its RAW pairs have none")
+            raise TypeError(f"{type(self.dataset).__name__} has no length, so neither have its RAW pairs")
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Any:
         if not isinstance(index, SupportsIndex):
-            raise TypeError(f"a pair has a number, got {type(index).__name__}; take parts with torch.utils.data.Subset")
+            raise TypeError(
+                f"the index must be an integer, got {type(index).__name__}; for slices use torch.utils.data.Subset"
+            )
         index = range(len(self))[index]  # IndexError ends iteration
         return self.draw(index, self._generator(index))
 
@@ -153,13 +155,13 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
             yield self._paired(sample, name, self._generator(name))
 
     def __getitem__(self, index: int) -> Any:
-        raise TypeError("a stream of RAW pairs has no index; iterate over it")
+        raise TypeError("a stream of RAW pairs cannot be indexed; iterate over it")
 
     def _identity(self, sample: Any) -> int | str:
         try:
             value = sample[self.identity]
         except (KeyError, IndexError, TypeError) as error:
-            raise ValueError(f"identity={self.identity!r}: a sample has no such field; name one that it has") from error
+            raise ValueError(f"identity={self.identity!r}: the samples have no such field") from error
         return value if isinstance(value, int) else str(value)
 
 
@@ -185,6 +187,6 @@ def placed(picture: Tensor, place: Tensor, crop: int | None) -> Tensor:
     """
     top, left, height, width, view = place.tolist()
     if picture.shape[-2:] != (height, width):
-        raise ValueError(f"the place is one in a picture of {height} x {width}, not {tuple(picture.shape[-2:])}")
+        raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
     patch = bayer.crop(picture, top, left, crop or height, crop or width)
     return bayer.turn(patch, view).contiguous()

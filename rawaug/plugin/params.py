@@ -47,7 +47,7 @@ class AugmentParams(NamedTuple):
         """
         missing = {"place", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
         if missing:
-            raise ValueError(f"these are no parameters of an augmentation: {', '.join(sorted(missing))} missing")
+            raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
         isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
         noise = {name.removeprefix("noise."): value for name, value in tensors.items() if name.startswith("noise.")}
         return cls(isp, noise, tensors["place"])

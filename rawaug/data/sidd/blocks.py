@@ -110,7 +110,7 @@ class SiddPlusBlocks(LazyPairs):
             clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
             _require_same_shape(clean, noisy, self.files[1])
             if len(clean) != len(self):
-                raise ValueError(f"{self.files[0]}: holds {len(clean)} blocks, the patterns are for {len(self)}")
+                raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
             self._blocks = clean, noisy
         frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
         clean, noisy = self._blocks
@@ -161,9 +161,11 @@ def find_file(path: Path, pattern: str) -> Path:
     """
     found = [path] if path.is_file() and path.match(pattern) else sorted(path.rglob(pattern))
     if not found:
-        raise FileNotFoundError(f"{path}: holds no {pattern}; see the page on datasets for where to get it")
+        raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")
     if len(found) > 1:
-        raise ValueError(f"{path}: holds {len(found)} files {pattern}, {found[0]} and {found[1]}; name a folder of one")
+        raise ValueError(
+            f"{path}: contains {len(found)} files {pattern}, such as {found[0]} and {found[1]}; give a folder with one"
+        )
     return found[0]
 
 

@@ -64,10 +64,10 @@ class SiddFrames(LazyPairs):
             missing = {"GT_RAW", "METADATA_RAW"} - set(files)
             if missing:
                 raise ValueError(
-                    f"{files['NOISY_RAW']}: {min(missing)}_{number} of {scene.name} is missing; get it too"
+                    f"{files['NOISY_RAW']}: {min(missing)}_{number} of {scene.name} is missing; download it too"
                 )
         if not self.shots:
-            raise ValueError(f"{path}: holds no NOISY_RAW frames of SIDD for training")
+            raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
         self.levels = noise_level_functions(self.path)
         super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
 
@@ -110,10 +110,14 @@ def mosaic_of(file: Path) -> Tensor:
 def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
     """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
     if values.ndim != axes or values.dtype.kind != "f" or not values.size:
-        raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floating point, {axes} axes")
+        raise ValueError(
+            f"{file}: holds {values.dtype} {values.shape}; normalised RAW must be floating point with {axes} axes"
+        )
     low, high = float(values.min()), float(values.max())
     if not (low > -1 and high <= 1):
-        raise ValueError(f"{file}: values run from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
+        raise ValueError(
+            f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0 and white at 1"
+        )
     return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
 
 
@@ -176,7 +180,7 @@ def colour_of(file: Path) -> Colour:
         gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
         return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(f"{file}: tells no AsShotNeutral and ColorMatrix2 ({error}); get the file again") from error
+        raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
 
 
 def _even(image: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class SiddScene:
         """
         found = _NAME.fullmatch(name)
         if found is None or found[3] not in PHONES:
-            raise ValueError(f"{name}: is no scene instance of SIDD, as 0052_002_S6_01600_01000_5500_N is")
+            raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
         return cls(name, int(found[1]), int(found[2]), found[3], int(found[4]), int(found[6]))
 
     @property

@@ -87,7 +87,7 @@ def test_files_of_one_stem_have_names_of_their_own(tmp_path: Path, bayer_dng: Dn
 
 
 def test_nothing_to_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"holds no RAW file; known are \.3fr"):
+    with pytest.raises(ValueError, match=r"contains no RAW file; supported extensions are \.3fr"):
         RawFolder(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
         RawFolder(tmp_path / "none.dng")
