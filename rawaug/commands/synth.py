@@ -117,8 +117,8 @@ def synth(
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
         sampling: of camera settings, as in :class:`rawaug.RawAugment`.
         seed: of all draws.
-        workers: number of processes; by default one per core; 0 works in this process. They start by forkserver or spawn, so a
-            script needs ``if __name__ == "__main__":`` around its main part.
+        workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
+            spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.

@@ -269,7 +269,7 @@ def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer
     write_scene(tmp_path, mat73, "0001_001_IP_00100_00060_3200_L", ("010",))
     assert len(open_pairs(f"sidd:{blocks}")) == 1280
     assert len(open_pairs(f"sidd:{tmp_path}", split="train")) == 1 == len(open_pairs(f"sidd:{tmp_path}:train"))
-    with pytest.raises(ValueError, match="no split validation; use train \(full frames\)"):
+    with pytest.raises(ValueError, match=r"no split validation; use train \(full frames\)"):
         open_pairs(f"sidd:{tmp_path}", split="validation")
     with pytest.raises(FileNotFoundError, match=r"holds no ValidationGtBlocksRaw\.mat"):
         open_pairs(f"sidd:{tmp_path}")
