@@ -1,4 +1,4 @@
-"""What share of published cameras a hull of ten colour atoms reaches, and whether it holds for cameras not looked at.
+"""What share of published cameras a hull of ten colour atoms reaches, and whether this holds for unseen cameras.
 
     python benchmarks/coverage.py photographs/ [--atoms 10] [--halves 5]
 

@@ -59,7 +59,7 @@ def make_folder(folder: Path, files: int, damaged: float) -> set[str]:
 
 
 def own_megabytes(processes: list[int]) -> list[float]:
-    """Memory that each process shares with no other, where the system tells."""
+    """Memory private to each process, where the system reports it."""
     sizes = []
     for process in processes:
         try:

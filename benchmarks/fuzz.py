@@ -1,10 +1,10 @@
-"""What the readers make of damaged files: each is read, or refused in one line that names it; nothing else.
+"""How the readers handle damaged files: each must be read, or refused in one line that names it.
 
     python -m benchmarks.fuzz [--count 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
 repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
-repeats pieces, as (seed, kind, number) tells. A worker process reads one after the other, and is started anew when a
+repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is started anew when a
 decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
 line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
 more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
@@ -194,7 +194,7 @@ def _forget_peak(process: int) -> None:
 
 
 def _peak_mebibytes(process: int) -> float:
-    """Peak of resident memory since :func:`_forget_peak`; 0 where the system does not tell."""
+    """Peak of resident memory since :func:`_forget_peak`; 0 where unavailable."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except OSError:
@@ -203,7 +203,7 @@ def _peak_mebibytes(process: int) -> float:
 
 
 def _innermost(log: Path) -> str:
-    """Where Python was when a decoder crashed, as faulthandler tells it."""
+    """Where Python was when a decoder crashed, from faulthandler's log."""
     lines = (line.strip() for line in log.read_text(errors="replace").splitlines())
     return next((line for line in lines if line.startswith("File ")), "unknown location")
 

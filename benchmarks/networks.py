@@ -4,8 +4,8 @@
     python -m benchmarks.networks --device cuda --width 128 --networks DHDN --crop 256     (bf16)
 
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
-with it, RawAugment makes it of sRGB first. Each network has a process of its own, whose peak memory is told; steps are
-timed in turn, and the fastest counts.
+with it, RawAugment makes it of sRGB first. Each network runs in its own process, whose peak memory is reported; steps
+are timed in turn, and the fastest counts.
 """
 
 from __future__ import annotations

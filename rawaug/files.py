@@ -74,10 +74,10 @@ def read_tensors(path: str | Path, advice: str) -> tuple[dict[str, str], dict[st
 
 
 def read_header(path: str | Path) -> dict[str, str]:
-    """The header of a file of rawaug's, without its tensors.
+    """The header of a rawaug file, without its tensors.
 
     Raises:
-        ValueError: if it is not a safetensors file, or not rawaug's.
+        ValueError: if it is not a safetensors file written by rawaug.
     """
     try:
         with safe_open(str(path), framework="pt") as file:

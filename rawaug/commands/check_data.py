@@ -1,4 +1,4 @@
-"""``rawaug data check``: which dataset is in a folder, and what of it is damaged."""
+"""``rawaug data check``: identify the dataset and list damaged files."""
 
 from __future__ import annotations
 

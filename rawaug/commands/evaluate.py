@@ -42,7 +42,7 @@ def add_arguments(parser: Any) -> None:
 
 
 def run(arguments: Any) -> None:
-    """Print the scores, and write what is asked for."""
+    """Print the scores and write the requested files."""
     settings = vars(arguments)
     json_path = settings.pop("json")
     result = evaluate(**settings)
@@ -68,7 +68,7 @@ def evaluate(
     Args:
         weights: an ISP's or a denoiser's; the file says which.
         data: a folder of RAW files, or ``kind:path``.
-        self_ensemble: average a denoiser over eight views; its scores without stand under ``plain``.
+        self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
         seed: of that noise.

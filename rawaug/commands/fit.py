@@ -37,7 +37,7 @@ def add_arguments(parser: Any) -> None:
 
 
 def run(arguments: Any) -> None:
-    """Fit, write the file and say how it went."""
+    """Fit, write the file and print a summary."""
     settings = vars(arguments)
     data, out = settings.pop("data"), settings.pop("out")
     if Path(out).suffix != ".safetensors":
@@ -69,19 +69,19 @@ def fit(
     state: str | Path | None = None,
     **settings: Any,
 ) -> DictionaryISP:
-    """Fit a camera of one's own.
+    """Fit an ISP to your own camera.
 
     Args:
         source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
-        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" goes on
-            without where the frames do not show them, and says why in ``isp.info["noise_not_measured"]``.
-        dark: folder of dark frames, which then tell the read variance.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto"
+            continues without them where they cannot be measured; the reason is in ``isp.info["noise_not_measured"]``.
+        dark: folder of dark frames to measure the read variance.
         noise_figure: where to draw the measured points and the line.
-        camera_jpeg: take the camera's JPEG of the same stem for the sRGB; False takes LibRaw's rendering always.
-        held_out: frames that the fit does not see; their PSNR_r while it runs goes to the progress bar and into
+        camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
+        held_out: frames excluded from the fit; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
-        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        state: file with the state of the fit, to resume it; removed at the end.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Raises:
@@ -113,7 +113,7 @@ def fit(
 
 
 def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> NoiseEstimate | str | None:
-    """The levels, or why they are not known."""
+    """The levels, or why they could not be measured."""
     if noise == "off":
         return None
     try:
@@ -125,7 +125,7 @@ def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) 
 
 
 class _Watch:
-    """PSNR_r of frames that the fit does not see, on a few patches of each."""
+    """PSNR_r of held-out frames, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs

@@ -1,4 +1,4 @@
-"""``rawaug info``: what is in a file of weights, for people to read."""
+"""``rawaug info``: a readable description of a weights file."""
 
 from __future__ import annotations
 

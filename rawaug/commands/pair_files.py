@@ -1,4 +1,4 @@
-r"""A RAW pair on disk, in one of three formats, and what replays it.
+r"""A RAW pair on disk, in one of three formats, and the parameters that replay it.
 
 ======  =====================================  ====================================================================
 format  files                                  content
@@ -71,16 +71,16 @@ def params_file(stem: Path) -> Path:
 
 
 def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
-    """The pair ``(4, h, w)`` that a file of parameters tells, bit for bit what was written.
+    """The pair ``(4, h, w)`` described by a parameter file, bit for bit as written.
 
     Args:
         params: ``NAME.safetensors`` of a pair.
-        picture: the sRGB picture, where it is no longer in the place that the file tells.
-        isp: the ISP's file, likewise.
+        picture: the sRGB picture, if it has moved since.
+        isp: the ISP's file, if it has moved since.
 
     Raises:
         FileNotFoundError: if picture or ISP are not there.
-        ValueError: if they have changed since, or the file is no pair's.
+        ValueError: if they have changed since, or the file does not belong to a pair.
 
     Example:
         >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
@@ -102,7 +102,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
 
 def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
-    """The augmentation of these names, as a file can tell them."""
+    """The augmentation with these settings."""
     return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)
 
 
@@ -133,9 +133,9 @@ def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFrame, float]:
-    """A pair ``(4, h, w)`` as a camera would hand it over: clean, noisy, and the stops that it is underexposed by."""
+    """A pair ``(4, h, w)`` as camera frames: clean, noisy, and the stops of underexposure."""
     white_balance, color_matrix, stops = _color(pair, augment)
-    told: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "cfa": augment.isp.cfa,
         "black": (_black(float(pair.noisy.min())),) * 4,
         "white": float(_WHITE),
@@ -152,8 +152,8 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
     levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
     clean, noisy = (bayer.unpack(raw, augment.isp.cfa) for raw in (pair.clean, pair.noisy))
     return (
-        RawFrame(mosaic=clean, noise_profile=None, **told),
-        RawFrame(mosaic=noisy, noise_profile=levels, **told),
+        RawFrame(mosaic=clean, noise_profile=None, **metadata),
+        RawFrame(mosaic=noisy, noise_profile=levels, **metadata),
         stops,
     )
 

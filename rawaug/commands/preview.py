@@ -1,4 +1,4 @@
-"""``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and what the dictionaries hold.
+"""``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and the atoms of the dictionaries.
 
 Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
 sensor sees.

@@ -1,4 +1,4 @@
-"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, many processes at work.
+"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, in parallel.
 
 What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
 run is stopped and started again, and with however many workers, the same files come out, each made once.
@@ -64,7 +64,7 @@ def run(arguments: Any) -> None:
 
 @dataclass(frozen=True)
 class _Settings:
-    """What the files depend on, besides the pictures; stands in ``synth.json`` beside them."""
+    """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
 
     format: Format
     isp: str
@@ -106,23 +106,23 @@ def synth(
     seed: int = 0,
     workers: int | None = None,
 ) -> Synthesis:
-    """Make ``per_image`` pairs of every picture of a folder and its subfolders; pairs that are there stay as they are.
+    """Make ``per_image`` pairs of every picture of a folder and its subfolders; existing pairs are kept.
 
     Args:
         source: the folder of sRGB pictures.
         out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.commands.pair_files`.
         format: dng, npz or tiff.
-        per_image: pairs a picture; may grow from run to run.
+        per_image: pairs per picture; may grow from run to run.
         isp: name of a shipped ISP, or an ISP's file.
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
         sampling: of camera settings, as in :class:`rawaug.RawAugment`.
-        seed: of all draws.
+        seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
-        ValueError: if the folder holds no picture or none that can be read, or ``out`` holds pairs of other settings.
+        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings.
         OSError: if a worker dies.
     """
     start = time.perf_counter()
@@ -135,7 +135,7 @@ def synth(
         raise ValueError(f"format must be dng, npz or tiff and per_image at least 1, got {format} and {per_image}")
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
-    augmentation(weights, levels, sampling)  # a wrong name is told here, not by a worker
+    augmentation(weights, levels, sampling)  # raises for a wrong name here, not in a worker
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
     tasks = list(_tasks(pictures, source, out, per_image))
@@ -185,10 +185,10 @@ def _numbered(stem: Path, number: int) -> Path:
 
 
 def require_same_settings(path: Path, settings: dict[str, object]) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with what is there.
+    """Write the settings of a folder's files to ``path``, or compare them with those in it.
 
     Raises:
-        ValueError: if the files that are there were made with others.
+        ValueError: if the existing files were made with other settings.
     """
     if path.is_file():
         try:
@@ -209,7 +209,7 @@ _settings: _Settings
 
 
 def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Iterator[tuple[_Task, str | None]]:
-    """Every task as it is finished, with why it could not be, if so."""
+    """Each task as it finishes, with the reason if it failed."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
     if workers < 1:
         _prepare(settings)
@@ -229,7 +229,7 @@ def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Itera
 
 
 def _start_worker(settings: _Settings) -> None:
-    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent is no more."""
+    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent has died."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -250,7 +250,7 @@ def _prepare(settings: _Settings) -> None:
 
 
 def _make(task: _Task) -> str | None:
-    """Make the missing pairs of a picture; why it cannot be read, if so."""
+    """Make the missing pairs of a picture; the reason if it cannot be read."""
     try:
         srgb = even_sided(read_picture(task.picture))
     except (OSError, ValueError) as error:

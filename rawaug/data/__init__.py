@@ -1,7 +1,7 @@
 """What is read: pictures, RAW files, published datasets and the built-in demo data.
 
 They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for what is to be handed in.
+clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
 
     Args:
         spec: ``"demo:"`` or the path of a folder.
-        min_side: smaller pictures of a folder are skipped and told; give the side of your crops.
+        min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.

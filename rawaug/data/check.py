@@ -1,8 +1,8 @@
-"""What is in a folder: which dataset, how much of it, of which sizes, patterns and levels, and what is broken.
+"""Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
-Everything is read once, as training would read it. A folder is recognised by the names that its publishers gave to the
-files; what has none of these is a folder of RAW files, of pictures, or both. Reading takes place in a process of its
-own: where a damaged file crashes the library that decodes it, the file is named, and another process goes on. (RAW
+Everything is read once, as training would read it. A folder is recognised by its publisher's file
+names; anything else is a folder of RAW files, of pictures, or both. Reading takes place in a separate process: where a
+damaged file crashes its decoder, the file is named and a new process continues. (RAW
 files are read in this one: LibRaw's threads do not survive a fork.)
 """
 
@@ -43,11 +43,11 @@ class PartReport:
     """One kind of data in a folder.
 
     Attributes:
-        what: it was recognised as.
+        what: the kind of data.
         items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
         sizes, cfas, cameras, levels: how often each occurs among those that could be read.
         signal: least and greatest value of RAW.
-        broken: one line each, naming the file.
+        broken: one line per damaged file, with its name.
     """
 
     what: str
@@ -61,7 +61,7 @@ class PartReport:
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: PartReport) -> None:
-        """Count what another report tells; one damaged file of many blocks is one line."""
+        """Add another report's counts; a damaged file of many blocks is one line."""
         for name in ("sizes", "cfas", "cameras", "levels"):
             getattr(self, name).update(getattr(other, name))
         if other.signal is not None:
@@ -100,15 +100,15 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None) -> DataReport:
-    """Recognise what is in a folder (or a file to be handed in to SIDD) and read it.
+    """Identify the data in a folder (or a SIDD submission) and read it.
 
     Args:
         path: a folder, a RAW file, or a SIDD submission.
-        first: read only so many of each kind.
+        first: read at most this many items of each kind.
 
     Raises:
         FileNotFoundError: if there is no such path.
-        ValueError: if nothing in it is known.
+        ValueError: if it contains no known data.
     """
     path = Path(path)
     if not path.exists():
@@ -122,7 +122,7 @@ def check(path: str | Path, first: int | None = None) -> DataReport:
 
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The published datasets that the names in a folder tell of, and how to open each."""
+    """The published datasets recognised by file names, and how to open each."""
     files = {name for _, _, names in os.walk(path) for name in names}
     scenes = {Path(parent) for parent, _, names in os.walk(path) if is_scene(Path(parent).name) and names}
     if any("GT_RAW" in file.name.upper() for scene in scenes for file in scene.iterdir()):
@@ -200,7 +200,7 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
 
 
 class _Facts(Dataset[PartReport]):
-    """What a report tells of each item by itself."""
+    """One report per item."""
 
     def __init__(self, items: Any) -> None:
         self.items = items

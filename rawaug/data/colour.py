@@ -1,4 +1,4 @@
-r"""Colour of frames whose files tell it as a DNG does, and their plain development.
+r"""Colour from DNG-style metadata, and a plain development.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 

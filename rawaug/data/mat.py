@@ -1,4 +1,4 @@
-"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, told apart by their header.
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header.
 
 A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
 naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
@@ -71,7 +71,7 @@ def read_value(path: str | Path, name: str) -> Any:
 def _read(path: Path, name: str, plain: bool) -> Any:
     if mat_version(path) == "5":
         return _read_5(path, name, plain)
-    with _damage_told(path):
+    with _as_os_error(path):
         import h5py
 
         with h5py.File(path, "r") as file:
@@ -83,7 +83,7 @@ def _read(path: Path, name: str, plain: bool) -> Any:
 def _read_5(path: Path, name: str, plain: bool) -> Any:
     from scipy.io import loadmat, whosmat
 
-    with _damage_told(path):
+    with _as_os_error(path):
         variables = loadmat(path, variable_names=[name], simplify_cells=plain)
         if name not in variables:
             raise _missing(path, name, [found for found, *_ in whosmat(path)])
@@ -91,7 +91,7 @@ def _read_5(path: Path, name: str, plain: bool) -> Any:
 
 
 @contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
+def _as_os_error(path: Path) -> Iterator[None]:
     """The many ways in which the libraries fail on a damaged file as one OSError that names it."""
     import zlib
 

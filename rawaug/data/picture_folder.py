@@ -2,8 +2,8 @@
 
 Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
 cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
-whatever order, with any number of workers. What was found lies in memory that all workers share, so that the process
-which made the dataset can tell it, and so that nobody opens a bad file twice.
+whatever order, with any number of workers. Damaged files are marked in memory shared by all workers, so that
+the main process can report them and no worker opens one twice.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
     After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
-    a warning; :attr:`skipped` and :meth:`report` tell them at any time.
+    a warning; :attr:`skipped` and :meth:`report` list them at any time.
 
     Args:
         path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
-        min_side: smaller pictures are skipped; give the side of your crops. A mosaic has sides of 2 at least.
+        min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
         max_pixels: larger pictures are skipped.
         allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
 
@@ -63,7 +63,7 @@ class PictureFolder(Dataset[Tensor]):
             raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
         self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
         self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
-        self._epochs_told = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._reasons: dict[int, str] = {}
 
     def __len__(self) -> int:
@@ -136,12 +136,12 @@ class PictureFolder(Dataset[Tensor]):
         return None
 
     def _count(self) -> None:
-        """Count a reading; whoever completes an epoch tells what was skipped (two may, if they do so at once)."""
+        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
         worker = get_worker_info()
         self._read[(0 if worker is None else 1 + worker.id) % _COUNTERS] += 1
         epoch = int(self._read.sum()) // len(self)
-        if epoch > self._epochs_told[0]:
-            self._epochs_told[0] = epoch
+        if epoch > self._epochs_logged[0]:
+            self._epochs_logged[0] = epoch
             if self._bad.any():
                 _log.warning("%s", self.report())
 

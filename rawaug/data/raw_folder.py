@@ -35,7 +35,7 @@ class RawFolder(LazyPairs):
 
     Args:
         path: where the RAW files are.
-        camera_jpeg: False takes LibRaw's rendering always.
+        camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
 
     Raises:
@@ -85,7 +85,7 @@ def _centre(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """Stems, with as much of the path before them as tells equal ones apart."""
+    """File stems, or paths where two stems are equal."""
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         above = os.path.commonpath([file.resolve().parent for file in files])

@@ -2,8 +2,8 @@
 
 A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
 be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
-Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). No file tells white balance or colour
-matrix in a way that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). There is no white balance or colour
+matrix in a form that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
 
 The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
 "Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
@@ -89,7 +89,7 @@ def picture_beside(file: Path) -> Path:
     """The picture of the same stem.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such picture.
     """
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():

@@ -4,7 +4,7 @@ r"""Zurich RAW to RGB: crops of a Huawei P20's RAW, and of the same scenes by a 
 
 for the numbers d of ``SPLIT/huawei_raw/0.png``, a PNG of 16 bits with 10 of them used, RGGB, 448 x 448; the picture is
 ``SPLIT/canon/0.jpg``. It was taken by another camera from another place: the pairs are not registered, and no camera's
-ISP leads from one to the other. The files tell no white balance: gains are 1, the colour matrix is the identity.
+ISP leads from one to the other. The files have no white balance: gains are 1, the colour matrix is the identity.
 
 Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing mobile camera ISP with a single deep learning model", CVPR
 workshops 2020, whose loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning

@@ -44,10 +44,10 @@ def write_dng(
     Args:
         path: the file, in a folder that exists.
         frame: its mosaic is rounded to digital numbers by its own levels; orientation, colour, noise profile, exposure
-            and gain maps are told by tags. ``iso`` and ``exposure`` are written where there is no source with EXIF.
-        source: the RAW file that the frame was read from: what it tells besides (a DNG's profiles, opcodes and crop;
+            and gain maps are written as tags; ``iso`` and ``exposure`` too, unless the source has EXIF.
+        source: the RAW file that the frame was read from: its other metadata (a DNG's profiles, opcodes and crop;
             EXIF, GPS and XMP of any TIFF) is kept.
-        baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own is kept in its place.
+        baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own value takes precedence.
 
     Raises:
         ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain,
@@ -64,7 +64,7 @@ def write_dng(
     numbers = digital_numbers(frame, path)
     size = numbers.shape[0], numbers.shape[1]
     carried = read_carried_tags(Path(source), size) if source is not None else CarriedTags("<", {}, {})
-    # an Exif directory of our own where none is carried
+    # write an Exif directory if the source has none
     directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
     directories = {name: entries for name, entries in directories.items() if entries}
     own = _camera(frame) if _DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
@@ -134,7 +134,7 @@ def _camera(frame: RawFrame) -> dict[int, Tag]:
 
 
 def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
-    """What a DNG source tells by itself, or does not tell."""
+    """Tags that a DNG source has itself, or lacks on purpose."""
     tags: list[Tag] = [
         (_DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
         (50707, BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0)), True),

@@ -1,4 +1,4 @@
-r"""Lens shading as a DNG tells it: the GainMap opcodes of its OpcodeList2 and OpcodeList3.
+r"""Lens shading in DNG: the GainMap opcodes of its OpcodeList2 and OpcodeList3.
 
     corrected(i, j) = gain((i + 1/2) / H, (j + 1/2) / W) y(i, j)
 
@@ -33,7 +33,7 @@ class GainMap:
 
     Attributes:
         area: top, left, bottom, right in pixels of the visible frame.
-        pitch: every so many rows and columns of ``area``, from its first on.
+        pitch: step in rows and columns within ``area``.
         planes: first colour plane, and how many.
         origin, spacing: of the grid, (vertical, horizontal), in parts of the frame's height and width.
         gains: float32 ``(P, V, H)``; further planes than P take the last one.
@@ -50,10 +50,10 @@ class GainMap:
 
 
 def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
-    """The gain maps of an opcode list; its other opcodes are passed over.
+    """The gain maps of an opcode list; its other opcodes are skipped.
 
     Raises:
-        ValueError: if the list ends in the middle of an opcode, or a grid is empty or makes no sense.
+        ValueError: if the list ends in the middle of an opcode, or a grid is empty or invalid.
     """
     maps = []
     try:

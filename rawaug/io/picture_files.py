@@ -25,7 +25,7 @@ from rawaug.bayer import turn
 from rawaug.io.icc import to_srgb
 
 MAX_PIXELS = 2**28
-"""Larger pictures (16384 x 16384) are refused unless told otherwise: a few bytes of header can claim any size."""
+"""Larger pictures (16384 x 16384) are refused by default, since a few header bytes can claim any size."""
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
@@ -60,8 +60,8 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        OSError: if the file is no picture, or is cut short.
-        ValueError: if its header tells more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
+        OSError: if the file is not a picture, or is truncated.
+        ValueError: if its header declares more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
             CIELAB, more than four channels, a damaged profile), or leave [0, 1].
 
     Example:
@@ -113,7 +113,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 @contextmanager
 def _text_damage_told(path: Path) -> Iterator[None]:
-    """Texts of a damaged header that are no UTF-8 fail in OpenImageIO's binding."""
+    """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -143,7 +143,7 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
-    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python holds bytes that are no UTF-8
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
         raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
     source = oiio.ImageInput.open(str(path))
     if source is None:
@@ -152,8 +152,8 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
     spec.attribute(_FORMAT, source.format_name())
     _require_size(spec, path, max_pixels)
     pixels = source.read_image(kind(spec))
-    error = source.geterror()  # set also where a decoder filled up a file that is cut short
-    # a GIF tells of its movement only where its frames have a duration
+    error = source.geterror()  # also set where a decoder padded a truncated file
+    # a GIF is marked as animated only if its frames have a duration
     moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
     source.close()
     if moves:

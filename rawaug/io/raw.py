@@ -43,20 +43,20 @@ class RawFrame:
     Attributes:
         mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
         cfa: the pattern of ``mosaic``.
-        black: levels of the sites R, Gr, Gb, B, in digital numbers; with the fractions that a DNG tells.
+        black: levels of the sites R, Gr, Gb, B, in digital numbers, with a DNG's fractions.
         white: the saturated level, in digital numbers.
         white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
         daylight: the multipliers for the white of sRGB (D65), green being 1.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1: the one that
-            LibRaw renders with, or a typical camera's where the file and LibRaw tell nothing.
-        camera: make and model, ``"unknown"`` where the file does not tell.
-        iso: None where the file does not tell.
+            LibRaw renders with, or a typical camera's if neither the file nor LibRaw has one.
+        camera: make and model, or ``"unknown"``.
+        iso: None if unknown.
         noise_profile: (shot_var, read_var) of a DNG's NoiseProfile tag, the mean over planes; None without one.
         orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
         name: the file's name without extension.
         color_known: false where ``color_matrix`` is the typical one.
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
-        exposure: seconds, f-number, focal length in mm and EXIF date, each None where the file does not tell.
+        exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
     """
 
     mosaic: Tensor
@@ -94,8 +94,8 @@ def read_raw(path: str | Path) -> RawFrame:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        OSError: if LibRaw cannot read it, or it is cut short.
-        ValueError: if it holds no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
+        OSError: if LibRaw cannot read it, or it is truncated.
+        ValueError: if it has no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
 
     Example:
         >>> frame = read_raw("shot.dng")  # doctest: +SKIP
@@ -116,7 +116,7 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
 
     The rendering has the camera's white balance, no automatic brightness, and LibRaw's default tone curve (that of
     BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum where that exceeds this part of
-    white (its default is 0.75): a digital gain that the file does not tell.
+    white (its default is 0.75): a digital gain that is not recorded in the file.
 
     LibRaw renders with OpenMP, whose threads do not survive a fork: render in the main process, or start DataLoader
     workers with ``multiprocessing_context="forkserver"``.
@@ -182,7 +182,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     with np.errstate(all="raise"):
         matrix, color_known = _color_matrix(raw)
     white_balance = _white_balance(raw)
-    other = getattr(raw, "other", None)  # rawpy tells since 0.27
+    other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     return RawFrame(
         mosaic=_normalised(raw.raw_image_visible, black, white),
         cfa=cfa,
@@ -203,11 +203,11 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with the fractions that a DNG tells."""
+    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
     levels = raw.black_level_per_channel
     black = np.array([[levels[k] for k in row] for row in cell], np.float32)
-    told = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
-    return told if np.abs(told - black).max() < 1 else black
+    exact = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
+    return exact if np.abs(exact - black).max() < 1 else black
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:

@@ -78,7 +78,7 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
 def noise_model(
     spec: str | Sequence[float] | Sequence[str] | NoiseModel, *, iso: Iso = None, poisson: bool = False
 ) -> NoiseModel:
-    """The shot and read noise of a name or of (shot_var, read_var); a model is handed back as it is.
+    """The shot and read noise of a name or of (shot_var, read_var); a model is returned as it is.
 
     Args:
         spec: one of :func:`noise_names`, a list of them (each picture draws one), a pair of variances on the scale

@@ -21,7 +21,7 @@ _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """``read_var`` of pixels, ``row_var`` of banding (0 where there is none to see), and the black level's error in
+    """``read_var`` of pixels, ``row_var`` of banding (0 if not measurable), and the black level's error in
     R, Gr, Gb, B. Fixed pattern noise is part of ``read_var``."""
 
     read_var: float

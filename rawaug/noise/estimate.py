@@ -61,7 +61,7 @@ class NoisePoints:
 class NoiseEstimate:
     """What was fitted: the line, its standard errors, R^2 over the used points, and the points themselves.
 
-    ``read_var`` is 0 where the files cannot tell it from none: the best line would have been negative at black.
+    ``read_var`` is 0 where it is not measurable: the best line would have been negative at black.
     """
 
     shot_var: float
@@ -95,7 +95,7 @@ def estimate_noise(
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
             left out, and those near another level of clipping, where the file's lowest or highest value piles up.
         cfa: the pattern, of all of them.
-        read_var: where dark frames tell it (:func:`from_dark_frames`); else it is fitted too.
+        read_var: known from dark frames (:func:`from_dark_frames`); fitted too if omitted.
 
     Raises:
         ValueError: if there are too few flat regions, or they do not span a range of signals.

@@ -92,7 +92,7 @@ class Preset:
     """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``.
 
     Raises:
-        ValueError: if there is none of this name.
+        ValueError: if the name is unknown.
     """
 
     def __init__(self, name: str) -> None:

@@ -34,7 +34,7 @@ from rawaug.seeding import derived_seed, keyed_generator
 Params = dict[str, Tensor]
 
 _NO_SHOT = 1e-30
-"""Stands for a shot_var of 0, so that it can be divided by: too small for any effect on the picture."""
+"""Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
 """Values whose photons are counted together: many small pictures, or one large."""
 
@@ -55,7 +55,7 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        """The noisy RAW before the clip at white: what composed models hand on to one another.
+        """The noisy RAW before the clip at white: what composed models pass on to one another.
 
         Args:
             clean: packed RAW ``(B, 4, h, w)``.
@@ -67,7 +67,7 @@ class NoiseModel(ABC):
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         """The variance map ``(B, 4, h, w)`` of the noise on signal ``clean``, before the clip at white.
 
-        It evaluates the law at whatever signal it is handed. In training that may be the clean signal; at test time
+        It evaluates the law at whatever signal it is given. In training that may be the clean signal; at test time
         only the noisy one is known, and it is what UPI's networks are given (Brooks et al. 2019).
         """
 
@@ -85,7 +85,7 @@ class NoiseModel(ABC):
         return self.disturb(clean, params).clamp_(max=1.0)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
-        """Noisy RAW as of :meth:`apply`, and its variance map as the noisy signal tells it, at once."""
+        """Noisy RAW as in :meth:`apply` and its variance map computed from the noisy signal, in one pass."""
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 

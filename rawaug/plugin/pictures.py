@@ -1,9 +1,9 @@
-"""Pictures as people have them, brought to one form: RGB, channels first, 8 bits or float32 in [0, 1].
+"""Pictures in any common form, converted to one: RGB, channels first, 8 bits or float32 in [0, 1].
 
-A *picture* is a tensor, a NumPy array or a PIL picture, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
+A *picture* is a tensor, a NumPy array or a PIL image, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
 in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out. A
-*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is such a thing
-itself, or a tuple or mapping that has it among other fields.
+*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is one of
+these, or a tuple or mapping with one among its fields.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
 
 Where = str | int | None
-"""Where in a sample the picture stands: a key, an index, or None where the sample is the picture."""
+"""Where the picture is in a sample: a key, an index, or None if the sample is the picture."""
 
 
 def to_rgb_tensor(picture: Any) -> Tensor:
@@ -66,7 +66,7 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
     """Pictures ``(3, H, W)`` to ``(B, 3, H, W)``; where only some are 8 bits, all become float32.
 
     Raises:
-        ValueError: if their sizes differ, or there is none.
+        ValueError: if their sizes differ, or the list is empty.
     """
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
@@ -92,12 +92,12 @@ def even_sided(image: Tensor) -> Tensor:
 
 
 def is_picture(value: Any) -> bool:
-    """Whether ``value`` is one picture: a PIL picture, or a tensor or array with two or three axes."""
+    """Whether ``value`` is one picture: a PIL image, or a tensor or array with two or three axes."""
     return value.ndim in (2, 3) if isinstance(value, (Tensor, np.ndarray)) else hasattr(value, "getbands")
 
 
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
-    """Where the picture (``batched``: the pictures) of a sample stands.
+    """Where the picture (``batched``: the pictures) of a sample is.
 
     Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first. A batch that is a list of
     pictures is not taken apart.
@@ -123,7 +123,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
 
 def picked(sample: Any, where: Where) -> Any:
-    """What stands there."""
+    """The value at ``place``."""
     return sample if where is None else sample[where]
 
 

@@ -29,7 +29,7 @@ PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg"
 """More photographs of the user's sRGB folder, of which the camera has no RAW."""
 
 PAIRS = {"train": 5, "validation": 4, "test": 9}
-"""Number of pairs of a split unless told otherwise."""
+"""Default number of pairs of a split."""
 
 FRAME = (288, 448)
 """Height and width of every frame."""

@@ -35,7 +35,7 @@ _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\
 
 
 class SiddFrames(LazyPairs):
-    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set too where it lies there.
+    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set if present.
 
     Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
     Where a frame's ``GT_SRGB`` picture is not there, the clean frame is developed as the dataset's makers did.
@@ -122,7 +122,7 @@ def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
-    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``; maybe none.
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any.
 
     Raises:
         ValueError: if the file has other columns.
@@ -162,7 +162,7 @@ def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
 
 
 class Colour(NamedTuple):
-    """What a METADATA file tells: gains, colour matrix, and the view that shows the frame upright."""
+    """Gains, colour matrix and upright view from a METADATA file."""
 
     white_balance: tuple[float, float, float]
     matrix: Tensor
