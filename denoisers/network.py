@@ -148,7 +148,8 @@ class Denoiser(nn.Module, ABC):
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
         """Draw all convolutions anew (He et al. 2015), biases zero; ``zeros`` become zero altogether.
 
-        A weight has the standard deviation ``gain / sqrt(fan in)``. The numbers come from a CPU generator of ``seed``: the same on every device, and the global state is untouched.
+        A weight has the standard deviation ``gain / sqrt(fan in)``. The numbers come from a CPU generator of ``seed``:
+        the same on every device, and the global state is untouched.
         """
         generator = torch.Generator("cpu").manual_seed(seed)
         for module in self.modules():
