@@ -139,7 +139,7 @@ def launched(device: str, devices: int, precision: str) -> Any:
 
 
 def running_average(decay: float) -> Any:
-    """``average <- d average + (1 - d) weights`` with d = ``decay``, less at first: (1 + n) / (10 + n) after n steps."""
+    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
 
     @torch.no_grad()
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
