@@ -53,7 +53,7 @@ def test_missing_frames_are_told(folder: Path) -> None:
         open_pairs(f"fivek_nikon:{folder}:train")
     with pytest.raises(ValueError, match="fivek: no split validation; use one of InvISP's: train, test"):
         open_pairs(f"fivek:{folder}", split="validation")
-    with pytest.raises(ValueError, match="fivek: no camera sony; there are canon, nikon"):
+    with pytest.raises(ValueError, match="fivek: no camera sony; use one of canon, nikon"):
         fivek_pairs(folder, "test", ["sony"])
     with pytest.raises(FileNotFoundError, match="no such folder of FiveK"):
         fivek_pairs(folder / "none", "test", CAMERAS)

@@ -40,7 +40,7 @@ def test_the_version_is_that_of_the_header(tmp_path: Path, mat73: Writer) -> Non
     with pytest.raises(ValueError, match=r"older\.mat: is not a MATLAB file of version 5 or 7\.3"):
         mat_version(tmp_path / "older.mat")
     (tmp_path / "empty.mat").touch()
-    with pytest.raises(ValueError, match=r"empty\.mat: is no MATLAB file"):
+    with pytest.raises(ValueError, match=r"empty\.mat: is not a MATLAB file"):
         mat_version(tmp_path / "empty.mat")
     with pytest.raises(FileNotFoundError, match=r"none\.mat: no such MATLAB file"):
         mat_version(tmp_path / "none.mat")

@@ -91,7 +91,7 @@ def test_nothing_to_read_is_named(tmp_path: Path) -> None:
         RawFolder(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
         RawFolder(tmp_path / "none.dng")
-    with pytest.raises(ValueError, match="flickr:x: no such kind of data; there are demo:"):
+    with pytest.raises(ValueError, match="flickr:x: unknown kind of data; use demo:"):
         open_pairs("flickr:x")
 
 

@@ -52,7 +52,7 @@ def test_what_is_wrong_is_told(tmp_path: Path) -> None:
         Rawir(tmp_path)[0]
     assert Rawir(tmp_path, white=4095)[0].raw.max().item() == pytest.approx(1207 / 4095)
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 8), np.uint16))
-    with pytest.raises(ValueError, match=r"packed RAW is unsigned \(h, w, 4\), got uint16 \(4, 6, 8\)"):
+    with pytest.raises(ValueError, match=r"packed RAW must be unsigned \(h, w, 4\), got uint16 \(4, 6, 8\)"):
         Rawir(tmp_path)[0]
     np.save(tmp_path / "a.npy", np.array([{"code": "to run"}], object), allow_pickle=True)
     with pytest.raises(OSError, match=r"a\.npy: cannot be read as an array"):

@@ -189,7 +189,7 @@ def test_what_16_bits_cannot_hold_is_refused(tmp_path: Path) -> None:
         write_dng(tmp_path / "a.dng", noisy)
     with pytest.raises(ValueError, match=r"a\.dng: levels must satisfy 0 <= black < white <= 65535"):
         write_dng(tmp_path / "a.dng", dataclasses.replace(frame, white=65536.0))
-    with pytest.raises(ValueError, match=r"a\.dng: a mosaic to write is \(1, H, W\) with even sides"):
+    with pytest.raises(ValueError, match=r"a\.dng: the mosaic must be \(1, H, W\) with even sides"):
         write_dng(tmp_path / "a.dng", dataclasses.replace(frame, mosaic=torch.zeros(1, 5, 4)))
     assert not list(tmp_path.iterdir())
 

@@ -74,7 +74,7 @@ def test_what_is_cut_short_is_refused() -> None:
     opcodes = opcode_list([a_map()])
     with pytest.raises(ValueError, match="is incomplete"):
         parse_gain_maps(opcodes[:-4], on_mosaic=True)
-    with pytest.raises(ValueError, match="cut short"):
+    with pytest.raises(ValueError, match="truncated"):
         parse_gain_maps(opcodes[:10], on_mosaic=True)
     for nonsense in (a_map(spacing=(0.0, 0.25)), a_map(gains=torch.full((1, 3, 5), torch.nan))):
         with pytest.raises(ValueError, match="is no map"):

@@ -68,7 +68,7 @@ def test_values_outside_the_unit_range_are_refused(tmp_path: Path) -> None:
     write_with_oiio(tmp_path / "bright.exr", np.full((4, 4, 3), 1.7, np.float32), "float")
     with pytest.raises(ValueError, match=r"bright\.exr: has values from 1\.7 to 1\.7, expected \[0, 1\]"):
         read_picture(tmp_path / "bright.exr")
-    with pytest.raises(ValueError, match="not in"):
+    with pytest.raises(ValueError, match="expected"):
         write_picture(tmp_path / "nan.png", torch.full((3, 4, 4), float("nan")))
 
 

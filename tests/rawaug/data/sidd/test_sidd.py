@@ -230,7 +230,7 @@ def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
     block = torch.full((1, SIDE, SIDE), 0.5)
     with pytest.raises(ValueError, match="a submission must have 1280 blocks, got 3"):
         write_submission(tmp_path / "a.csv", [block] * 3, SIDE)
-    with pytest.raises(ValueError, match=r"block 1: a block has shape \(1, 256, 256\), got \(1, 8, 8\)"):
+    with pytest.raises(ValueError, match=r"block 1: must have shape \(1, 256, 256\), got \(1, 8, 8\)"):
         write_submission(tmp_path / "a.csv", [torch.zeros(1, 256, 256), block])
     with pytest.raises(ValueError, match="block 0: holds values that are not finite"):
         write_submission(tmp_path / "a.csv", [block * float("nan")], SIDE)
@@ -271,7 +271,7 @@ def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer
     assert len(open_pairs(f"sidd:{tmp_path}", split="train")) == 1 == len(open_pairs(f"sidd:{tmp_path}:train"))
     with pytest.raises(ValueError, match=r"no split validation; use train \(full frames\)"):
         open_pairs(f"sidd:{tmp_path}", split="validation")
-    with pytest.raises(FileNotFoundError, match=r"holds no ValidationGtBlocksRaw\.mat"):
+    with pytest.raises(FileNotFoundError, match=r"contains no ValidationGtBlocksRaw\.mat"):
         open_pairs(f"sidd:{tmp_path}")
     with pytest.raises(ValueError, match="sidd:: say where the data are, sidd:PATH"):
         open_pairs("sidd:")
