@@ -25,7 +25,7 @@ def describe(weights: str | Path) -> str:
     """Kind, size, settings and, for an ISP, its atoms as numbers.
 
     Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it is not rawaug's.
+        FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
     """
     path = find_weights(weights)
     kind = read_header(path)["kind"]

@@ -125,7 +125,7 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
 
 
 def _swatches(axis: Any, isp: DictionaryISP) -> None:
-    """One row an atom: what it makes of sRGB red, green, blue, white, skin and sky."""
+    """One row per atom: the result for sRGB red, green, blue, white, skin and sky."""
     tones = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])
     patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
     axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")

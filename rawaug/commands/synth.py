@@ -264,15 +264,15 @@ def _make(task: _Task) -> str | None:
 
 
 def print_synthesis(result: Synthesis) -> None:
-    """A short table, and the broken pictures by name."""
+    """A short table, and the unreadable pictures by name."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=str(result.out))
-    for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
+    for column in ("pictures", "pairs made", "existing", "unreadable", "time (s)"):
         table.add_column(column, justify="right")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
     Console(width=100).print(table)
     for reason in result.broken.values():
-        print(f"broken: {reason}")
+        print(f"unreadable: {reason}")

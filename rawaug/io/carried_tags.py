@@ -75,7 +75,7 @@ class CarriedTags:
 
 
 def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
-    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing where it is no TIFF.
+    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing if it is not a TIFF.
 
     A DNG gives all tags of its first directory and of the mosaic's; another TIFF (NEF, CR2, ARW, ...), whose private
     tags mean something else, its description, author, XMP, EXIF and GPS.

@@ -1,4 +1,4 @@
-r"""What a sensor adds to shot and read noise, each a model of its own that composes with the others.
+r"""Sensor noise beyond shot and read noise, each effect a model that composes with the others.
 
 Row noise (banding), heavy-tailed read noise, the offset of the black level, the bias of a colour, dead and hot pixels
 and the rounding to digital numbers; after Wei et al., "A physics-based noise formation model for extreme low-light raw

@@ -1,7 +1,7 @@
 """Built-in data: a few photographs, dead leaves textured from them, and shots of both by the demo camera.
 
 The photographs are files of scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
-of texture. As for a camera at hand, there are few RAW pairs and many sRGB pictures.
+of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 """
 
 from __future__ import annotations

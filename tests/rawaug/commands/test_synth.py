@@ -180,7 +180,7 @@ def test_the_command(tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixtu
     command = ["synth", str(pictures), str(tmp_path / "out"), "--noise", "[0.001, 1e-5]", "--workers", "0"]
     assert main([*command, "--per-image", "2"]) == 0
     text = capsys.readouterr().out
-    assert "pairs made" in text and "broken:" in text and "broken.jpg" in text
+    assert "pairs made" in text and "unreadable:" in text and "broken.jpg" in text
     assert main([*command, "--format", "npz"]) == 2
     assert "made with format dng, not npz" in capsys.readouterr().err
 
