@@ -93,7 +93,7 @@ class Denoiser(nn.Module, ABC):
     ) -> None:
         super().__init__()
         if domain != "linear" and domain not in DOMAINS:
-            raise ValueError(f"domain {domain!r} is none of linear, {', '.join(DOMAINS)}")
+            raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         self.domain = domain
         self.channels = channels
         self.variance_map = variance_map
@@ -129,7 +129,7 @@ class Denoiser(nn.Module, ABC):
             return noisy + self._correction(noisy)
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
-            raise ValueError(f"{name} was made with {needed}: pass the noise variance of each value")
+            raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
         if self.domain == "linear":

@@ -46,7 +46,7 @@ def train(
     estimator: Supervised | None = None,
     choose: bool = True,
 ) -> Denoiser:
-    """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
+    """Train a denoiser, resuming from the last checkpoint in ``folder``, if any.
 
     Args:
         stream: keyed samples.
@@ -109,12 +109,12 @@ def train(
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
             write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
-        told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
-        bar.set_postfix_str(told, refresh=False)
+        status = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
+        bar.set_postfix_str(status, refresh=False)
     if journal is not None:
         journal.close()
     if not math.isfinite(best["psnr"]):
-        raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
+        raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
     trained.load_state_dict(best["net"])
     trained.cpu().to(memory_format=torch.contiguous_format)
     return estimator.corrected(trained).eval()
@@ -185,7 +185,7 @@ def write_atomically(state: dict[str, Any], path: Path) -> None:
 
 
 class Journal:
-    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: what a killed run told beyond it is dropped."""
+    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: later entries of a killed run are dropped."""
 
     def __init__(self, folder: Path, start: int) -> None:
         from torch.utils.tensorboard.writer import SummaryWriter

@@ -156,7 +156,7 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
         model(noisy)
     # The same picture at twice the gain is the same problem, whose solution is twice as bright.
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="domain 'log' is none of linear, ksigma, anscombe"):
+    with pytest.raises(ValueError, match="domain 'log' is unknown; use one of linear, ksigma, anscombe"):
         make(domain="log")
 
 

@@ -59,13 +59,13 @@ class FitConfig:
     def __post_init__(self) -> None:
         for key in ("atoms", "pixels", "batch"):
             if getattr(self, key) < 1:
-                raise ValueError(f"{key} is at least 1, got {getattr(self, key)}")
+                raise ValueError(f"{key} must be at least 1, got {getattr(self, key)}")
         for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
             if getattr(self, key) not in values:
-                raise ValueError(f"{key} is {' or '.join(values)}, got {getattr(self, key)!r}")
+                raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
-            raise ValueError(f"isp: unknown {sorted(unknown)}; there are {[key.name for key in fields(ISPConfig)]}")
+            raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
         if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs the stage tone or gamma")
         if self.steps < 0 or self.reach < 1:
-            raise ValueError(f"steps is at least 0 and reach at least 1, got {self.steps} and {self.reach}")
+            raise ValueError(f"steps must be at least 0 and reach at least 1, got {self.steps} and {self.reach}")

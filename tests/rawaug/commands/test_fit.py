@@ -130,7 +130,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     monkeypatch.setattr(Descent, "_keep", stop)
     fit(out, *frames, status=INTERRUPTED)
     assert state.is_file() and not out.exists()
-    assert "the same command goes on from here" in capsys.readouterr().err
+    assert "run the same command again to resume" in capsys.readouterr().err
     stopped = state.read_bytes()
     monkeypatch.setattr(Descent, "_keep", kept)
     monkeypatch.setattr(Descent, "_restore", noted)

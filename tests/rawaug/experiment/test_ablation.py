@@ -137,7 +137,7 @@ def _told_in_full(result: dict[str, Any], folder: Path, said: str) -> None:
 
 def test_one_frame_leaves_none_to_fit(monkeypatch: pytest.MonkeyPatch, frame_of: FrameOf) -> None:
     monkeypatch.setattr(ablation, "open_pairs", lambda spec, split: [frame_of("a")])
-    with pytest.raises(ValueError, match="data: lonely has 1 frame; leaving one out needs two or more"):
+    with pytest.raises(ValueError, match="data: lonely has 1 frame; leave-one-out needs two or more"):
         ablate(Ablation(data="lonely"))
 
 

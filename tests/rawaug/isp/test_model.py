@@ -149,9 +149,9 @@ def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, tol
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance is positive"),
-        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance is positive"),
-        ({"digital_gain": 0.0}, "digital_gain is positive"),
+        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
+        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance must be positive"),
+        ({"digital_gain": 0.0}, "digital_gain must be positive"),
         ({"raw_samples": torch.zeros(2, 0, 3)}, "row, column, value"),
         ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "not a number"),
     ],
@@ -163,11 +163,11 @@ def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any]
 
 def test_pictures_out_of_range_and_parameters_of_others_are_refused(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
-    with pytest.raises(ValueError, match="a float picture is in"):
+    with pytest.raises(ValueError, match="a float picture must be in"):
         isp.reverse(255.0 * srgb)
     with pytest.raises(ValueError, match="uint8, or float32"):
         isp.reverse(srgb.double())
-    with pytest.raises(ValueError, match="the parameters are those of 1 pictures, the batch has 2"):
+    with pytest.raises(ValueError, match="the parameters are for 1 pictures, but the batch has 2"):
         isp.reverse(srgb, isp.choose(srgb[:1]))
 
 
@@ -192,7 +192,7 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
         ({"stages": ("tone", "tone")}, "at most once"),
         ({"stages": ()}, "stages: none"),
         ({"encoder_widths": (8, 8)}, "are three"),
-        ({"knee": 1.0}, "knee is in"),
+        ({"knee": 1.0}, "knee must be in"),
         ({"gain_atoms": 0}, "at least 1"),
     ],
 )
