@@ -227,7 +227,7 @@ def test_unet_has_the_published_features() -> None:
         (lambda: DHDN(width=5), "positive multiple of 2"),
         (lambda: UNet(scales=0), "scales must be at least 1"),
         (lambda: DnCNN(depth=1), "depth must be at least 2"),
-        (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "as many scales as each other"),
+        (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "the same number of scales"),
     ],
 )
 def test_impossible_settings_are_refused(make_bad: Make, message: str) -> None:

@@ -62,7 +62,7 @@ def test_weights_are_found_by_name_and_by_path(tmp_path: Path) -> None:
         == WEIGHTS / "universal.safetensors"
         == find_weights(WEIGHTS / "universal.safetensors")
     )
-    with pytest.raises(FileNotFoundError, match=r"nothing: no such weights.*universal"):
+    with pytest.raises(FileNotFoundError, match=r"nothing: not found.*universal"):
         find_weights("nothing")
 
 

@@ -160,9 +160,9 @@ def test_the_command(tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pyt
     assert main([*command, "--noise", "[0.002, 1e-5]"]) == 0
     assert "shot_var 0.002, read_var 1e-05 (given)" in capsys.readouterr().out
     assert main(["denoise", str(source), str(source), "--denoiser", str(identity)]) == 2
-    assert "is the file to denoise" in capsys.readouterr().err
+    assert "is the input file" in capsys.readouterr().err
     assert main(["denoise", str(source), str(tmp_path / "b.tif"), "--denoiser", str(identity)]) == 2
-    assert "name that ends in .dng" in capsys.readouterr().err
+    assert "name ending in .dng" in capsys.readouterr().err
     assert main(["denoise", str(tmp_path / "gone.dng"), str(tmp_path / "b.dng"), "--denoiser", str(identity)]) == 2
     assert "gone.dng: no such RAW file" in capsys.readouterr().err
 

@@ -82,10 +82,10 @@ def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="box 1: a denoised box must be finite"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), torch.full((1, 6, 8), torch.nan)])
     write_dnd_submission(tmp_path / "a", [torch.zeros(1, 8, 6)] * 1000)
-    with pytest.raises(ValueError, match=r"0001\.mat: box 1 is float32 \(6, 8\), got float32 \(8, 6\)"):
+    with pytest.raises(ValueError, match=r"0001\.mat: box 1 must be float32 \(6, 8\), got float32 \(8, 6\)"):
         check_dnd_submission(tmp_path / "a", dnd)
     write_dnd_submission(tmp_path / "a", [torch.full((1, 6, 8), 1.5)] * 1000)
-    with pytest.raises(ValueError, match=r"box 1 runs from 1\.5 to 1\.5; clip it"):
+    with pytest.raises(ValueError, match=r"box 1 has values from 1\.5 to 1\.5; clip it"):
         check_dnd_submission(tmp_path / "a", dnd)
     (tmp_path / "a" / "0050.mat").unlink()
     write_dnd_submission(tmp_path / "b", [crop.noisy for crop in dnd])

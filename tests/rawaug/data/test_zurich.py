@@ -57,7 +57,7 @@ def test_what_is_wrong_is_told(folder: Path) -> None:
     Image.fromarray(np.full((4, 4), 5000, np.uint16)).save(folder / "test" / "huawei_raw" / "0.png")
     with pytest.raises(ValueError, match=r"0\.png: has value 5000, more than 10 bits"):
         Zurich(folder, "test")[0]
-    with pytest.raises(ValueError, match="zurich: no split validation; there are train and test"):
+    with pytest.raises(ValueError, match="zurich: no split validation; use train or test"):
         open_pairs(f"zurich:{folder}", "validation")
     with pytest.raises(FileNotFoundError, match="no such folder of Zurich"):
         Zurich(folder / "train")

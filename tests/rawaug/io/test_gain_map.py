@@ -77,5 +77,5 @@ def test_what_is_cut_short_is_refused() -> None:
     with pytest.raises(ValueError, match="truncated"):
         parse_gain_maps(opcodes[:10], on_mosaic=True)
     for nonsense in (a_map(spacing=(0.0, 0.25)), a_map(gains=torch.full((1, 3, 5), torch.nan))):
-        with pytest.raises(ValueError, match="is no map"):
+        with pytest.raises(ValueError, match="is invalid"):
             parse_gain_maps(opcode_list([nonsense]), on_mosaic=True)

@@ -119,7 +119,7 @@ def test_a_file_holds_the_whole_isp(tmp_path: Path, srgb: torch.Tensor) -> None:
 
 
 def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nobody: no such weights.*universal"):
+    with pytest.raises(FileNotFoundError, match=r"nobody: not found.*universal"):
         DictionaryISP.from_pretrained("nobody")
     (tmp_path / "cut.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(ValueError, match=r"cut\.safetensors"):
@@ -153,7 +153,7 @@ def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, tol
         ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance must be positive"),
         ({"digital_gain": 0.0}, "digital_gain must be positive"),
         ({"raw_samples": torch.zeros(2, 0, 3)}, "row, column, value"),
-        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "not a number"),
+        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "NaN"),
     ],
 )
 def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], told: str) -> None:
@@ -191,7 +191,7 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
     [
         ({"stages": ("tone", "tone")}, "at most once"),
         ({"stages": ()}, "stages: none"),
-        ({"encoder_widths": (8, 8)}, "are three"),
+        ({"encoder_widths": (8, 8)}, "must be three"),
         ({"knee": 1.0}, "knee must be in"),
         ({"gain_atoms": 0}, "at least 1"),
     ],

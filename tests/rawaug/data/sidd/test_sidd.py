@@ -232,13 +232,13 @@ def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
         write_submission(tmp_path / "a.csv", [block] * 3, SIDE)
     with pytest.raises(ValueError, match=r"block 1: must have shape \(1, 256, 256\), got \(1, 8, 8\)"):
         write_submission(tmp_path / "a.csv", [torch.zeros(1, 256, 256), block])
-    with pytest.raises(ValueError, match="block 0: holds values that are not finite"):
+    with pytest.raises(ValueError, match="block 0: has values that are not finite"):
         write_submission(tmp_path / "a.csv", [block * float("nan")], SIDE)
-    with pytest.raises(ValueError, match=r"is a \.csv or a \.mat file"):
+    with pytest.raises(ValueError, match=r"must be a \.csv or \.mat file"):
         write_submission(tmp_path / "a.npz", [block], SIDE)
     path = tmp_path / "a.csv"
     write_submission(path, [block * 3] * 1280, SIDE)
-    with pytest.raises(ValueError, match=r"values run from 1\.5 to 1\.5; clip them"):
+    with pytest.raises(ValueError, match=r"has values from 1\.5 to 1\.5; clip them"):
         check_submission(path, SIDE)
     write_submission(path, [block] * 1280, SIDE)
     lines = path.read_text().splitlines()
@@ -273,5 +273,5 @@ def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer
         open_pairs(f"sidd:{tmp_path}", split="validation")
     with pytest.raises(FileNotFoundError, match=r"contains no ValidationGtBlocksRaw\.mat"):
         open_pairs(f"sidd:{tmp_path}")
-    with pytest.raises(ValueError, match="sidd:: say where the data are, sidd:PATH"):
+    with pytest.raises(ValueError, match="sidd:: has no path; write sidd:PATH"):
         open_pairs("sidd:")

@@ -67,7 +67,7 @@ def test_bad_pictures_are_refused(name: str) -> None:
             model.reverse(torch.rand(shape))
     with pytest.raises(ValueError, match=r"torch\.int32"):
         model.reverse(torch.zeros(1, 3, 8, 8, dtype=torch.int32))
-    with pytest.raises(ValueError, match="RAW only" if name == "unet" else "mosaic|reference"):
+    with pytest.raises(ValueError, match="only converts sRGB to RAW" if name == "unet" else "mosaic|reference"):
         model(torch.rand(1, 3, 8, 8) if name != "unet" else torch.rand(1, 1, 8, 8))
 
 
