@@ -104,7 +104,7 @@ def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(
     assert part.examined == 5 and len(part.broken) == 6 and "stopped after 5 crashes" in part.broken[-1]
 
 
-def test_what_is_unknown_is_told(tmp_path: Path) -> None:
+def test_what_is_unknown_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
         check(tmp_path / "none")
     (tmp_path / "notes.txt").write_text("nothing")

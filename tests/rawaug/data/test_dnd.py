@@ -94,7 +94,7 @@ def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
         check_dnd_submission(tmp_path / "b", dnd)
 
 
-def test_what_is_missing_or_wrong_is_told(tmp_path: Path, mat73: Writer) -> None:
+def test_what_is_missing_or_wrong_is_reported(tmp_path: Path, mat73: Writer) -> None:
     with pytest.raises(FileNotFoundError, match=r"info\.mat: no such MATLAB file"):
         Dnd(tmp_path)
     mat73(tmp_path / "info.mat", {"info": [info(0), info(1)]})

@@ -44,7 +44,7 @@ def test_a_split_is_found_by_number_and_developed(folder: Path) -> None:
         assert pair.srgb.shape == (3, 32, 48)
 
 
-def test_missing_frames_are_told(folder: Path) -> None:
+def test_missing_frames_are_reported(folder: Path) -> None:
     with pytest.raises(
         FileNotFoundError, match=r"126 of the 200 DNGs of fivek canon\+nikon, test, are missing, first a\d{4}-"
     ):

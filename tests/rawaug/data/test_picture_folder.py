@@ -151,7 +151,7 @@ def test_an_epoch_over_a_damaged_folder_completes_and_names_every_file(
     assert all(sum(name in line for line in report) == 1 for name in damaged)
 
 
-def test_each_damage_is_told_for_what_it_is(messy: tuple[Path, set[str]]) -> None:
+def test_each_damage_is_reported_for_what_it_is(messy: tuple[Path, set[str]]) -> None:
     folder, _ = messy
     pictures = PictureFolder(folder)
     for k in range(len(pictures)):
@@ -174,7 +174,7 @@ def test_the_replacement_does_not_depend_on_who_asks_in_which_order(messy: tuple
     assert all(torch.equal(there[k], back[k]) for k in chosen)
 
 
-def test_the_end_of_an_epoch_is_told(messy: tuple[Path, set[str]], caplog: pytest.LogCaptureFixture) -> None:
+def test_the_end_of_an_epoch_is_reported(messy: tuple[Path, set[str]], caplog: pytest.LogCaptureFixture) -> None:
     pictures = PictureFolder(messy[0])
     with caplog.at_level(logging.WARNING):
         for k in range(len(pictures) - 1):
@@ -206,7 +206,7 @@ def test_names_take_two_arrays_however_many_there_are(tmp_path: Path) -> None:
     assert "name is not UTF-8; rename it" in pictures.report()
 
 
-def test_nothing_to_read_is_told_at_once(tmp_path: Path) -> None:
+def test_nothing_to_read_is_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such folder of pictures"):
         PictureFolder(tmp_path / "none")
     with pytest.raises(ValueError, match=r"contains no picture; supported extensions are \.bmp"):

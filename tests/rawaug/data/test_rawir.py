@@ -46,7 +46,7 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
 
 
-def test_what_is_wrong_is_told(tmp_path: Path) -> None:
+def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
     write_pair(tmp_path, "a", "jpg", scale=3)
     with pytest.raises(ValueError, match=r"a\.npy: has value 1207, above the white level 1024; pass white="):
         Rawir(tmp_path)[0]

@@ -50,7 +50,7 @@ def test_8_bits_are_a_quarter(tmp_path: Path) -> None:
     assert planes.tolist() == pytest.approx([100, 200, 300, 400], abs=4)
 
 
-def test_what_is_wrong_is_told(folder: Path) -> None:
+def test_what_is_wrong_is_reported(folder: Path) -> None:
     (folder / "train" / "canon" / "2.jpg").unlink()
     with pytest.raises(FileNotFoundError, match=r"2\.jpg: is missing, and 0 others"):
         Zurich(folder)

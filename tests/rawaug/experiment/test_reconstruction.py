@@ -178,13 +178,13 @@ def test_frames_that_cannot_make_a_table_are_refused(
         compare(settings(tmp_path))
     laboratory.frames = 3
     pairs = laboratory.open_pairs("", "")
-    for odd, told in (
+    for odd, message in (
         (replace(pairs[1], registered=False), "f1 is not registered pixel by pixel; unet cannot share"),
         (replace(pairs[1], cfa=CFA.BGGR), "f1 has a different CFA"),
         (replace(pairs[1], name="f0"), "several frames are named f0"),
     ):
         monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             compare(settings(tmp_path, methods=["unet"]))
     assert laboratory.folds == []
 
@@ -232,13 +232,13 @@ def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    for wrong, told in (
+    for wrong, message in (
         ({"methods": ["unett"]}, r"methods: \['unett'\]; choose from dictionary, .*invgrey"),
         ({"methods": []}, "methods: none; choose from"),
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"patches": 0}, "patches must be at least 1, or null for all, got 0"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             Comparison(**wrong)
 
 

@@ -23,7 +23,7 @@ MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 WHITE_BALANCE = (2.1, 1.0, 1.4)
 
 
-def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int, **told: object) -> RawFrame:
+def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int, **fields: object) -> RawFrame:
     """The frame whose digital numbers are ``numbers`` ``(H, W)``."""
     levels = np.zeros((2, 2))
     for site, level in zip(cfa.sites, black, strict=True):
@@ -40,7 +40,7 @@ def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int,
         "orientation": 0,
         "name": "a",
     }
-    return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **told})  # type: ignore[arg-type]
+    return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **fields})  # type: ignore[arg-type]
 
 
 def numbers_in(path: Path) -> np.ndarray:
@@ -218,7 +218,7 @@ def test_an_iso_beyond_16_bits_is_the_recommended_exposure_index(
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"orientation": 9}, "orientation"),
         ({"white_balance": (0.0, 1.0, 1.5)}, "positive"),
@@ -226,8 +226,8 @@ def test_an_iso_beyond_16_bits_is_the_recommended_exposure_index(
     ],
 )
 def test_what_no_dng_can_tell_is_refused(
-    tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], told: str
+    tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], message: str
 ) -> None:
     frame = read_raw(bayer_dng(tmp_path / "a.dng", np.arange(64 * 96, dtype=np.uint16).reshape(64, 96) % 4096))
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         write_dng(tmp_path / "b.dng", dataclasses.replace(frame, **change))

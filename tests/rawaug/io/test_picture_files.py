@@ -172,7 +172,7 @@ def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
     assert error[SRGB[:1].expand_as(error) >= 12].max() <= 2
 
 
-def test_a_damaged_profile_is_told(tmp_path: Path) -> None:
+def test_a_damaged_profile_is_reported(tmp_path: Path) -> None:
     profile = bytearray(icc_profile(b"RGB ", {b"wtpt": b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)}))
     Image.fromarray(PIXELS).save(tmp_path / "a.tif", icc_profile=bytes(profile))
     with pytest.raises(ValueError, match=r"a\.tif: its ICC profile cannot be used .*; convert the picture to sRGB"):

@@ -127,7 +127,7 @@ def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('"colour_atoms\\": 3', '"colour_atoms\\": 9', "tensor colour.* does not fit its configuration"),
         ('"gain_atoms\\": 5,', '"gain_atomz\\": 5,', "its configuration is damaged .*gain_atomz"),
@@ -135,19 +135,19 @@ def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
         ("reverse_networks.gamma", "reverse_networks.gumma", "tensor reverse_networks.gamma does not fit"),
     ],
 )
-def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, told: str) -> None:
+def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, message: str) -> None:
     path = tmp_path / "camera.safetensors"
     DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=5, encoder_widths=(4, 4, 4))).save(path)
     content = path.read_bytes()
     assert before.encode() in content
     path.write_bytes(content.replace(before.encode(), after.encode()))
-    with pytest.raises(ValueError, match=told) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         DictionaryISP.from_pretrained(path)
     assert "camera.safetensors" in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
         ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance must be positive"),
@@ -156,8 +156,8 @@ def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, tol
         ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "NaN"),
     ],
 )
-def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DictionaryISP().reverse(srgb, **given)
 
 
@@ -187,7 +187,7 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"stages": ("tone", "tone")}, "at most once"),
         ({"stages": ()}, "stages: none"),
@@ -196,6 +196,6 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
         ({"gain_atoms": 0}, "at least 1"),
     ],
 )
-def test_impossible_configurations_are_refused(settings: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_impossible_configurations_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         ISPConfig(**settings)

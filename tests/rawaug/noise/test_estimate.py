@@ -111,7 +111,7 @@ def test_levels_too_near_white_are_left_out() -> None:
 
 
 def test_smoothed_levels_are_left_out() -> None:
-    """A codec that smooths the blue plane: the others tell the noise."""
+    """A codec that smooths the blue plane: the others show the noise."""
     packed = shoot(scene(2), 1e-3, 1e-5, 2)
     planes = packed.clone()
     blue = planes[..., 1::2, 0::2]  # of GRBG
@@ -187,7 +187,7 @@ def test_gopro_file_agrees_with_its_noise_profile(camera_files: Path) -> None:
     """The codec smooths: most of B, and the highlights of all colours, are left out; G and R lie 12 % below the tag.
 
     The tag's read variance is shot_var / 3200 in every GoPro file, not a measurement; the estimate is 1.8 times that.
-    Its bound is loose, as the file does not tell it: the codec's steps are twice the noise, and the halves of the frame
+    Its bound is loose, as the file lacks it: the codec's steps are twice the noise, and the halves of the frame
     give 0.5 to 4.9 times the tag.
     """
     path = camera_files / "raw" / "gopro" / "hero6_0024.dng"

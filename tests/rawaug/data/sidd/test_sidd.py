@@ -142,7 +142,7 @@ def test_small_has_no_number_in_its_names_and_what_is_held_back_is_left_out(tmp_
     assert SiddFrames(tmp_path).names == ["0001_001_IP_00100_00060_3200_L_010"]
 
 
-def test_incomplete_and_damaged_frames_are_told(tmp_path: Path, mat73: Writer) -> None:
+def test_incomplete_and_damaged_frames_are_reported(tmp_path: Path, mat73: Writer) -> None:
     name = "0001_001_IP_00100_00060_3200_L"
     write_scene(tmp_path, mat73, name, ("010",))
     gt = tmp_path / name / "0001_GT_RAW_010.MAT"
