@@ -13,7 +13,7 @@ from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_told
+from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_as_os_error
 
 _DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
@@ -86,7 +86,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
     import tifffile
 
     try:
-        with damage_told(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
+        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
             dng = any(_DNG_VERSION in page.tags for page in pages)

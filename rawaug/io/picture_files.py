@@ -68,7 +68,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    with _text_damage_told(Path(path)):
+    with _text_damage_as_os_error(Path(path)):
         pixels, orientation = _read(Path(path), max_pixels)
     return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
 
@@ -80,7 +80,7 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         FileNotFoundError, OSError: as :func:`read_picture`.
         ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
     """
-    with _text_damage_told(Path(path)):
+    with _text_damage_as_os_error(Path(path)):
         pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
@@ -112,7 +112,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 
 @contextmanager
-def _text_damage_told(path: Path) -> Iterator[None]:
+def _text_damage_as_os_error(path: Path) -> Iterator[None]:
     """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
     try:
         yield

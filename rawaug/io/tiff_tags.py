@@ -58,7 +58,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
     import tifffile
 
     try:
-        with damage_told(path), tifffile.TiffFile(path) as tiff:
+        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff:
             pages = list(all_pages(tiff.pages))
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
@@ -71,7 +71,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
 
 @contextmanager
-def damage_told(path: Path) -> Iterator[None]:
+def damage_as_os_error(path: Path) -> Iterator[None]:
     """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
     import tifffile
 

@@ -41,7 +41,7 @@ def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) ->
     assert (tmp_path / "noise.png").stat().st_size > 10_000
 
 
-def test_dark_frames_tell_the_read_variance(noisy_pair: Pair, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_dark_frames_set_the_read_variance(noisy_pair: Pair, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     rng = np.random.default_rng(0)
     dark = rng.normal(512, READ_VAR**0.5 * (16383 - 512), (128, 128)).round().astype(np.uint16)
     bayer_dng(tmp_path / "dark.dng", dark, cfa="GRBG", black=(512,), white=16383)

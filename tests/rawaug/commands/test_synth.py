@@ -114,7 +114,7 @@ def others_in_session(session: int) -> list[str]:
     return found
 
 
-def test_the_dngs_tell_the_truth(tmp_path: Path) -> None:
+def test_the_dngs_have_the_right_metadata(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     ramp = torch.linspace(0.1, 0.9, 512)[None, :, None].expand(3, 512, 512)
     write_picture(tmp_path / "in/ramp.png", ramp)

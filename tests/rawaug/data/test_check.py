@@ -41,7 +41,7 @@ def test_pictures_are_counted_by_size_and_the_broken_ones_named(tmp_path: Path) 
     assert "pictures: 5, 2 examined" in str(check(tmp_path, first=2))
 
 
-def test_raw_files_tell_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.full((32, 48), 1000, np.uint16)
     bayer_dng(tmp_path / "a.dng", numbers, cfa="GRBG", black=(64,), white=1023)
     bayer_dng(tmp_path / "b.dng", numbers, cfa="BGGR", black=(64,), white=1023)

@@ -59,7 +59,7 @@ def test_missing_frames_are_reported(folder: Path) -> None:
         fivek_pairs(folder / "none", "test", CAMERAS)
 
 
-def test_check_tells_how_much_of_each_split_is_there(folder: Path) -> None:
+def test_check_counts_the_files_of_each_split(folder: Path) -> None:
     report = str(check(folder))
     assert "RAW files (FiveK: canon test 1 of 127, nikon test 73 of 73): 74" in report
     assert "sizes: 32 x 48 (74)" in report and "cfas: RGGB (74)" in report and "black 0, white 4095 (74)" in report

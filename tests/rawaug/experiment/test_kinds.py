@@ -58,7 +58,7 @@ def test_the_commands_of_a_header_can_be_given(name: str) -> None:
         assert not quick or kind.smoke(recipe).name.endswith("-smoke")
 
 
-def test_the_reconstruction_header_tells_the_methods_rows_and_budgets_that_there_are() -> None:
+def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
     head = header("reconstruction")
     (named,) = re.findall(r"--methods '\[(.*?)\]'", head)
     assert set(named.split(", ")) <= set(FAMILIES) and {"dictionary", "dictionary-encoders"} < set(named.split(", "))
@@ -70,7 +70,7 @@ def test_the_reconstruction_header_tells_the_methods_rows_and_budgets_that_there
     assert set(re.findall(r"`(\w+)`", find_recipe("reconstruction").read_text())) <= keys
 
 
-def test_the_ablation_header_tells_how_coarse_the_blocks_are() -> None:
+def test_the_ablation_header_gives_the_block_size() -> None:
     assert f"at {BLOCK} times lower resolution" in header("ablation")
 
 

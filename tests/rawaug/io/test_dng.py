@@ -120,7 +120,7 @@ def test_a_raw_developer_shows_the_colours_that_were_meant(tmp_path: Path, cfa: 
     assert (shown - expected)[:, inner].abs().max() < 0.02
 
 
-def test_what_a_source_tells_is_kept(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_metadata_of_a_source_are_kept(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.random.default_rng(0).integers(0, 4096, (32, 48)).astype(np.uint16)
     matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     extra = [(50940, 11, 4, (0.0, 0.0, 1.0, 1.0), True), (50936, 2, 0, "Vivid", True), (51111, 1, 16, bytes(16), True)]
@@ -163,7 +163,7 @@ def test_directories_are_copied_in_either_byte_order(tmp_path: Path) -> None:
         assert tiff.byteorder == ">" and "MakerNote" not in tiff.pages.first.tags["ExifTag"].value
 
 
-def test_any_camera_name_and_exposure_can_be_told(tmp_path: Path) -> None:
+def test_any_camera_name_and_exposure_can_be_written(tmp_path: Path) -> None:
     numbers = np.full((32, 32), 900, np.uint16)
     shot = Exposure(5000.0, 2.8, 35.0, "2020:02:29 12:00:00")
     frame = a_frame(numbers, CFA.RGGB, (0, 0, 0, 0), 1023, camera="Möller Kamera", exposure=shot)
@@ -225,7 +225,7 @@ def test_an_iso_beyond_16_bits_is_the_recommended_exposure_index(
         ({"color_matrix": torch.zeros(3, 3)}, "singular"),
     ],
 )
-def test_what_no_dng_can_tell_is_refused(
+def test_what_no_dng_can_store_is_refused(
     tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], message: str
 ) -> None:
     frame = read_raw(bayer_dng(tmp_path / "a.dng", np.arange(64 * 96, dtype=np.uint16).reshape(64, 96) % 4096))

@@ -130,7 +130,7 @@ def test_known_read_noise_is_kept() -> None:
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
 
 
-def test_dark_frames_tell_banding_black_level_and_ignore_hot_pixels() -> None:
+def test_dark_frames_show_banding_black_level_and_ignore_hot_pixels() -> None:
     def dark(seed: int) -> Tensor:
         clean = torch.tensor([1e-3, 2e-3, -1e-3, 0.0])[None, :, None, None].expand(1, 4, 512, 256)
         for model in (ShotReadNoise(FixedLevels(0, 1e-5)), RowNoise(2e-6), DefectPixels(0, 1e-3), Quantisation(14)):

@@ -57,7 +57,7 @@ def test_auto_leaves_the_constants_to_few_frames(exact_pair: Callable[..., Pair]
     assert not isp.encoders_in_use and "encoders_gain_db" not in isp.info
 
 
-def test_auto_keeps_them_where_the_picture_tells_the_light(exact_pair: Callable[..., Pair]) -> None:
+def test_auto_keeps_them_where_the_picture_shows_the_light(exact_pair: Callable[..., Pair]) -> None:
     isp = fit_isp(frames(exact_pair, 12, informative=True), config("auto"), progress=False)
     assert isp.encoders_in_use and isp.info["encoders_gain_db"] > 1.0
 

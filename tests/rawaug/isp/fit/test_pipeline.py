@@ -44,7 +44,7 @@ def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -
     assert psnr(rendered, pair.srgb[None] / 255.0).item() > 33.0  # gamma alone: 25
 
 
-def test_the_isp_tells_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
+def test_the_isp_records_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
     assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0}
     assert str(fitted.cfa) == "GRBG" and not fitted.training
 
