@@ -32,7 +32,7 @@ def build(name: str, **config: Any) -> Denoiser:
     settings = inspect.signature(DENOISERS[name]).parameters
     for key, value in config.items():
         if key not in settings:
-            raise ValueError(f"{name} has no setting {key!r}; it has {', '.join(settings)}")
+            raise ValueError(f"{name} has no setting {key!r}; use one of {', '.join(settings)}")
         expected = type(settings[key].default)
         if expected is tuple and isinstance(value, list):  # as JSON and YAML have it
             config[key] = value = tuple(value)

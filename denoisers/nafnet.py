@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import PACKED, Denoiser, conv, require_width
+from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
 
 
 class ChannelNorm(nn.Module):
@@ -90,7 +90,7 @@ class NAFNet(Denoiser):
     ) -> None:
         require_width(width)
         if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
-            raise ValueError(f"encoder and decoder have as many scales as each other, got {encoder} and {decoder}")
+            raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
         super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]
@@ -100,7 +100,7 @@ class NAFNet(Denoiser):
         self.middle = _blocks(sizes[-1], middle)
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_blocks(c, n) for c, n in zip(reversed(sizes[:-1]), decoder, strict=True))
-        self.initialise(seed, self.ending)
+        self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""

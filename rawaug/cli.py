@@ -16,15 +16,15 @@ from rawaug._version import __version__
 BAD_INPUT = 2
 
 COMMANDS = {
-    "fit": "Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where there are any).",
-    "evaluate": "PSNR and SSIM of an ISP or a denoiser; the file says which.",
-    "synth": "RAW pairs on disk from a folder of sRGB pictures; stopped, the same command goes on from there.",
-    "denoise": "Denoise a RAW file, or a folder of them, to DNG; in a folder what is there is skipped.",
-    "preview": "Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.",
-    "info": "What is in a file of weights.",
+    "fit": "Fit a dictionary ISP to RAW files, with the camera's JPEGs of the same stems if present.",
+    "evaluate": "PSNR and SSIM of an ISP or a denoiser.",
+    "synth": "Write RAW pairs made from a folder of sRGB pictures; resumable.",
+    "denoise": "Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.",
+    "preview": "Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.",
+    "info": "Describe a weights file.",
 }
-"""By name, what each does; its module, with ``add_arguments`` and ``run``, is loaded when the parser is made, for a
-worker process of a command loads this module too."""
+"""By name, what each does; its module, with ``add_arguments`` and ``run``, is imported only when the parser is built,
+since worker processes import this module too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,13 +34,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(argv)
-    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+    except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
     except (ValueError, OSError, ArgumentError) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("rawaug: stopped; the same command goes on from here", file=sys.stderr)
+        print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
 
 
@@ -77,16 +77,16 @@ def _parser(kind: str) -> Any:
     def new(description: str) -> Any:
         return ArgumentParser(exit_on_error=False, description=description)
 
-    run = new("Every stage of a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
-    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a recipe in the package")
-    run.add_argument("--smoke", action="store_true", help="every stage in seconds on tiny built-in data")
+    run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
+    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
+    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
     run.add_class_arguments(KINDS[kind].settings)
     parsers = {"run": run}
     for name, description in COMMANDS.items():
         parsers[name] = new(description)
         _module(name).add_arguments(parsers[name])
-    data = parsers["data"] = new("About data: rawaug data check PATH.")
-    check = new("What is in a folder: which dataset, how many, sizes, patterns, levels, and what is broken.")
+    data = parsers["data"] = new("Inspect data: rawaug data check PATH.")
+    check = new("Identify the dataset, count items, sizes, CFAs and levels, and list damaged files.")
     _module("check_data").add_arguments(check)
 
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)

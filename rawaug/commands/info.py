@@ -1,4 +1,4 @@
-"""``rawaug info``: what is in a file of weights, for people to read."""
+"""``rawaug info``: a readable description of a weights file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def describe(weights: str | Path) -> str:
     """Kind, size, settings and, for an ISP, its atoms as numbers.
 
     Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it is not rawaug's.
+        FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
     """
     path = find_weights(weights)
     kind = read_header(path)["kind"]
@@ -44,7 +44,7 @@ def _millions(model: DictionaryISP | denoisers.Denoiser) -> str:
 def _describe_isp(path: Path) -> str:
     isp = DictionaryISP.from_pretrained(path)
     config = isp.config
-    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, makes {isp.cfa} RAW"]
+    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, {isp.cfa} output"]
     lines.append(f"  stages: {' '.join(config.stages)} mosaic; encoders {'on' if config.encoders else 'off'}")
     weights = isp.reverse_encoders.gain.prior.softmax(0)
     lines.append("  gain atoms (digital, red, blue; constant weight):")

@@ -1,4 +1,4 @@
-"""PSNR_r of an ISP: how well it makes the RAW of frames from their sRGB."""
+"""PSNR_r of an ISP: how well it reconstructs RAW frames from their sRGB."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches:
     Args:
         isp: the ISP.
         pair: the frame.
-        white_balance: give the frame's as-shot white balance.
-        patches: score so many patches of a registered frame (:func:`windows_of`); None scores all.
+        white_balance: use the frame's as-shot white balance.
+        patches: score this many patches of a registered frame (:func:`windows_of`); None scores all.
     """
     given = pair.white_balance if white_balance else None
     if pair.registered:
@@ -50,7 +50,7 @@ def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
 
 @torch.no_grad()
 def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
-    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, within [0, 1], in the pattern of the pair.
+    """The RAW ``(1, 1, H, W)`` reconstructed from the pair's sRGB under ``params``, within [0, 1], in its pattern.
 
     Strip by strip, to bound memory.
     """
@@ -78,7 +78,7 @@ def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
-    """Mean PSNR over windows of what ``make`` makes of an sRGB patch ``(1, 3, h, w)`` and its place in the frame."""
+    """Mean PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
     values, (height, width) = [], pair.raw.shape[-2:]
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))

@@ -1,4 +1,4 @@
-r"""Which stage brings how many decibels: PSNR of every intermediate image of the reverse pass against the RAW.
+r"""The contribution of each stage: PSNR of every intermediate image of the reverse pass against the RAW.
 
 ``x, x1, ..., x5`` against the demosaiced RAW, in RGB, in luminance Y and in chrominance UV (ITU-R BT.601), as in the
 ablation figure of Conde et al., AAAI 2022; with each frame's as-shot gains and blind. And the other way round: fits
@@ -39,7 +39,7 @@ STRIDE = 4
 
 @dataclass
 class Ablation:
-    """What each stage is worth.
+    """The contribution of each stage.
 
     Args:
         experiment: "ablation".
@@ -68,7 +68,7 @@ def ablate(ablation: Ablation) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``."""
     pairs = list(open_pairs(ablation.data, split="train"))
     if len(pairs) < 2:
-        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leaving one out needs two or more")
+        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), Path(ablation.out) / ablation.name
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}

@@ -1,7 +1,7 @@
 """A recipe, stage by stage: fit the ISP, train every arm, evaluate, report.
 
-Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is not done again, so that
-a run that was stopped goes on where it was.
+Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is skipped, so that
+a stopped run resumes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Results = dict[str, list[dict[str, Any]]]
 
 
 def run(recipe: Recipe) -> Results:
-    """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``.
+    """Run a recipe; the results by arm, one entry a seed, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return empty lists.
     """
@@ -106,7 +106,7 @@ class _Run:
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
-                print(f"fitted already: {path}")
+                print(f"already fitted: {path}")
                 return isp
         isp = fit(self.pairs, noise="on" if measure else "off", **settings)
         isp.info["key"] = key
@@ -124,7 +124,7 @@ class _Run:
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
-                print(f"trained already: {path}")
+                print(f"already trained: {path}")
                 return model
         if _leads():
             _discard_other_checkpoint(place, key)
@@ -149,7 +149,7 @@ class _Run:
         key = fingerprint(digest, self.data.test, stamps(self.test))
         path = place / "evaluation.json"
         if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
-            print(f"evaluated already: {path}")
+            print(f"already evaluated: {path}")
             return {kind: known[kind] for kind in ("plain", "self_ensemble")}
         result: dict[str, Any] = {}
         model.to(_device(self.recipe.device))
@@ -217,11 +217,11 @@ def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> 
     for part, pairs in others.items():
         seen = unseen & _identities(pairs)
         if seen:
-            raise ValueError(f"data.test: {min(seen)} is also among data.{part}; test on frames that nothing has seen")
+            raise ValueError(f"data.test: {min(seen)} is also in data.{part}; test on unseen frames")
 
 
 def _identities(pairs: Sequence[Pair]) -> set[str]:
-    """What tells frames apart without reading them: the path of a file, else the name."""
+    """Identifies frames without reading them: the path of a file, else the name."""
     if isinstance(pairs, RawFolder):
         return {str(file.resolve()) for file in pairs.files}
     if isinstance(pairs, LazyPairs):
@@ -240,10 +240,10 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage that was done with these frames depends on, by frame, told without reading files again.
+    """What a stage depends on, by frame, without reading files again.
 
-    Of RAW files path, size and time of change; of the frames of a dataset their names; of frames in memory what is in
-    them, in samples.
+    Path, size and modification time of RAW files; names of a dataset's frames; samples of the content of frames in
+    memory.
     """
     if isinstance(pairs, RawFolder):
         return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]

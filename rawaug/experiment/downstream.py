@@ -1,4 +1,4 @@
-"""PSNR_d: how well a denoiser does on real RAW that was trained on the RAW that a method makes of sRGB pictures.
+"""PSNR_d: a denoiser trained on a method's RAW from sRGB pictures, scored on real RAW.
 
 Pictures, network, steps and noise are the same for every method; what differs is the way from sRGB to RAW. The
 dictionary ISP draws camera settings from its hull, UPI from its published distributions; a network has one answer.

@@ -1,7 +1,7 @@
-"""The methods of the reconstruction table, on one footing: fitted on the same pairs, asked for the same patches.
+"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
 A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best weights there are (oracle), which tells what the dictionaries could do.
+samples, and with the best possible weights (oracle), the limit of the dictionaries.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _oracle(isp: DictionaryISP, pair: Pair) -> ISPParams:
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
     """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back.
 
-    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, tells what its stages lose.
+    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, is the loss of its stages alone.
     """
     model, through, without = fitted.model, [], []
     if not model.bidirectional:

@@ -2,7 +2,7 @@
 
 PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. PSNR_d is that of a
 denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
-fit's figures go into a file of their own, so that a stopped run goes on where it was.
+fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -88,11 +88,11 @@ class Comparison:
         if unknown or not self.methods:
             raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
         if self.seeds < 1:
-            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
-            raise ValueError(f"patches is at least 1, or null for all, got {self.patches}")
+            raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
-            raise ValueError("noise: only the dictionary ISP is fitted to noisy frames; leave the other methods out")
+            raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
 
 def smoke_comparison(comparison: Comparison) -> Comparison:
@@ -115,7 +115,7 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 
 
 def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
-    """Run a comparison; the rows as they stand in ``table.json``."""
+    """Run a comparison; the rows as in ``table.json``."""
     return _Comparison(comparison).table()
 
 
@@ -124,11 +124,11 @@ class _Comparison:
         self.settings, self.folder = settings, Path(settings.out) / settings.name
         self.pairs = list(open_pairs(settings.data, split="train"))
         if len(self.pairs) < 2:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leaving one out needs two or more")
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         exact = any(method not in POINTWISE for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
-                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has another CFA"
+                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has a different CFA"
                 raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
         if settings.noise:
             noise = noise_model(settings.noise)
@@ -136,7 +136,7 @@ class _Comparison:
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
         names = [pair.name for pair in self.pairs]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"data: several frames are named {twice[0]}; give each file a name of its own")
+            raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
         if settings.longer and not 1 <= settings.longer_frames <= len(names):
             raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
         side = settings.downstream.train.crop if settings.downstream else 2

@@ -6,7 +6,7 @@ r"""Camera-consistent sampling: one draw is a camera in a light, not a colour ma
 with h Brooks' highlight-preserving inverse gains (:func:`rawaug.isp.stages.inverse_gains`), w a mixture of two of the
 cameras that the hull of the atoms was made for (:class:`rawaug.isp.dictionary.CameraDictionary`), a light L
 (:mod:`rawaug.isp.light`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest gain
-is 1, as cameras and LibRaw have it, lest clipped RAW develop to a coloured white.
+is 1, as in cameras and LibRaw, so that clipped RAW develops to white.
 
 Shares of a mixture follow the Dirichlet distribution of concentration 1/2, which crowds its ends: most draws are near
 one camera, and tone is near one curve or between two. Flat weights of all atoms would crowd the middle of the hull, and
@@ -56,7 +56,9 @@ class CameraSampler:
         lamps: float = LAMP_SHARE,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
-            raise ValueError(f"at least one camera and one tone make a draw, got {cameras_mixed} and {tones_mixed}")
+            raise ValueError(
+                f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}"
+            )
         self.cameras, self.tone_atoms = cameras, tone_atoms
         self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
         self.kelvin, self.lamps = kelvin, lamps
@@ -90,7 +92,7 @@ class CameraSampler:
             if not len(open_):
                 return weights.to(self.cameras.matrices), balance
         raise ValueError(
-            f"no light of {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
+            f"no light at {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
         )
 
 

@@ -13,7 +13,7 @@ POINTWISE_STAGES = ("tone", "gamma", "colour", "gains", "shading")
 
 @dataclass(frozen=True)
 class ISPConfig:
-    """What a :class:`DictionaryISP` is made of; stands in the header of its file.
+    """Configuration of a :class:`DictionaryISP`, stored in the header of its file.
 
     Args:
         colour_atoms: N, colour correction matrices in the dictionary.
@@ -49,11 +49,11 @@ class ISPConfig:
         if wrong or not self.stages:
             raise ValueError(f"stages: {wrong or 'none'}; choose one or more, each at most once")
         if len(self.encoder_widths) != 3 or min(self.colour_atoms, self.gain_atoms, *self.encoder_widths) < 1:
-            raise ValueError("encoder_widths are three, and these and the numbers of atoms at least 1")
+            raise ValueError("encoder_widths must be three numbers; they and the numbers of atoms must be at least 1")
         if (self.tone_atoms > 0) != ("curve" in self.stages):
-            raise ValueError(f"tone_atoms: the stage curve takes them and no other does, got {self.tone_atoms}")
+            raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
         if not 0.0 <= self.knee < 1.0:
-            raise ValueError(f"knee is in [0, 1), got {self.knee}")
+            raise ValueError(f"knee must be in [0, 1), got {self.knee}")
 
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))

@@ -134,10 +134,10 @@ def bakeable(order: Sequence[Stage]) -> bool:
 def require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
     """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
     if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
-        raise ValueError(f"sRGB has shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
+        raise ValueError(f"sRGB must have shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
     for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
         if value is not None and len(value) != len(srgb):
-            raise ValueError(f"{what} is for {len(value)} pictures, the batch has {len(srgb)}")
+            raise ValueError(f"{what} is for {len(value)} pictures, but the batch has {len(srgb)}")
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:

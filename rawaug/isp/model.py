@@ -219,11 +219,11 @@ class DictionaryISP(ReverseISP):
                 what is given is for another number of pictures.
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3:
-            raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
+            raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
         x = stages.display_referred(srgb)
         params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
         if len(params.gains) != len(x):
-            raise ValueError(f"the parameters are those of {len(params.gains)} pictures, the batch has {len(x)}")
+            raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
         if raw_samples is not None:
             params = conditioning.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
         seen: dict[str, Tensor] = {}

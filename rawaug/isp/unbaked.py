@@ -1,4 +1,4 @@
-"""The reverse pass of an ISP whose stages stand in an order of their own, which no table can hold.
+"""The reverse pass of an ISP with reordered stages, which cannot be baked into a table.
 
 Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.fast.BakedISP`; dozens of times slower.
 """

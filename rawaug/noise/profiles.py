@@ -1,4 +1,4 @@
-r"""Noise of any camera by name: darktable's profiles, 374 models by ISO.
+r"""Noise of a camera by name: darktable's profiles, 374 models by ISO.
 
 .. math:: \operatorname{var}(y) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 
@@ -124,7 +124,7 @@ class ProfileLevels:
             limits[index] = torch.tensor(iso_limits(profiles.names[index], iso, (low, high)), dtype=torch.float64).log()
             self.cameras = torch.tensor([index])
         if not len(self.cameras):
-            raise ValueError(f"ISO {iso} is within no camera's profile; widen it")
+            raise ValueError(f"no camera has a profile within ISO {iso}; widen the range")
         self.limits = limits[self.cameras]
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

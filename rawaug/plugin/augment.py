@@ -1,4 +1,4 @@
-r"""Online augmentation: sRGB pictures in, noisy/clean RAW pairs out.
+r"""Online augmentation: sRGB pictures to noisy/clean RAW pairs.
 
 ``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
 atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.camera_sampling`), then
@@ -49,11 +49,11 @@ class RawAugment(nn.Module):
             camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
             ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
-        seed: of the module's own draws, where no generator is passed. They are counted from its construction on: what
-            is to go on where it stopped passes a generator, or takes RawPairs or wrap.
-        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. By default that of the
-            camera which the ISP knows, ``(0, 0)``, or ``(-1, 0.2)`` if its cameras are published ones, whose headroom
-            above their pictures' white is not. For a fitted camera that is to serve others, (-1.5, 0).
+        seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
+            resume, pass a generator, or use RawPairs or wrap.
+        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
+            default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
+            above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -75,13 +75,13 @@ class RawAugment(nn.Module):
     ) -> None:
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
         if not strength >= 0:
-            raise ValueError(f"strength is a standard deviation, at least 0, got {strength}")
+            raise ValueError(f"strength must be at least 0, got {strength}")
         if exposure is None:
             exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
-            raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
+            raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
         self.isp = frozen(isp)
         self.baked = frozen(reverse_pass(isp))
         self.register_load_state_dict_pre_hook(_drop_isp)
@@ -169,7 +169,7 @@ class RawAugment(nn.Module):
 
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
         if len(params.place) != len(srgb):
-            raise ValueError(f"the parameters are those of {len(params.place)} pictures, the batch has {len(srgb)}")
+            raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
             clean = self.baked(srgb, params.isp, params.place, white=1.0)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
@@ -216,13 +216,15 @@ class RawAugment(nn.Module):
         return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
-        """``(B, 3, H, W)`` with even sides; what is no tensor yet goes to the module's device."""
+        """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
         device = self.device
         srgb = even_sided(to_rgb_batch(pictures))
         if not isinstance(pictures, Tensor):
             return srgb.to(device)
         if srgb.device != device:
-            raise ValueError(f"the pictures are on {srgb.device}, the augmentation on {device}; call augment.to(...)")
+            raise ValueError(
+                f"the pictures are on {srgb.device} but the augmentation is on {device}; call augment.to(...)"
+            )
         return srgb
 
     def _own_generator(self) -> torch.Generator:
@@ -259,7 +261,7 @@ def _float32(like: Tensor) -> torch.autocast:
 
 
 def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels that stand in its file.
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels in its file.
 
     Raises:
         ValueError: if none were measured, or the name is unknown.
@@ -267,5 +269,5 @@ def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] |
     if noise != "camera":
         return noise_model(noise)
     if "noise" not in isp.info:
-        raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again, or name a preset')
+        raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
     return noise_model((isp.info["noise"]["shot_var"], isp.info["noise"]["read_var"]))

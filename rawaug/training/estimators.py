@@ -37,7 +37,7 @@ from rawaug.training.criteria import Criterion
 
 
 def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """The noise variance as the noisy signal tells it, shape of ``noisy``."""
+    """The noise variance computed from the noisy signal, shape of ``noisy``."""
     return read_var + shot_var * noisy.clamp_min(0.0)
 
 
@@ -163,7 +163,7 @@ class Neighbor2Neighbor(SelfSupervised):
 
     def __init__(self, gamma: float = 1.0) -> None:
         if gamma < 0:
-            raise ValueError(f"gamma is not negative, got {gamma}")
+            raise ValueError(f"gamma must be at least 0, got {gamma}")
         self.gamma = gamma
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
@@ -202,5 +202,5 @@ def _recorrupted(noisy: Tensor, shot_var: float, read_var: float, alpha: float, 
 
 def _positive(alpha: float) -> float:
     if not alpha > 0:
-        raise ValueError(f"alpha is positive, got {alpha}")
+        raise ValueError(f"alpha must be positive, got {alpha}")
     return alpha

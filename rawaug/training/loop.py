@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
@@ -46,7 +46,7 @@ def train(
     estimator: Supervised | None = None,
     choose: bool = True,
 ) -> Denoiser:
-    """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
+    """Train a denoiser, resuming from the last checkpoint in ``folder``, if any.
 
     Args:
         stream: keyed samples.
@@ -69,8 +69,7 @@ def train(
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
-    ema = torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
-    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=ema)
+    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
     start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
@@ -110,12 +109,12 @@ def train(
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
             write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
-        told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
-        bar.set_postfix_str(told, refresh=False)
+        status = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
+        bar.set_postfix_str(status, refresh=False)
     if journal is not None:
         journal.close()
     if not math.isfinite(best["psnr"]):
-        raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
+        raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
     trained.load_state_dict(best["net"])
     trained.cpu().to(memory_format=torch.contiguous_format)
     return estimator.corrected(trained).eval()
@@ -137,6 +136,17 @@ def launched(device: str, devices: int, precision: str) -> Any:
         fabric.launch()
     fabric.barrier()
     return fabric
+
+
+def running_average(decay: float) -> Any:
+    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
+
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
+        n = int(steps)
+        torch._foreach_lerp_(list(averages), list(weights), 1.0 - min(decay, (1 + n) / (10 + n)))
+
+    return update
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:
@@ -175,7 +185,7 @@ def write_atomically(state: dict[str, Any], path: Path) -> None:
 
 
 class Journal:
-    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: what a killed run told beyond it is dropped."""
+    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: later entries of a killed run are dropped."""
 
     def __init__(self, folder: Path, start: int) -> None:
         from torch.utils.tensorboard.writer import SummaryWriter

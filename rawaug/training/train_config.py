@@ -35,8 +35,8 @@ class TrainConfig:
         weigh: how the loss weighs light and shade: linear, stabilised or mixed; see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
-        validate_every: steps between two looks at the validation pairs, the best weights on which are kept.
-        checkpoint_every: steps between two checkpoints (a killed run goes on from the last).
+        validate_every: steps between validations; the best weights are kept.
+        checkpoint_every: steps between checkpoints, from which a killed run resumes.
         workers: processes that prepare samples; 0 prepares them in the training process.
         precision: Fabric's, such as 32-true or bf16-mixed.
         channels_last: memory format of the network.
@@ -64,8 +64,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
             if getattr(self, key) < 1:
-                raise ValueError(f"train.{key} is at least 1, got {getattr(self, key)}")
+                raise ValueError(f"train.{key} must be at least 1, got {getattr(self, key)}")
         if self.crop < 8 or self.crop % 2:
-            raise ValueError(f"train.crop is even and at least 8, got {self.crop}")
+            raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:
-            raise ValueError("train: ema is in [0, 1), and warmup, workers and clip_norm are at least 0")
+            raise ValueError("train: ema must be in [0, 1), and warmup, workers and clip_norm at least 0")

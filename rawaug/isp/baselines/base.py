@@ -57,7 +57,7 @@ class BaselineISP(ReverseISP):
     def render(self, raw: Tensor) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; overridden where the method has it."""
         raise ValueError(
-            f"{self.name} goes from sRGB to RAW only; rawaug.isp.baselines lists the methods that render RAW"
+            f"{self.name} only converts sRGB to RAW; rawaug.isp.baselines lists the methods that also render RAW"
         )
 
     def reverse(self, srgb: Tensor) -> Tensor:
@@ -125,18 +125,22 @@ class CropTrainedISP(BaselineISP):
 def checked_srgb(srgb: Tensor) -> Tensor:
     """``(B, 3, H, W)``, uint8 or float, as float in [0, 1]."""
     if srgb.ndim != 4 or srgb.shape[1] != 3:
-        raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
+        raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
     if srgb.dtype != torch.uint8 and not srgb.is_floating_point():
-        raise ValueError(f"sRGB is uint8 or float in [0, 1], got {srgb.dtype}")
+        raise ValueError(f"sRGB must be uint8 or float in [0, 1], got {srgb.dtype}")
     if srgb.shape[2] % 2 or srgb.shape[3] % 2:
-        raise ValueError(f"a Bayer mosaic has even sides, got sRGB of {tuple(srgb.shape[2:])}; crop a row or column")
+        raise ValueError(
+            f"a Bayer mosaic must have even sides, got sRGB of {tuple(srgb.shape[2:])}; crop a row or column"
+        )
     return as_float(srgb)
 
 
 def checked_raw(raw: Tensor) -> Tensor:
     """``(B, 1, H, W)`` with even sides."""
     if raw.ndim != 4 or raw.shape[1] != 1:
-        raise ValueError(f"a mosaic has shape (B, 1, H, W), got {tuple(raw.shape)}")
+        raise ValueError(f"a mosaic must have shape (B, 1, H, W), got {tuple(raw.shape)}")
     if raw.shape[2] % 2 or raw.shape[3] % 2:
-        raise ValueError(f"a Bayer mosaic has even sides, got {tuple(raw.shape[2:])}; crop the last row or column")
+        raise ValueError(
+            f"a Bayer mosaic must have even sides, got {tuple(raw.shape[2:])}; crop the last row or column"
+        )
     return raw

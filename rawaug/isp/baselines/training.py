@@ -43,7 +43,7 @@ def fit_baseline(
     seed: int = 0,
     progress: bool = True,
 ) -> Model:
-    """Fit a baseline in place; ``model.info`` tells the steps and seconds it took, and the last loss.
+    """Fit a baseline in place; ``model.info`` records the steps, the seconds and the last loss.
 
     UPI as published has nothing to fit: it comes back as it is, after 0 steps. Tuned UPI is solved in closed form, in
     one step, whatever the budget.
@@ -113,14 +113,14 @@ class _CropDrawer:
 
     def __post_init__(self) -> None:
         if self.side < 2 or self.side % 2 or self.batch < 1:
-            raise ValueError(f"crop is even and batch at least 1, got crop {self.side}, batch {self.batch}")
+            raise ValueError(f"crop must be even and batch at least 1, got crop {self.side}, batch {self.batch}")
         for frame in self.frames:
             height, width = frame.raw.shape[-2:]
             if not frame.registered:
-                raise ValueError(f"{frame.name}: RAW and sRGB do not meet pixel for pixel; crops need pairs that do")
+                raise ValueError(f"{frame.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
             if min(height, width) < self.side + 2:
                 needed = self.side + 2
-                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; take a smaller crop")
+                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; use a smaller crop")
 
     def __call__(self, step: int, device: torch.device) -> Crops:
         generator = keyed_generator(self.seed, "baseline crops", step)

@@ -74,7 +74,7 @@ class SmoothstepISP(BaselineISP):
 
     @abstractmethod
     def default_params(self, batch: int) -> UPIParams:
-        """What a pass uses if nothing else is given."""
+        """The defaults of a pass."""
 
     def apply(self, srgb: Any, params: UPIParams | None = None) -> Any:
         """sRGB ``(B, 3, H, W)``, uint8 or float, to the mosaic ``(B, 1, H, W)`` with the given parameters.

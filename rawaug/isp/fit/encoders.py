@@ -31,7 +31,7 @@ CONSISTENCY = 1.0
 def train_encoders(
     isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
 ) -> None:
-    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` tells which."""
+    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` records which."""
     wanted = config.encoders
     isp.use_encoders(False)
     if wanted == "auto" and len(shots) >= FEWEST_FRAMES:

@@ -66,7 +66,7 @@ def fit_isp(
         pairs: one or more frames, of one or several cameras; read once.
         config: settings; see :class:`FitConfig`.
         progress: show progress bars.
-        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        state: file with the state of the fit, to resume it; removed at the end.
         report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
 
     Raises:
@@ -114,7 +114,7 @@ def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
     }
     fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
     if not fewest <= settings["gain_atoms"] <= most:
-        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames call for {fewest} to {most}")
+        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {most}")
     return DictionaryISP(ISPConfig(**settings), derived_seed(config.seed, "isp"))
 
 
@@ -207,10 +207,10 @@ class _Fit:
             predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.place)
             return reading_error(predicted, part) + self.tie(self.colour)
 
-        def tell() -> str:
+        def status() -> str:
             return "" if report is None else report(self.snapshot())
 
-        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, tell)
+        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, status)
 
     def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
         used = [stage for stage in self.isp.ordered_stages if stage is not without]

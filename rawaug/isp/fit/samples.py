@@ -156,7 +156,7 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
     greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]
     likeness = float(torch.corrcoef(greens)[0, 1])
     if likeness < LEAST_LIKENESS:
-        raise ValueError(f"sRGB and RAW hardly resemble each other (correlation {likeness:.2f}); are they of one shot?")
+        raise ValueError(f"sRGB and RAW hardly correlate ({likeness:.2f}); are they from the same shot?")
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)

@@ -114,7 +114,7 @@ def others_in_session(session: int) -> list[str]:
     return found
 
 
-def test_the_dngs_tell_the_truth(tmp_path: Path) -> None:
+def test_the_dngs_have_the_right_metadata(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     ramp = torch.linspace(0.1, 0.9, 512)[None, :, None].expand(3, 512, 512)
     write_picture(tmp_path / "in/ramp.png", ramp)
@@ -145,7 +145,7 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
 def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder of pictures"):
         synth(tmp_path / "nowhere", tmp_path / "out")
-    with pytest.raises(ValueError, match="would lie among the pictures"):
+    with pytest.raises(ValueError, match="is inside the picture folder"):
         synth(pictures, pictures / "out", workers=0)
     with pytest.raises(ValueError, match="'bogus' is unknown"):
         synth(pictures, tmp_path / "out", noise="bogus", workers=0)
@@ -172,7 +172,7 @@ def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) 
     with pytest.raises(ValueError, match="has changed since"):
         replay(params, picture=pictures / "sub/b.png")
     DictionaryISP().save(tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match="is not the one that made this pair"):
+    with pytest.raises(ValueError, match="is not the one this pair was made with"):
         replay(params, picture=moved, isp=tmp_path / "other.safetensors")
 
 
@@ -180,7 +180,7 @@ def test_the_command(tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixtu
     command = ["synth", str(pictures), str(tmp_path / "out"), "--noise", "[0.001, 1e-5]", "--workers", "0"]
     assert main([*command, "--per-image", "2"]) == 0
     text = capsys.readouterr().out
-    assert "pairs made" in text and "broken:" in text and "broken.jpg" in text
+    assert "pairs made" in text and "unreadable:" in text and "broken.jpg" in text
     assert main([*command, "--format", "npz"]) == 2
     assert "made with format dng, not npz" in capsys.readouterr().err
 

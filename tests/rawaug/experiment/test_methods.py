@@ -106,7 +106,7 @@ def test_a_frame_smaller_than_a_patch_is_scored_whole(known_camera: DictionaryIS
 
 @pytest.fixture
 def unfitted(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Fits do nothing, and tell what they were asked for."""
+    """Fits do nothing but record their arguments."""
     asked: dict[str, Any] = {}
 
     def baseline(model: Any, pairs: Sequence[Pair], *budget: float, **settings: int) -> Any:

@@ -120,7 +120,7 @@ def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
     baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
     with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
         baked(torch.zeros(2, 3, 8, 7), params)
-    with pytest.raises(ValueError, match="matrix is for 2 pictures, the batch has 3"):
+    with pytest.raises(ValueError, match="matrix is for 2 pictures, but the batch has 3"):
         baked(torch.zeros(3, 3, 8, 8), params)
     with pytest.raises(ValueError, match="place is for 1 pictures"):
         baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))

@@ -24,13 +24,13 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
     assert "9 passed" in done.stdout
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_the_noise_compiles_for_a_gpu(told: bool) -> None:
+@pytest.mark.parametrize("with_map", [True, False])
+def test_the_noise_compiles_for_a_gpu(with_map: bool) -> None:
     from rawaug.kernels import noise_triton as noise
 
     names = ("clean", "levels", "keys", "noisy", "variance", "cells", "white")
     types = dict(zip(names, ("*fp32", "*fp32", "*i64", "*fp32", "*fp32", "i32", "fp32"), strict=True))
-    assert "st.global" in compiled_for_a_gpu(noise._cells, types, {"TOLD": told, "BLOCK": 512})
+    assert "st.global" in compiled_for_a_gpu(noise._cells, types, {"MAP": with_map, "BLOCK": 512})
 
 
 @pytest.mark.parametrize(("pixels", "all_stages"), [("*u8", True), ("*fp32", False)])
@@ -53,13 +53,13 @@ def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, 
     return str(triton.compile(source, target=GPUTarget("cuda", 80, 32), options={"enable_fp_fusion": True}).asm["ptx"])
 
 
-def test_a_kernel_that_fails_is_told_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_that_fails_is_reported_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fallback, "_refused", [])
 
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
-    with pytest.warns(UserWarning, match="cannot be used, PyTorch is: RuntimeError: for this target"):
+    with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
         assert fallback.kernel_or(fails, lambda: 2) == 2
     assert not fallback.usable(torch.zeros(1, device="meta"))
 

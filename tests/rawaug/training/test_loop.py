@@ -121,8 +121,8 @@ def test_torchrun_s_processes_count(tmp_path: Path) -> None:
         subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
         for rank in (0, 1)
     ]
-    told = "".join(node.communicate(timeout=120)[0] for node in nodes)
-    assert sorted(re.findall(r"\d of \d", told)) == [f"{rank} of 4" for rank in range(4)]
+    output = "".join(node.communicate(timeout=120)[0] for node in nodes)
+    assert sorted(re.findall(r"\d of \d", output)) == [f"{rank} of 4" for rank in range(4)]
 
 
 def test_the_rate_warms_up_and_falls() -> None:
