@@ -59,7 +59,7 @@ def test_draws_are_where_the_published_cameras_are(universal: DictionaryISP) -> 
     published = colour_matrix(published_cameras().distinct()).float()
     torch.testing.assert_close(drawn.mean(dim=0), published.mean(dim=0), atol=0.02, rtol=0)
     spread = drawn.std(dim=0).mean() / published.std(dim=0).mean()
-    assert 0.75 < spread < 1.05
+    assert 0.65 < spread < 0.95  # mixtures of two: 0.87 of the cameras' own, and the hull leaves some out
 
 
 def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryISP) -> None:
@@ -70,7 +70,8 @@ def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryIS
     assert setting.gains.std(dim=0).max() > 0.1
     assert isinstance(nikon.colour, CameraDictionary)
     back = nikon.colour.xyz_to_camera(torch.ones(1, 1))
-    torch.testing.assert_close(white_balance(back, white_point(D65)), white_balance(own, white_point(D65)))
+    d65 = white_point(D65)
+    torch.testing.assert_close(white_balance(back, d65), white_balance(own, d65), atol=1e-3, rtol=0)
     torch.testing.assert_close(back, own, atol=1e-4, rtol=0)
     with pytest.raises(ValueError, match="not listed"):
         of_cameras(universal, "Box Brownie")
