@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.commands.pair_files import (
     Format,
@@ -37,6 +36,7 @@ from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
@@ -141,7 +141,8 @@ def synth(
     tasks = list(_tasks(pictures, source, out, per_image))
     result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
     todo = [task for task in tasks if task.numbers]
-    for task, error in tqdm(_done(todo, settings, workers), total=len(todo), desc="synth", unit="picture"):
+    bar = progress(_done(todo, settings, workers), label="synth", unit="picture", total=len(todo), leave=True)
+    for task, error in bar:
         if error is None:
             result.made += len(task.numbers)
         else:

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.data import open_pairs
@@ -27,6 +26,7 @@ from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.progress import progress
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """RGB to YUV, ITU-R BT.601."""
@@ -72,7 +72,7 @@ def ablate(ablation: Ablation) -> dict[str, Any]:
     config, folder = replace(ablation.fit, seed=ablation.seed), Path(ablation.out) / ablation.name
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
-    for left_out in tqdm(pairs, desc="ablation", unit="frame", leave=False):
+    for left_out in progress(pairs, label="ablation", unit="frame"):
         others = [pair for pair in pairs if pair is not left_out]
         isp = fit_isp(others, config, progress=False)
         for given, curves in stagewise.items():

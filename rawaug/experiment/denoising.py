@@ -39,6 +39,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
+from rawaug.training.train_config import weights_key
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -118,9 +119,7 @@ class _Run:
         recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
         path = place / "denoiser.safetensors"
         config, network = recipe.train, recipe.denoiser
-        parts = (recipe.arms[arm], config, network, self.data)
-        seen = (stamps(self.pairs), stamps(self.validation), len(self.pictures))
-        key = fingerprint(isp.info["key"], recipe.noise, *seen, *(asdict(part) for part in parts))
+        key = self.weights_key(arm, isp, seed)
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
@@ -141,6 +140,14 @@ class _Run:
         denoisers.save(model, path, info)
         (place / "last.pt").unlink(missing_ok=True)
         return model
+
+    def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
+        """What the weights of an arm depend on."""
+        recipe, data = self.recipe, self.data
+        pictures = (data.pictures, len(self.pictures))
+        samples = (isp.info["key"], recipe.noise, asdict(recipe.arms[arm]), data.pairs, stamps(self.pairs), pictures)
+        validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
+        return weights_key(recipe.denoiser, recipe.train, (seed, *samples), validation)
 
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
@@ -221,7 +228,7 @@ def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> 
 
 
 def _identities(pairs: Sequence[Pair]) -> set[str]:
-    """What tells frames apart without reading them: the path of a file, else the name."""
+    """What identifies frames without reading them: the path of a file, else the name."""
     if isinstance(pairs, RawFolder):
         return {str(file.resolve()) for file in pairs.files}
     if isinstance(pairs, LazyPairs):
@@ -240,7 +247,7 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage that was done with these frames depends on, by frame, told without reading files again.
+    """What a stage that was done with these frames depends on, by frame, without reading files again.
 
     Of RAW files path, size and time of change; of the frames of a dataset their names; of frames in memory what is in
     them, in samples.

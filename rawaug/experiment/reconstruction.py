@@ -16,7 +16,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -39,6 +38,8 @@ from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
+from rawaug.training.train_config import weights_key
 
 
 @dataclass
@@ -162,7 +163,7 @@ class _Comparison:
         settings, longer = self.settings, scale != 1.0
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
         frames = range(settings.longer_frames if longer else len(self.pairs))
-        bar = tqdm([(s, k) for s in seeds for k in frames], desc=f"{family} x{scale:g}", unit="fit", leave=False)
+        bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
         folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
         whole = {} if longer else self._whole(family)
         rows = {}
@@ -217,7 +218,9 @@ class _Comparison:
         fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
         if downstream:
-            place = self.folder / f"{family}-denoisers-{key}"  # a checkpoint of other settings is not gone on from
+            samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
+            trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
+            place = self.folder / f"{family}-denoisers-{trained}"
             result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
         write_json(result, path)
         return result

@@ -49,7 +49,7 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
     noisy = psnr(validation[0].noisy, validation[0].clean).item()
     assert loop.validate(net, validation, torch.device("cpu")) > noisy + 2.0
-    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,samples_per_second"
+    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,learning_rate,samples_per_second"
 
 
 def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
@@ -77,6 +77,40 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
+    stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses = []
+
+    def noted(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        losses.append((a - b).abs().mean())
+        return losses[-1]
+
+    monkeypatch.setitem(loop.LOSSES, "l1", noted)
+    for steps in (8, 12):  # the second run goes on from step 8, in the middle of a row
+        config = replace(CONFIG, steps=steps, schedule="step")
+        loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu", choose=False)
+    rows = [line.split(",") for line in (tmp_path / "log.csv").read_text().splitlines()[1:]]
+    assert [int(row[0]) for row in rows] == [6, 8, 12]
+    for row, part in zip(rows, (losses[:6], losses[6:8], losses[8:]), strict=True):
+        assert float(row[1]) == pytest.approx(float(torch.stack(part).mean()), rel=1e-4)
+        assert float(row[3]) == pytest.approx(3e-3)
+
+
+def test_a_large_validation_frame_is_seen_in_tiles() -> None:
+    seen = []
+
+    class Note(torch.nn.Module):
+        def forward(self, noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+            seen.append(max(noisy.shape[-2:]))
+            return noisy
+
+    frame = torch.rand(1, 4, 1500, 2000, generator=torch.Generator().manual_seed(0))  # 12 Mpix
+    sample = Sample(frame + 0.1, frame, torch.full_like(frame, 1e-3))
+    assert loop.validate(Note(), [sample], torch.device("cpu")) == pytest.approx(20.0, abs=1e-3)
+    assert max(seen) == 384
 
 
 @pytest.mark.parametrize("choose", [True, False])
