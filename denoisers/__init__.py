@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from denoisers.dhdn import DHDN
     from denoisers.dncnn import DnCNN
     from denoisers.ensemble import SelfEnsemble
+    from denoisers.nafnet import NAFNet
     from denoisers.network import Denoiser
+    from denoisers.pmrid import PMRID
     from denoisers.tiling import tiled
     from denoisers.unet import UNet
     from denoisers.weights import load, save
@@ -26,7 +28,9 @@ _MODULES = {
     "DHDN": "denoisers.dhdn",
     "Denoiser": "denoisers.network",
     "DnCNN": "denoisers.dncnn",
+    "NAFNet": "denoisers.nafnet",
     "NonLocalMeans": "denoisers.classical",
+    "PMRID": "denoisers.pmrid",
     "SelfEnsemble": "denoisers.ensemble",
     "Stabilised": "denoisers.classical",
     "TotalVariation": "denoisers.classical",
@@ -43,8 +47,10 @@ __all__ = [
     "BM3D",
     "DENOISERS",
     "DHDN",
+    "PMRID",
     "Denoiser",
     "DnCNN",
+    "NAFNet",
     "NonLocalMeans",
     "SelfEnsemble",
     "Stabilised",
