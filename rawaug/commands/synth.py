@@ -32,6 +32,7 @@ from rawaug.commands.pair_files import (
     write_pair,
 )
 from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
@@ -264,14 +265,8 @@ def _make(task: _Task) -> str | None:
 
 def print_synthesis(result: Synthesis) -> None:
     """A short table, and the broken pictures by name."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=str(result.out))
-    for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
-        table.add_column(column, justify="right")
+    head = ("pictures", "pairs made", "already there", "broken", "time (s)")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
-    table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
-    Console(width=100).print(table)
+    print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
         print(f"broken: {reason}")

@@ -19,6 +19,8 @@ from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.evaluation.tables import print_rows
+from rawaug.extras import extra
 from rawaug.files import write_json
 from rawaug.isp import conditioning
 from rawaug.isp.config import POINTWISE_STAGES
@@ -136,7 +138,8 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: Path, title: str) -> Path:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(2, 2, 1.3))
@@ -158,14 +161,9 @@ def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: 
 
 
 def _print(result: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title="PSNR against RAW after each stage (dB), frames left out")
-    for k, head in enumerate(("given", "space", *TITLES)):
-        table.add_column(head, justify="right" if k > 1 else "left")
-    for given, rows in result["stages"].items():
-        for k, space in enumerate(SPACES):
-            table.add_row(given, space, *(f"{row[k]:.2f}" for row in rows))
-    Console().print(table)
+    sections = [
+        [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
+        for given, rows in result["stages"].items()
+    ]
+    print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
     print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))

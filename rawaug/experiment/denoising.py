@@ -33,6 +33,7 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
+from rawaug.extras import extra
 from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -206,14 +207,16 @@ def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
 
 def _leads() -> bool:
     """Whether this is the one of several training processes that writes and evaluates."""
-    from lightning_fabric.utilities.rank_zero import rank_zero_only
+    with extra("train"):
+        from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _device(accelerator: str) -> torch.device:
     """Where Fabric would put a network."""
-    from lightning_fabric import Fabric
+    with extra("train"):
+        from lightning_fabric import Fabric
 
     return Fabric(accelerator=accelerator, devices=1).device
 

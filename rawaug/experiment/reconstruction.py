@@ -22,7 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.evaluation.tables import mean_and_spread
+from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.methods import (
     FAMILIES,
@@ -268,17 +268,9 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     frames = len(next(iter(rows.values()))["frames"])
-    table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
+    title = f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}"
     heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
-    for k, head in enumerate(("method", *heads)):
-        table.add_column(head, justify="right" if k else "left")
-    for name, row in rows.items():
-        table.add_row(name, *_cells(row))
-    console = Console()
-    (console if console.is_terminal else Console(width=140)).print(table)
+    print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

@@ -23,6 +23,7 @@ from torch.utils.data import DataLoader
 import denoisers
 from denoisers.network import Denoiser
 from rawaug.data.sample import Sample
+from rawaug.extras import extra
 from rawaug.files import replacing
 from rawaug.metrics import psnr
 from rawaug.progress import progress
@@ -134,7 +135,8 @@ def launched(device: str, devices: int, precision: str) -> Any:
 
     All have met here when it returns, so that none looks for a checkpoint before the first has put away an old one.
     """
-    from lightning_fabric import Fabric
+    with extra("train"):
+        from lightning_fabric import Fabric
 
     nodes = 1
     if torch.distributed.is_torchelastic_launched():
@@ -209,7 +211,8 @@ class Journal:
     """
 
     def __init__(self, folder: Path, start: int) -> None:
-        from torch.utils.tensorboard.writer import SummaryWriter
+        with extra("train"):
+            from torch.utils.tensorboard.writer import SummaryWriter
 
         self.path = folder / "log.csv"
         if self.path.is_file():
