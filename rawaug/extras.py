@@ -27,4 +27,6 @@ def extra(name: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise MissingExtra(f"{error.name} is not installed; run: pip install 'rawaug[{name}]'") from None
+        raise MissingExtra(
+            f"{str(error.name).split('.')[0]} is not installed; run: pip install 'rawaug[{name}]'"
+        ) from None

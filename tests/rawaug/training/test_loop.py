@@ -148,14 +148,14 @@ def test_torchrun_s_processes_count(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    meeting = ["--nnodes", "2", "--nproc-per-node", "1", "--master-addr", "127.0.0.1", "--master-port", port]
+    meeting = ["--nnodes", "2", "--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", port]
     torchrun = [sys.executable, "-m", "torch.distributed.run", *meeting]
     nodes = [
         subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
         for rank in (0, 1)
     ]
-    said = "".join(node.communicate(timeout=120)[0] for node in nodes)
-    assert sorted(re.findall(r"\d of \d", said)) == [f"{rank} of 2" for rank in range(2)]
+    said = "".join(node.communicate(timeout=400)[0] for node in nodes)
+    assert sorted(re.findall(r"\d of \d", said)) == [f"{rank} of 4" for rank in range(4)]
 
 
 def test_the_rate_warms_up_and_falls() -> None:
