@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from denoisers.nafnet import NAFNet
     from denoisers.network import Denoiser
     from denoisers.pmrid import PMRID
+    from denoisers.pretrained import from_pretrained
     from denoisers.tiling import tiled
     from denoisers.unet import UNet
-    from denoisers.weights import load, save
+    from denoisers.weight_files import load, save
 
 _MODULES = {
     "BM3D": "denoisers.classical",
@@ -37,8 +38,9 @@ _MODULES = {
     "UNet": "denoisers.unet",
     "Wavelet": "denoisers.classical",
     "build": "denoisers.catalogue",
-    "load": "denoisers.weights",
-    "save": "denoisers.weights",
+    "from_pretrained": "denoisers.pretrained",
+    "load": "denoisers.weight_files",
+    "save": "denoisers.weight_files",
     "tiled": "denoisers.tiling",
 }
 """Public name to the module that defines it."""
@@ -58,6 +60,7 @@ __all__ = [
     "UNet",
     "Wavelet",
     "build",
+    "from_pretrained",
     "load",
     "save",
     "tiled",

@@ -16,12 +16,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
+from denoisers.pretrained import DEFAULT, find
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.commands.synth import require_same_settings
@@ -43,7 +45,8 @@ def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
     parser.add_argument("out", type=str, help="output DNG, or output folder")
-    parser.add_argument("--denoiser", type=str, required=True, help=".safetensors file written by rawaug run")
+    denoiser_help = ".safetensors file written by rawaug run, or the name of a shipped denoiser"
+    parser.add_argument("--denoiser", type=str, default=DEFAULT, help=denoiser_help)
     noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
     parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
     parser.add_argument("--self-ensemble", action="store_true", help="average eight views, at eight times the cost")
@@ -154,7 +157,7 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
 def denoise_file(
     source: str | Path,
     out: str | Path,
-    weights: str | Path,
+    weights: str | Path = DEFAULT,
     noise: Noise = "auto",
     self_ensemble: bool = False,
 ) -> Denoised:
@@ -163,7 +166,7 @@ def denoise_file(
     Args:
         source: the RAW file.
         out: the DNG to write; its folder is made.
-        weights: a denoiser's file.
+        weights: a denoiser's file, or the name of a shipped one.
         noise: see :data:`Noise`; ignored by networks without a noise map.
         self_ensemble: average eight flips and turns, eight times the work.
 
@@ -172,14 +175,14 @@ def denoise_file(
         ValueError: if the source is no Bayer RAW, its noise is unknown, or ``out`` is no DNG or the source itself.
 
     Example:
-        >>> denoise_file("shot.dng", "shot-denoised.dng", "denoiser.safetensors")  # doctest: +SKIP
+        >>> denoise_file("shot.dng", "shot-denoised.dng")  # doctest: +SKIP
     """
     return _denoise_file(Path(source), Path(out), _load(weights), noise, self_ensemble)
 
 
 def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
-    model, info = denoisers.load(weights)
-    return model, CFA(info.get("cfa", "RGGB"))
+    model, info = denoisers.load(find(weights))
+    return model.to(memory_format=torch.channels_last), CFA(info.get("cfa", "RGGB"))  # type: ignore[call-overload]
 
 
 def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
@@ -190,7 +193,7 @@ def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: 
         raise ValueError(f"{out}: is the input file; give another name")
     model, cfa = loaded
     frame = read_raw(source)
-    shot_var, read_var, noise_source = levels_of(frame, noise) if model.variance_map else (*_NO_NOISE, "not needed")
+    shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
     mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
     below = _clip_below_zero(mosaic, frame)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +218,7 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
 def denoise_folder(
     source: str | Path,
     out: str | Path,
-    weights: str | Path,
+    weights: str | Path = DEFAULT,
     noise: Noise = "auto",
     self_ensemble: bool = False,
 ) -> DenoisedFolder:
@@ -229,7 +232,7 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
     loaded = _load(weights)
-    settings = {"denoiser_sha256": sha256(Path(weights)), "self_ensemble": self_ensemble}
+    settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
     require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
     result = DenoisedFolder()
     for file, target in tqdm(targets.items(), desc="denoise", unit="file"):

@@ -10,6 +10,7 @@ from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
+from denoisers.pretrained import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -25,7 +26,7 @@ from rawaug.noise import NoiseModel, noise_model
 
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
-    parser.add_argument("weights", type=str, help="a .safetensors file of rawaug fit or rawaug run")
+    parser.add_argument("weights", type=str, help="a .safetensors file of rawaug fit or rawaug run, or a shipped name")
     parser.add_argument("--data", type=str, required=True, help="folder of RAW files, one file, or kind:path")
     parser.add_argument(
         "--self-ensemble", action="store_true", help="also score the average over eight views (denoisers)"
@@ -81,7 +82,7 @@ def evaluate(
             is for denoisers and the file is an ISP's.
     """
     require_classical(classical)
-    weights = find_weights(weights)
+    weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = open_pairs(data, split="test")
     if kind == "isp":

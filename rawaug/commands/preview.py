@@ -15,6 +15,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
@@ -110,17 +111,18 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])
     _swatches(colour, isp)
     _gain_swatches(gains, isp)
-    mask = isp.shading(place_in_frame(75, 100))[0, 0] if "shading" in isp.config.stages else torch.ones(75, 100)
+    lens = isp.find(LensShading)
+    mask = lens.mask(place_in_frame(75, 100))[0, 0] if lens else torch.ones(75, 100)
     image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
     figure.colorbar(image, ax=shading, shrink=0.6)
     shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)
     shading.set(xticks=[], yticks=[])
     grey = torch.linspace(0, 1, 256)
-    curve = isp.reverse_networks.tone(grey.expand(1, 3, 1, 256))[0, :, 0]
+    curve = isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0]
     for line, name in zip(curve, ("tab:red", "tab:green", "tab:blue"), strict=True):
         tone.plot(grey.numpy(), line.numpy(), color=name)
-    tone.set(xlabel="sRGB grey", ylabel="x1", aspect="equal")
-    tone.set_title(f"inverse tone curve, then gamma {isp.reverse_networks.gamma.item():.2f}", fontsize=9)
+    tone.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
+    tone.set_title("inverse tone curve and gamma", fontsize=9)
     return figure
 
 
@@ -140,7 +142,7 @@ def _gain_swatches(axis: Any, isp: DictionaryISP) -> None:
     atoms, channels = isp.gain.atoms(), isp.gain.channel_gains()
     light = channels.amin(1, keepdim=True) / channels
     axis.imshow(encode_srgb(light)[:, None].numpy(), aspect="auto", extent=(0, 1, len(atoms) - 0.5, -0.5))
-    weight = isp.reverse_networks.gain_encoder.prior.softmax(0)
+    weight = isp.reverse_encoders.gain.prior.softmax(0)
     for row, ((digital, red, blue), share) in enumerate(zip(atoms.tolist(), weight.tolist(), strict=True)):
         text = f"{digital:.2f}   {red:.2f}   {blue:.2f}   {share:.0%}"
         axis.text(0.5, row, text, ha="center", va="center", fontsize=min(8, 120 / len(atoms)), color="black")

@@ -29,7 +29,7 @@ from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe
 from rawaug.seeding import keyed_generator
 
-TILE, OVERLAP = 384, 64
+TILE, OVERLAP = 1536, 96
 """Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
@@ -63,7 +63,7 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
     return Sample(noisy, clean, noise.variance(noisy, params))
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
     """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import singledispatch
 from pathlib import Path
 
 import torch
@@ -19,8 +20,8 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import score_denoiser
-from rawaug.isp.baselines import UPI, ReverseISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
@@ -65,9 +66,7 @@ class DownstreamConfig:
         )
 
 
-def psnr_d(
-    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int
-) -> float:
+def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
     crops = _crops(model, pictures, noise, config)
@@ -81,15 +80,16 @@ def psnr_d(
     return sum(scores) / len(scores)
 
 
-def _crops(
-    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
-) -> Source:
-    crop = config.train.crop
-    if isinstance(model, DictionaryISP):
-        return PictureCrops(RawPairs(pictures, RawAugment(model, noise, exposure=config.exposure), crop))
-    if isinstance(model, UPI):
-        return MadeCrops(pictures, lambda x, g: model.apply(x, model.sample(1, g)), model.cfa, noise, crop)
-    return MadeCrops(pictures, lambda x, g: model.reverse(x), model.cfa, noise, crop)
+@singledispatch
+def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+
+
+@_crops.register
+def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    """By the plugin, so that each crop keeps its place in its frame."""
+    augment = RawAugment(model, noise, exposure=config.exposure)
+    return PictureCrops(RawPairs(pictures, augment, config.train.crop))
 
 
 class MadeCrops:

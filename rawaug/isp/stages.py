@@ -150,6 +150,11 @@ def place_in_frame(
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
 
 
+def placed(x: Tensor, place: Tensor | None) -> Tensor:
+    """``place``, or that of a full frame, in the type of the image ``x``."""
+    return (place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
+
+
 class GaussianMask(nn.Module):
     r"""The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``.
 

@@ -47,7 +47,7 @@ def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
         >>> type(reverse_pass(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))).__name__
         'UnbakedISP'
     """
-    return BakedISP(isp) if bakeable(isp.config.stages) else UnbakedISP(isp)
+    return BakedISP(isp) if bakeable(isp.ordered_stages) else UnbakedISP(isp)
 
 
 def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:

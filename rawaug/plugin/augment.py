@@ -12,8 +12,9 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypeVar, overload
 
 import torch
 from torch import Tensor, nn
@@ -34,8 +35,10 @@ Sampling = Literal["convex", "perturb", "chosen"]
 class RawAugment(nn.Module):
     """sRGB batches to RAW pairs.
 
+    It has no parameters and adds nothing to the ``state_dict`` of a surrounding network.
+
     Args:
-        isp: the fitted camera; is put in eval mode, without gradients.
+        isp: the fitted camera; a frozen copy is taken, later changes do not reach it.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
@@ -72,8 +75,9 @@ class RawAugment(nn.Module):
             raise ValueError(f"strength must be at least 0, got {strength}")
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
-        self.isp = isp.eval().requires_grad_(False)
-        self.baked = reverse_pass(self.isp)
+        self.isp = frozen(isp)
+        self.baked = frozen(reverse_pass(isp))
+        self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
@@ -188,7 +192,7 @@ class RawAugment(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the module is."""
-        return next(self.isp.parameters()).device
+        return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
         """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
@@ -207,6 +211,27 @@ class RawAugment(nn.Module):
         self._calls += 1
         worker = get_worker_info()
         return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
+
+
+M = TypeVar("M", bound=nn.Module)
+
+
+def frozen(module: M) -> M:
+    """A copy in eval mode whose tensors are buffers outside of ``state_dict``; the module stays as it is."""
+    copy = deepcopy(module).eval()
+    for part in copy.modules():
+        tensors = {**part._parameters, **part._buffers}
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                delattr(part, name)
+                part.register_buffer(name, tensor.detach(), persistent=False)
+    return copy
+
+
+def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Checkpoints of version 0.1 hold the ISP."""
+    for name in [name for name in state if name.startswith((f"{prefix}isp.", f"{prefix}baked."))]:
+        del state[name]
 
 
 def _float32(like: Tensor) -> torch.autocast:

@@ -16,7 +16,7 @@ Parameters are those of the reverse pass at the default, published size.
 
 from types import MappingProxyType
 
-from rawaug.isp.baselines.base import ReverseISP
+from rawaug.isp.baselines.base import BaselineISP
 from rawaug.isp.baselines.cycleisp import CycleISP
 from rawaug.isp.baselines.invgrey import InvertibleGrey
 from rawaug.isp.baselines.invisp import InvISP
@@ -25,7 +25,7 @@ from rawaug.isp.baselines.training import fit_baseline
 from rawaug.isp.baselines.upi import UPI
 from rawaug.isp.baselines.upi_tuned import TunedUPI
 
-BASELINES: MappingProxyType[str, type[ReverseISP]] = MappingProxyType(
+BASELINES: MappingProxyType[str, type[BaselineISP]] = MappingProxyType(
     {method.name: method for method in (UPI, TunedUPI, UNetISP, CycleISP, InvISP, InvertibleGrey)}
 )
 """Name to class; each is made without arguments, or with ``cfa`` and its own settings."""
@@ -33,10 +33,10 @@ BASELINES: MappingProxyType[str, type[ReverseISP]] = MappingProxyType(
 __all__ = [
     "BASELINES",
     "UPI",
+    "BaselineISP",
     "CycleISP",
     "InvISP",
     "InvertibleGrey",
-    "ReverseISP",
     "TunedUPI",
     "UNetISP",
     "fit_baseline",

@@ -18,13 +18,13 @@ import torch
 from tqdm.auto import tqdm
 
 from rawaug.bayer import CFA
-from rawaug.isp.baselines.base import Crops, CropTrainedISP, ReverseISP
+from rawaug.isp.baselines.base import BaselineISP, Crops, CropTrainedISP
 from rawaug.isp.baselines.upi_tuned import TunedUPI
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 from rawaug.seeding import keyed_generator
 
-Model = TypeVar("Model", bound=ReverseISP)
+Model = TypeVar("Model", bound=BaselineISP)
 
 CLIP_NORM = 1.0
 """The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.isp import stages
-from rawaug.isp.baselines.base import ReverseISP, checked_raw, checked_srgb
+from rawaug.isp.baselines.base import BaselineISP, checked_raw, checked_srgb
 
 GAMMA = 2.2
 XYZ_TO_CAMERA = (
@@ -69,7 +69,7 @@ def camera_matrix(weights: Tensor) -> Tensor:
     return matrix / matrix.sum(dim=2, keepdim=True)
 
 
-class SmoothstepISP(ReverseISP):
+class SmoothstepISP(BaselineISP):
     """UPI's stages with a matrix and gains from wherever; both passes are pure functions of picture and parameters."""
 
     @abstractmethod
@@ -123,6 +123,10 @@ class UPI(SmoothstepISP):
 
     name = "upi"
     trainable = False
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        mosaic: Tensor = self.apply(srgb, self.sample(len(srgb), generator))
+        return mosaic
 
     def default_params(self, batch: int) -> UPIParams:
         """The published distributions' means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.stage import stage_class
 
 _SWITCH = ("auto", "on", "off")
 
@@ -65,7 +66,7 @@ class FitConfig:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
             raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
-        if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):
-            raise ValueError("isp: a fit needs the stage tone or gamma")
+        if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
+            raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")
         if self.steps < 0 or self.reach < 1:
             raise ValueError(f"steps must be at least 0 and reach at least 1, got {self.steps} and {self.reach}")

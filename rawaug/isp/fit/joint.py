@@ -45,8 +45,7 @@ def train_jointly(
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
 
-    tensors = {name: p for name, p in isp.named_parameters() if isp.encoders_in_use or "_encoder.layers" not in name}
-    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=watch)
+    descent.run("end to end", loss, dict(isp.named_parameters()), steps, LEARNING_RATE, watch=watch)
     seen = descent.watched["end to end"]
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 

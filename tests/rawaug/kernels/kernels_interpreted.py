@@ -11,6 +11,7 @@ import torch
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading, ToneMap
 from rawaug.kernels import fallback, noise_numba, raw_torch
 from rawaug.kernels import noise_triton as noise_kernel
 from rawaug.kernels import raw_triton as raw_kernel
@@ -25,9 +26,12 @@ def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
     generator = torch.Generator().manual_seed(0)
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings)).requires_grad_(False)
     isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-    for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):
-        list(network.parameters())[-2].normal_(std=0.05, generator=generator)
-    isp.shading.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+    if tone := isp.find(ToneMap):
+        list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
+    if lens := isp.find(LensShading):
+        lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+        if lens.reverse_attention:
+            list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
     return BakedISP(isp)._camera(srgb, isp.choose(srgb), place)
 
