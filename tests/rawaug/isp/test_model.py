@@ -242,7 +242,7 @@ def test_pictures_out_of_range_and_parameters_of_others_are_refused(srgb: torch.
     isp = DictionaryISP()
     with pytest.raises(ValueError, match="a float picture must be in"):
         isp.reverse(255.0 * srgb)
-    with pytest.raises(ValueError, match="uint8, or float32"):
+    with pytest.raises(ValueError, match="uint8 or float32"):
         isp.reverse(srgb.double())
     with pytest.raises(ValueError, match="the parameters are for 1 pictures, but the batch has 2"):
         isp.reverse(srgb, isp.choose(srgb[:1]))
