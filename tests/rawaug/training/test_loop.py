@@ -109,7 +109,7 @@ def test_a_large_validation_frame_is_seen_in_tiles() -> None:
     frame = torch.rand(1, 4, 1500, 2000, generator=torch.Generator().manual_seed(0))  # 12 Mpix
     sample = Sample(frame + 0.1, frame, torch.full_like(frame, 1e-3))
     assert loop.validate(Note(), [sample], torch.device("cpu")) == pytest.approx(20.0, abs=1e-3)
-    assert max(seen) == 384
+    assert len(seen) > 1 and max(seen) <= 1536
 
 
 @pytest.mark.parametrize("choose", [True, False])
