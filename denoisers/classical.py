@@ -71,15 +71,24 @@ class Classical(ABC):
         return torch.from_numpy(clean).permute(2, 0, 1).to(image)
 
 
+def _library(name: str, advice: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ImportError(f"{error.name} is not installed; {advice}") from None
+
+
+def _restoration() -> Any:
+    return _library("skimage.restoration", "run: pip install 'rawaug[train]'")
+
+
 class NonLocalMeans(Classical):
     """Non-local means (scikit-image, fast mode): patches of 5 x 5 over all four planes, sought 6 pixels around."""
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_nl_means
-
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
-        return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
+        return _restoration().denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
 
 
 class Wavelet(Classical):
@@ -87,8 +96,6 @@ class Wavelet(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_wavelet
-
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
@@ -103,7 +110,7 @@ class Wavelet(Classical):
         }
         mean = np.zeros_like(planes)
         for shift in product(range(4), repeat=2):
-            shrunk = denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
+            shrunk = _restoration().denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
             mean += np.roll(shrunk, np.negative(shift), (0, 1)) / 16
         return mean
 
@@ -113,9 +120,7 @@ class TotalVariation(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_tv_chambolle
-
-        return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
+        return _restoration().denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
 
 class BM3D(Classical):
@@ -132,12 +137,7 @@ class BM3D(Classical):
         Raises:
             ImportError: if the wheel is not installed.
         """
-        try:
-            bm3d = import_module("bm3d")
-        except ImportError:
-            raise ImportError(
-                "BM3D needs the bm3d wheel, licensed for non-commercial use only: pip install bm3d"
-            ) from None
+        bm3d = _library("bm3d", "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
 

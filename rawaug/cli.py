@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any
 
 from rawaug._version import __version__
+from rawaug.extras import MissingExtra
 
 BAD_INPUT = 2
 
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _dispatch(argv)
     except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
-    except (ValueError, OSError, ArgumentError) as error:
+    except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
@@ -33,6 +32,7 @@ from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -235,7 +235,7 @@ def denoise_folder(
     settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
     require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
     result = DenoisedFolder()
-    for file, target in tqdm(targets.items(), desc="denoise", unit="file"):
+    for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists():
             result.existing += 1
             continue

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm.auto import tqdm
-
 import denoisers
 from denoisers.network import Denoiser
 from denoisers.pretrained import FOLDER
@@ -22,6 +20,7 @@ from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.progress import progress
 
 
 def add_arguments(parser: Any) -> None:
@@ -90,8 +89,9 @@ def evaluate(
             raise ValueError(
                 f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
             )
-        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
-        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
+        isp = DictionaryISP.from_pretrained(weights)
+        frames = progress(pairs, label="evaluate", unit="image")
+        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.extras import extra
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
@@ -75,7 +76,8 @@ def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
 
 @torch.no_grad()
 def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
@@ -105,7 +107,8 @@ def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> An
 
 @torch.no_grad()
 def _draw_atoms(isp: DictionaryISP) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])

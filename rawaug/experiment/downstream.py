@@ -58,6 +58,10 @@ class DownstreamConfig:
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
+    def sampling(self) -> tuple[object, ...]:
+        """What the training samples depend on."""
+        return self.noise, self.exposure
+
     def smoke(self) -> DownstreamConfig:
         """In seconds, on the demo camera."""
         few = TrainConfig(steps=2, batch=2, crop=32, warmup=1, validate_every=2, checkpoint_every=2)

@@ -137,12 +137,12 @@ def smoke(recipe: Recipe) -> Recipe:
     """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
     tiny = {"UNet": {"width": 4, "scales": 2}, "DHDN": {"width": 4}, "DnCNN": {"width": 8, "depth": 3}}
     name = recipe.denoiser.name
-    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
+    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=4, checkpoint_every=2, workers=0)
     return replace(
         recipe,
         name=f"{recipe.name.replace('/', '-')}-smoke",
         data=replace(
-            DataConfig(count=1, test_count=1),
+            DataConfig(count=1, validation_crop=64, test_count=1),
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),

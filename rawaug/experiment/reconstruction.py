@@ -16,14 +16,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.evaluation.tables import mean_and_spread
+from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.methods import (
     FAMILIES,
@@ -39,6 +38,8 @@ from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
+from rawaug.training.train_config import weights_key
 
 
 @dataclass
@@ -162,7 +163,7 @@ class _Comparison:
         settings, longer = self.settings, scale != 1.0
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
         frames = range(settings.longer_frames if longer else len(self.pairs))
-        bar = tqdm([(s, k) for s in seeds for k in frames], desc=f"{family} x{scale:g}", unit="fit", leave=False)
+        bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
         folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
         whole = {} if longer else self._whole(family)
         rows = {}
@@ -217,7 +218,9 @@ class _Comparison:
         fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
         if downstream:
-            place = self.folder / f"{family}-denoisers-{key}"  # a checkpoint of other settings is not gone on from
+            samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
+            trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
+            place = self.folder / f"{family}-denoisers-{trained}"
             result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
         write_json(result, path)
         return result
@@ -265,17 +268,9 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     frames = len(next(iter(rows.values()))["frames"])
-    table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
+    title = f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}"
     heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
-    for k, head in enumerate(("method", *heads)):
-        table.add_column(head, justify="right" if k else "left")
-    for name, row in rows.items():
-        table.add_row(name, *_cells(row))
-    console = Console()
-    (console if console.is_terminal else Console(width=140)).print(table)
+    print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

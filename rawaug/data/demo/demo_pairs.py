@@ -15,6 +15,7 @@ from torch import Tensor
 from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
 from rawaug.data.demo.dead_leaves import dead_leaves
 from rawaug.data.pair import Pair
+from rawaug.extras import extra
 from rawaug.io import read_picture
 from rawaug.seeding import keyed_generator
 
@@ -119,7 +120,8 @@ def _photographs(split: str) -> dict[str, Tensor]:
 
 @cache
 def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
-    import skimage
+    with extra("train"):
+        import skimage
 
     folder = Path(skimage.__file__).parent / "data"
     return {Path(file).stem: read_picture(folder / file) for file in files}

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import BaselineISP, Crops, CropTrainedISP
 from rawaug.isp.baselines.upi_tuned import TunedUPI
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
+from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
 Model = TypeVar("Model", bound=BaselineISP)
@@ -151,7 +151,7 @@ def _descend(
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     rate = model.learning_rate if learning_rate is None else learning_rate
     optimiser = torch.optim.Adam(parameters, lr=rate)
-    bar = tqdm(desc=f"fit {model.name}", total=budget.steps, disable=not progress, unit="step", leave=False)
+    bar = progress_bar(label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
     start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
     while spent < 1.0:
         for group in optimiser.param_groups:

@@ -100,8 +100,10 @@ def test_encoders_look_at_the_picture_only_when_enabled(srgb: torch.Tensor) -> N
     isp = DictionaryISP()
     assert torch.equal(*isp.choose(srgb).gain_weights)
     isp.use_encoders(True)
+    layers = isp.reverse_encoders.gain.layers
+    assert layers is not None
     with torch.no_grad():
-        for parameter in isp.reverse_encoders.gain.parameters():
+        for parameter in layers[-1].parameters():
             parameter.normal_(generator=torch.Generator().manual_seed(0))
     assert not torch.equal(*isp.choose(srgb).gain_weights)
     isp.use_encoders(False)
