@@ -1,6 +1,6 @@
-"""The command line: ``rawaug run | fit | evaluate | synth | denoise | preview | info | data``, by jsonargparse.
+"""Train and evaluate RAW denoisers and camera ISPs.
 
-Bad input ends in one line on stderr that names the file or key and what to do, with exit status 2.
+Errors are one line on stderr that names the file or key and what to do; the exit status is then 2.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def add_arguments(parser: Any) -> None:
     )
     noise_help = "noise added to frames without a noisy capture: a preset, a measured camera, or [shot_var, read_var]"
     parser.add_argument("--noise", type=tuple[float, float] | str | None, default=None, help=noise_help)
-    parser.add_argument("--seed", type=int, default=0, help="of that noise")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of that noise")
     classical = "classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D"
     parser.add_argument("--classical", type=list[str], default=[], help=classical)
     parser.add_argument("--device", type=str, default="cpu", help="device for a denoiser: cpu, cuda, ...")

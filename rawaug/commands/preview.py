@@ -33,7 +33,7 @@ def add_arguments(parser: Any) -> None:
     parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
     parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
     parser.add_argument("--count", type=int, default=4, help="number of augmented RAWs to plot")
-    parser.add_argument("--seed", type=int, default=0, help="of these")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
 
 
 def run(arguments: Any) -> None:

@@ -17,14 +17,14 @@ class DataConfig:
 
     Args:
         pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null for none.
-        count: how many of them are used; all if null.
+        count: number of pairs to use; null for all.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
-        memory_mb: pictures are kept in memory once decoded, up to this many megabytes.
-        validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
-            watches it on RAW made from the pictures, which chooses no weights: those of the end are kept.
-        validation_crop: side of the middle of each validation frame that is looked at; null for the whole frame.
-        test: pairs on which the result is measured; no stage sees them before.
-        test_count: how many of them are used; all if null.
+        memory_mb: size in megabytes of the cache of decoded pictures.
+        validation: validation pairs, of which self-supervised arms see only the noisy frames; null validates on RAW
+            made from the pictures and keeps the final weights.
+        validation_crop: side of the central crop used of each validation frame; null for the whole frame.
+        test: test pairs; no earlier stage sees them.
+        test_count: number of pairs to use; null for all.
     """
 
     pairs: str | None = "demo:train"
@@ -48,10 +48,10 @@ class ArmConfig:
         zoom: of published: pictures are enlarged up to this factor, half of the time; 1 for none.
         strength: of ``perturb``.
         exposure: lowest and highest exposure of the RAW in stops.
-        estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
+        estimator: training target: supervised uses clean frames; the others use noisy frames only, see
             :mod:`rawaug.training.estimators`.
         alpha: of noisier and r2r: strength of the extra noise.
-        correct: of noisier: extrapolate the result, which takes its bias away.
+        correct: of noisier: extrapolate the result, which removes its bias.
         gamma: of neighbor2neighbor: weight of its second term.
     """
 
@@ -75,22 +75,22 @@ class Recipe:
     """A whole experiment.
 
     Args:
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
         camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
-        noise: what is added to clean RAW, in training and where a test frame has no noisy capture: the name of a preset
+        noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], or "camera", the
             levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
         train: the loop.
-        arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
+        arms: the variants to compare, by name; all supervised, or all self-supervised (then no stage sees a clean frame).
         classical: classical denoisers to compare with, such as Wavelet; see :mod:`denoisers.classical`.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
-        seeds: how many runs, with seeds ``seed``, ``seed + 1``, ...; more than one gives mean and spread.
+        seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
         device: auto, cpu, cuda, ...: Fabric's accelerator.
-        devices: how many of them.
+        devices: number of devices.
         out: folder of all runs.
     """
 

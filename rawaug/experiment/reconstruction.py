@@ -48,21 +48,21 @@ class Comparison:
 
     Args:
         experiment: "reconstruction".
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         data: the pairs, of one CFA; methods that train on crops need them registered.
-        noise: preset that is added to every frame once and for all; the dictionary ISP is then fitted to these noisy
+        noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines.
-        seconds: budget of methods that learn by descent, reading not counted.
+        seconds: training budget of methods trained by gradient descent, without file reading.
         crop, batch: of these methods' training: small ones give more steps to a short budget.
-        longer: a second budget for them, as a factor; 0 leaves it out.
+        longer: factor of a second, longer budget for them; 0 for none.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
-        downstream: PSNR_d; null leaves it out.
+        downstream: PSNR_d; null skips it.
         seed: of the first run.
-        seeds: how many runs.
+        seeds: number of runs.
         out: folder of all runs.
     """
 

@@ -29,14 +29,14 @@ class TrainConfig:
         steps: optimiser steps, the same in every arm.
         batch: samples in a step, over all processes.
         crop: side of the mosaic crops in pixels.
-        learning_rate: of Adam at its highest.
+        learning_rate: peak learning rate of Adam.
         warmup: steps of linear warm-up.
         schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
         halve_every: steps.
         loss: l1, l2 or charbonnier.
-        weigh: how the loss weighs light and shade: linear, stabilised or mixed; see :mod:`rawaug.training.criteria`.
-        ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
-        clip_norm: largest norm of the gradient; 0 switches it off.
+        weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.
+        ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
+        clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept.
         checkpoint_every: steps between checkpoints, from which a killed run resumes.
         workers: processes that prepare samples; 0 prepares them in the training process.
