@@ -17,7 +17,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 import denoisers
-from denoisers.classical import Classical, Stabilised
+from denoisers.stabilised import Stabilised
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
@@ -119,35 +119,25 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
     return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
-CLASSICAL: dict[str, Callable[[], Classical]] = {
-    "NonLocalMeans": denoisers.NonLocalMeans,
-    "Wavelet": denoisers.Wavelet,
-    "TotalVariation": denoisers.TotalVariation,
-    "BM3D": denoisers.BM3D,
-}
-"""By name; BM3D needs a wheel of its own."""
-
-
-def require_classical(names: Sequence[str]) -> None:
-    """Refuse a name that is no classical denoiser's.
+def require_classical(specs: Sequence[Spec]) -> None:
+    """Refuse what is no classical denoiser or has no such setting.
 
     Raises:
-        ValueError: naming those there are.
+        ValueError: with the nearest name.
     """
-    for name in names:
-        if name not in CLASSICAL:
-            raise ValueError(f"classical: {name} is unknown; there are {', '.join(CLASSICAL)}")
+    for spec in specs:
+        FILTERS.make(spec)
 
 
-def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
+def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
     """A classical denoiser as something to score; shot noise is stabilised before and after."""
-    require_classical([name])
-    denoiser = CLASSICAL[name]()
+    denoiser = FILTERS.make(spec)
 
     def method(pair: Pair, sample: Sample) -> Tensor:
         levels = frozen_levels(pair, noise, seed)
         if levels is None or not levels[0] > 0:
-            return denoiser(sample.noisy, sample.variance)
+            denoised: Tensor = denoiser(sample.noisy, sample.variance)
+            return denoised
         shot_var, read_var = (torch.tensor([level]) for level in levels)
         return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
 
@@ -164,14 +154,19 @@ def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, floa
 
 
 def score_classical(
-    names: Sequence[str], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
+    specs: Sequence[Spec], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """The summary of each classical denoiser, by name."""
-    methods = {name: classical_method(name, noise, seed) for name in names}
+    """The summary of each classical denoiser, by name, with its settings where it has some."""
+    methods = {_label(spec): classical_method(spec, noise, seed) for spec in specs}
     return {
         name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
         for name, method in methods.items()
     }
+
+
+def _label(spec: Spec) -> str:
+    name, settings = name_and_settings(spec)
+    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
 
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
