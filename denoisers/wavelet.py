@@ -1,4 +1,4 @@
-"""Translation-invariant wavelet shrinkage: the mean over shifts of thresholded transforms (Coifman and Donoho, 1995)."""
+"""Translation-invariant wavelet shrinkage: thresholded transforms, averaged over shifts (Coifman and Donoho, 1995)."""
 
 from __future__ import annotations
 

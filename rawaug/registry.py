@@ -1,8 +1,8 @@
 """What one file adds: networks, filters, noise, datasets, estimators, losses, baselines and commands, by name.
 
-A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name; so
-is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported when
-a name is first asked for, an entry point when its own name is: importing this module loads nothing.
+A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name;
+so is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
+when a name is first asked for, an entry point when its own name is: importing this module loads nothing.
 
 Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
 """
@@ -51,6 +51,38 @@ def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
     return spec["name"], dict(settings)
 
 
+def checked_settings(
+    label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Keyword arguments for ``function``: lists, which is what YAML and JSON have, become tuples.
+
+    Args:
+        label: opens the messages.
+        function: or class, whose signature says what it takes.
+        settings: the keyword arguments to check.
+        given: arguments that the caller passes besides.
+
+    Raises:
+        ValueError: if one is unknown, missing, or not of the plain type that the signature names.
+    """
+    parameters = inspect.signature(function).parameters
+    takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    for key in settings:
+        if key not in takes:
+            raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes)}{nearest(key, takes)}")
+    for key in takes:
+        if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
+            raise ValueError(f"{label} needs the setting {key!r}")
+    return {key: _of_type(value, parameters[key], f"{label}: {key}") for key, value in settings.items()}
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """``" (nearest: UNet)"`` for a name that is nearly known, else nothing."""
+    by_key = {candidate.casefold(): candidate for candidate in known}
+    near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
+    return f" (nearest: {by_key[near[0]]})" if near else ""
+
+
 class Registry(Mapping[str, Any]):
     """Things of one kind by name, in alphabetical order.
 
@@ -69,7 +101,7 @@ class Registry(Mapping[str, Any]):
         0.5
         >>> filters.make({"name": "Identity", "settings": {"strenght": 0.5}})
         Traceback (most recent call last):
-        ValueError: filter Identity has no setting 'strenght'; did you mean 'strength'? There are strength
+        ValueError: filter Identity has no setting 'strenght'; it has strength (nearest: strength)
     """
 
     def __init__(self, kind: str, group: str, package: str) -> None:
@@ -98,7 +130,7 @@ class Registry(Mapping[str, Any]):
             self._import_builtin()
         if name not in self._things:
             if name not in self._entry_points:
-                raise UnknownName(f"{self.kind} {name!r} is unknown; {_choice(name, self)}")
+                raise UnknownName(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}")
             self._things[name] = self._loaded(name)
         return self._things[name]
 
@@ -124,19 +156,7 @@ class Registry(Mapping[str, Any]):
                 may refuse a value too.
         """
         name, settings = name_and_settings(spec)
-        return self[name](**{**defaults, **self._checked(name, settings, set(defaults))})
-
-    def _checked(self, name: str, settings: dict[str, Any], given: set[str]) -> dict[str, Any]:
-        """The settings; lists, which is what YAML and JSON have, as tuples."""
-        label, parameters = f"{self.kind} {name}", inspect.signature(self[name]).parameters
-        takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-        for key in settings:
-            if key not in takes:
-                raise ValueError(f"{label} has no setting {key!r}; {_choice(key, takes)}")
-        for key in takes:
-            if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
-                raise ValueError(f"{label} needs the setting {key!r}: {{name: {name}, settings: {{{key}: ...}}}}")
-        return {key: _of_type(value, parameters[key], f"{label}: {key}") for key, value in settings.items()}
+        return self[name](**{**defaults, **checked_settings(f"{self.kind} {name}", self[name], settings, defaults)})
 
     def _import_builtin(self) -> None:
         if self._complete:
@@ -167,15 +187,8 @@ class Registry(Mapping[str, Any]):
 
 
 def _path(thing: Any) -> str:
+    thing = getattr(thing, "func", thing)  # of functools.partial
     return f"{thing.__module__}.{thing.__qualname__}"
-
-
-def _choice(name: object, known: Iterable[str]) -> str:
-    """What there is, the nearest name first."""
-    by_key = {candidate.casefold(): candidate for candidate in known}
-    near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
-    hint = f"did you mean {by_key[near[0]]!r}? " if near else ""
-    return f"{hint}There are {', '.join(by_key.values()) or 'none'}"
 
 
 def _of_type(value: Any, parameter: inspect.Parameter, label: str) -> Any:
@@ -195,7 +208,7 @@ DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
 FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
 """Subclasses of :class:`denoisers.classical.Classical`."""
 NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
-"""Subclasses of :class:`rawaug.noise.NoiseModel`. Presets and cameras go by name too, see :mod:`rawaug.noise.by_name`."""
+"""Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.by_name`."""
 DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
 """``reader(path, split) -> Sequence[Pair]``; what ``kind:path`` opens as pairs."""
 PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")

@@ -17,8 +17,8 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 import denoisers
-from denoisers.stabilised import Stabilised
 from denoisers.network import Denoiser
+from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed, exposure_of
@@ -27,6 +27,7 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe
+from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
 
 TILE, OVERLAP = 384, 64

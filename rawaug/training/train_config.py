@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from rawaug.registry import LOSSES
+
 
 @dataclass
 class DenoiserConfig:
@@ -31,7 +33,7 @@ class TrainConfig:
         warmup: steps of linear warm-up.
         schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
         halve_every: steps.
-        loss: l1, l2 or charbonnier.
+        loss: l1, l2 or charbonnier, or {name, settings}.
         weigh: how the loss weighs light and shade: linear, stabilised or mixed; see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
         clip_norm: largest norm of the gradient; 0 switches it off.
@@ -50,7 +52,7 @@ class TrainConfig:
     warmup: int = 50
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: int = 20000
-    loss: Literal["l1", "l2", "charbonnier"] = "l1"
+    loss: str | dict[str, Any] = "l1"
     weigh: Literal["linear", "stabilised", "mixed"] = "linear"
     ema: float = 0.99
     clip_norm: float = 0.1
@@ -65,6 +67,7 @@ class TrainConfig:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
             if getattr(self, key) < 1:
                 raise ValueError(f"train.{key} is at least 1, got {getattr(self, key)}")
+        LOSSES.make(self.loss)
         if self.crop < 8 or self.crop % 2:
             raise ValueError(f"train.crop is even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:

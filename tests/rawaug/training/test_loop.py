@@ -61,7 +61,7 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
         pass
 
     steps = 0
-    plain = loop.LOSSES["l1"]
+    plain = loop.LOSSES.make("l1")
 
     def dies(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         nonlocal steps
@@ -70,10 +70,10 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
             raise Killed
         return plain(a, b)
 
-    monkeypatch.setitem(loop.LOSSES, "l1", dies)
+    monkeypatch.setitem(loop.LOSSES._things, "l1", lambda: dies)
     with pytest.raises(Killed):
         loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
-    monkeypatch.setitem(loop.LOSSES, "l1", plain)
+    monkeypatch.setitem(loop.LOSSES._things, "l1", lambda: plain)
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
