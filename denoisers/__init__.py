@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from denoisers.dhdn import DHDN
     from denoisers.dncnn import DnCNN
     from denoisers.ensemble import SelfEnsemble
+    from denoisers.nafnet import NAFNet
     from denoisers.network import Denoiser
     from denoisers.non_local_means import NonLocalMeans
+    from denoisers.pmrid import PMRID
     from denoisers.stabilised import Stabilised
     from denoisers.tiling import tiled
     from denoisers.total_variation import TotalVariation
@@ -30,7 +32,9 @@ _MODULES = {
     "DHDN": "denoisers.dhdn",
     "Denoiser": "denoisers.network",
     "DnCNN": "denoisers.dncnn",
+    "NAFNet": "denoisers.nafnet",
     "NonLocalMeans": "denoisers.non_local_means",
+    "PMRID": "denoisers.pmrid",
     "SelfEnsemble": "denoisers.ensemble",
     "Stabilised": "denoisers.stabilised",
     "TotalVariation": "denoisers.total_variation",
@@ -47,8 +51,10 @@ __all__ = [
     "BM3D",
     "DENOISERS",
     "DHDN",
+    "PMRID",
     "Denoiser",
     "DnCNN",
+    "NAFNet",
     "NonLocalMeans",
     "SelfEnsemble",
     "Stabilised",

@@ -54,6 +54,7 @@ class DHDN(Denoiser):
         channels: 4 for packed RAW, 3 in the paper.
         variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
         deviation: the map is sqrt(variance); False: the variance.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
         seed: of the initial weights.
 
     Example:
@@ -68,10 +69,11 @@ class DHDN(Denoiser):
         channels: int = PACKED,
         variance_map: bool = True,
         deviation: bool = True,
+        domain: str = "linear",
         seed: int = 0,
     ) -> None:
         require_width(width, multiple=2)
-        super().__init__(channels, variance_map, deviation, 2 ** (LEVELS - 1), {"width": width})
+        super().__init__(channels, variance_map, deviation, 2 ** (LEVELS - 1), {"width": width}, domain)
         sizes = [width * 2**k for k in range(LEVELS)]
         self.first = _pointwise(self.inputs, width)
         self.encoder = nn.ModuleList(_level(size) for size in sizes)

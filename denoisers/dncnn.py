@@ -29,6 +29,7 @@ class DnCNN(Denoiser):
         channels: 4 for packed RAW.
         variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
         deviation: the map is sqrt(variance); False: the variance.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
         seed: of the initial weights.
 
     Example:
@@ -46,13 +47,14 @@ class DnCNN(Denoiser):
         channels: int = PACKED,
         variance_map: bool = True,
         deviation: bool = True,
+        domain: str = "linear",
         seed: int = 0,
     ) -> None:
         require_width(width)
         if depth < 2:
             raise ValueError(f"depth must be at least 2, got {depth}")
         config = {"width": width, "depth": depth, "batch_norm": batch_norm}
-        super().__init__(channels, variance_map, deviation, 1, config)
+        super().__init__(channels, variance_map, deviation, 1, config, domain)
         middle = [layer for _ in range(depth - 2) for layer in _layer(width, batch_norm)]
         last = conv(width, channels)
         self.layers = nn.Sequential(conv(self.inputs, width), nn.ReLU(inplace=True), *middle, last)

@@ -26,8 +26,8 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-LEAST_SHOT = 3e-4
-"""Least shot_var of the transforms, white at 3,300 photons: inputs need a bound, and white at ISO 100 is 400
+LEAST_SHOT = 6e-4
+"""Least shot_var of the transforms, white at 1,700 photons: inputs need a bound, and white at ISO 100 is 400
 times its noise."""
 _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""

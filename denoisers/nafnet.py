@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import PACKED, Denoiser, conv, require_width
+from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
 from rawaug.registry import DENOISERS
 
 
@@ -102,7 +102,7 @@ class NAFNet(Denoiser):
         self.middle = _blocks(sizes[-1], middle)
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_blocks(c, n) for c, n in zip(reversed(sizes[:-1]), decoder, strict=True))
-        self.initialise(seed, self.ending)
+        self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""

@@ -25,7 +25,11 @@ PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
 
 LEAK = 0.2
-"""Negative slope that the initialisation reckons with (the U-Net's own; the others' are near enough)."""
+"""Negative slope of the leaky ReLUs."""
+HE_GAIN = math.sqrt(2.0 / (1.0 + LEAK**2))
+"""Keeps the deviation of features through a convolution and its leaky ReLU."""
+RESIDUAL_GAIN = math.sqrt(1.0 / 3.0)
+"""For deep sums of residuals of separable convolutions, whose deviation HE_GAIN would multiply at each of dozens."""
 
 
 def conv(
@@ -141,10 +145,11 @@ class Denoiser(nn.Module, ABC):
         return self.residual(pad_to_multiple(features, self.stride))[..., : signal.shape[-2], : signal.shape[-1]]
 
     @torch.no_grad()
-    def initialise(self, seed: int, *zeros: nn.Conv2d) -> None:
-        """Draw all convolutions anew (He et al. 2015, fan in), biases zero; ``zeros`` become zero altogether.
+    def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
+        """Draw all convolutions anew (He et al. 2015), biases zero; ``zeros`` become zero altogether.
 
-        The numbers come from a CPU generator of ``seed``: the same on every device, and the global state is untouched.
+        A weight has the standard deviation ``gain / sqrt(fan in)``. The numbers come from a CPU generator of ``seed``:
+        the same on every device, and the global state is untouched.
         """
         generator = torch.Generator("cpu").manual_seed(seed)
         for module in self.modules():
@@ -157,7 +162,7 @@ class Denoiser(nn.Module, ABC):
                 upwards = isinstance(module, nn.ConvTranspose2d)
                 fan_in = module.in_channels if upwards else math.prod(module.weight.shape[1:])
                 draw = torch.empty(module.weight.shape, device="cpu")
-                deviation = nn.init.calculate_gain("leaky_relu", LEAK) / math.sqrt(fan_in)
+                deviation = gain / math.sqrt(fan_in)
                 module.weight.copy_(nn.init.normal_(draw, 0.0, deviation, generator=generator))
             if module.bias is not None:
                 module.bias.zero_()

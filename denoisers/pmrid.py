@@ -15,7 +15,7 @@ from collections import OrderedDict
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, Denoiser, conv, require_width
+from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
 from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 16
@@ -123,7 +123,7 @@ class PMRID(Denoiser):
             self.add_module(f"dec{k}", DecoderStage(inputs, outputs, skip))
         self.out0 = Residual(width)
         self.out1 = _named(conv(width, channels))
-        self.initialise(seed, self.out1.conv)
+        self.initialise(seed, self.out1.conv, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of 16, to the correction ``(B, channels, h, w)``."""

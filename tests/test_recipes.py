@@ -91,7 +91,7 @@ def test_its_smoke_form_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.fixture
 def two_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the demo's frames and pictures only two, and few steps to the best weights: the same code in less time."""
-    for module in ("ablation", "comparison", "downstream"):
+    for module in ("ablation", "reconstruction", "downstream"):
         monkeypatch.setattr(f"rawaug.experiment.{module}.open_pairs", lambda spec, split: open_pairs(spec, split)[:2])
     monkeypatch.setattr("rawaug.experiment.reconstruction.open_pictures", lambda spec, min_side: demo_pictures(9)[-2:])
     monkeypatch.setattr("rawaug.experiment.methods.ORACLE_STEPS", 10)

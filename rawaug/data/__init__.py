@@ -1,7 +1,7 @@
 """What is read: pictures, RAW files, published datasets and the built-in demo data.
 
 They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for what is to be handed in.
+clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def open_pictures(spec: str, min_side: int = 2) -> Sequence[Tensor] | PictureFol
 
     Args:
         spec: ``"demo:"`` or the path of a folder.
-        min_side: smaller pictures of a folder are skipped and told; give the side of your crops.
+        min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
@@ -104,12 +104,10 @@ def open_pictures(spec: str, min_side: int = 2) -> Sequence[Tensor] | PictureFol
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:
     if kind not in kinds:
         known = ", ".join(f"{name}:" for name in kinds)
-        raise ValueError(
-            f"{spec}: no such {kinds.kind}; there are {known} or the path of {other}{nearest(kind, kinds)}"
-        )
+        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{nearest(kind, kinds)}")
     reader: Callable[[str, Any], Any] = kinds[kind]
     if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
-        raise ValueError(f"{spec}: say where the data are, {kind}:PATH")
+        raise ValueError(f"{spec}: has no path; write {kind}:PATH")
     return reader
 
 

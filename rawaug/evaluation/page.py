@@ -1,7 +1,7 @@
-"""The page of a run: one HTML file that needs nothing beside it, with curves, tables and pictures.
+"""The page of a run: one self-contained HTML file with curves, tables and pictures.
 
-RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Of each frame the whole clean picture
-stands there once, and the window with most detail of it at twice its size: noisy, of every arm, clean.
+RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Each frame is shown
+whole and clean, with its most detailed window at twice the size: noisy, from every arm, and clean.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHOLE = 640
 """Largest width of a whole frame on the page, in pixels."""
 
 ON_PAGE = 12
-"""Frames on the page at most."""
+"""Largest number of frames on the page."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
@@ -63,7 +63,7 @@ class Page:
 
     def add_curves(self, png: bytes) -> None:
         """A figure as :func:`draw_curves` makes it."""
-        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'curves of training')}</p>", "<h2>Pictures</h2>"]
+        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'training curves')}</p>", "<h2>Pictures</h2>"]
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
@@ -80,7 +80,7 @@ class Page:
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"<figcaption>whole frame, clean; the window is at row {2 * top}, column {2 * left}</figcaption>"
+        caption = f"<figcaption>whole frame, clean; window at row {2 * top}, column {2 * left}</figcaption>"
         figures.append(f"<figure>{_picture(encode_png(whole), 'whole frame')}{caption}</figure>")
         self.parts.append(f'<h3>{html.escape(row.pair.name)}</h3><div class="frame">{"".join(figures)}</div>')
 

@@ -34,7 +34,7 @@ TILE, OVERLAP = 384, 64
 """Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
-"""Denoises the packed RAW of a sample; what it may know of the pair are the levels of the noise."""
+"""Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
 
 @torch.no_grad()
 def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, maybe as a mean of views.
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
 
     Returns:
         The same shape, on the CPU.
@@ -121,10 +121,10 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
-    """Refuse what is no classical denoiser or has no such setting.
+    """Check the names and settings of classical denoisers.
 
     Raises:
-        ValueError: with the nearest name.
+        ValueError: if one is unknown.
     """
     for spec in specs:
         FILTERS.make(spec)

@@ -63,7 +63,7 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
     _require_no_iso(spec, iso)
     if not isinstance(spec, Sequence) or len(spec) != 2:
-        raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
+        raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
     return FixedLevels(*(float(value) for value in spec))
 
 
@@ -79,7 +79,7 @@ def _of_name(name: str, iso: Iso) -> NoiseLevels:
 def _require_no_iso(spec: str | Sequence[float] | Sequence[str], iso: Iso) -> None:
     if iso is not None:
         raise ValueError(
-            f"noise {spec!r} has no law by ISO; leave iso out, or name a camera: {', '.join(camera_names())}"
+            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
         )
 
 
@@ -98,7 +98,7 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
 
 
 def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
-    """The noise model of a name or of (shot_var, read_var); a model is handed back as it is.
+    """The noise model of a name or of (shot_var, read_var); a model is returned as it is.
 
     Args:
         spec: one of :func:`noise_names`, with settings as ``{"name": ..., "settings": {...}}``, a list of names (each
@@ -119,16 +119,17 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     """
     if isinstance(spec, (str, Mapping)):
         name, settings = name_and_settings(spec)
-        if name in NOISE:
-            spec = NOISE.make(spec)
-        else:
+        if name not in NOISE:
             options = checked_settings(f"noise {name!r}", partial(_shot_read, name), settings)
             return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
-    if not isinstance(spec, NoiseModel):
+        model: NoiseModel = NOISE.make(spec)
+    elif isinstance(spec, NoiseModel):
+        model = spec
+    else:
         return _shot_read(spec, iso, poisson)
     if iso is not None or poisson:
-        raise ValueError("iso and poisson are for noise given by name; this noise is a model already")
-    return spec
+        raise ValueError("iso and poisson apply to noise given by name, not to a noise model")
+    return model
 
 
 def _shot_read(

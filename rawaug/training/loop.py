@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
@@ -71,8 +71,7 @@ def train(
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
-    ema = torch.optim.swa_utils.get_ema_multi_avg_fn(config.ema)
-    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=ema)
+    average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
     start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
@@ -138,6 +137,17 @@ def launched(device: str, devices: int, precision: str) -> Any:
         fabric.launch()
     fabric.barrier()
     return fabric
+
+
+def running_average(decay: float) -> Any:
+    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
+
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
+        n = int(steps)
+        torch._foreach_lerp_(list(averages), list(weights), 1.0 - min(decay, (1 + n) / (10 + n)))
+
+    return update
 
 
 def learning_rate_factor(step: int, config: TrainConfig) -> float:

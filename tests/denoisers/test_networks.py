@@ -1,6 +1,7 @@
 """The contract that every network keeps: shapes, identity before training, errors, dtypes, export."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,7 +9,9 @@ import torch
 from torch import Tensor
 
 from denoisers import DHDN, Denoiser, DnCNN, UNet
+from denoisers.nafnet import NAFNet
 from denoisers.network import pad_to_multiple
+from denoisers.pmrid import PMRID
 
 Make = Callable[..., Any]
 
@@ -16,6 +19,8 @@ SMALL: dict[str, Make] = {
     "UNet": lambda **settings: UNet(width=4, **settings),
     "DHDN": lambda **settings: DHDN(width=4, **settings),
     "DnCNN": lambda **settings: DnCNN(width=8, depth=4, **settings),
+    "PMRID": lambda **settings: PMRID(width=4, **{"domain": "linear", "variance_map": True, **settings}),
+    "NAFNet": lambda **settings: NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1), **settings),
 }
 
 
@@ -33,8 +38,11 @@ def awake(model: Denoiser, seed: int = 5) -> Denoiser:
     """The zero weights drawn as well, so that the residual is not zero."""
     model.initialise(seed)
     with torch.no_grad():
-        for weight in model.parameters():
-            weight.mul_(0.7)  # DHDN's residual blocks would double the signal fourteen times
+        for key, weight in model.named_parameters():
+            if key.endswith(("beta", "gamma")):
+                weight.fill_(0.5)  # NAFNet's residuals start at zero
+            elif "norm" not in key:
+                weight.mul_(0.7)  # DHDN's residual blocks would double the signal fourteen times
     return model.eval()
 
 
@@ -135,10 +143,70 @@ def test_padding_reflects_without_the_edge_as_often_as_needed() -> None:
     assert pad_to_multiple(padded, 8) is padded
 
 
-def test_dhdn_has_the_published_size() -> None:
+@pytest.mark.parametrize("domain", ["ksigma", "anscombe"])
+def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
+    noisy = pair(2, 4, 20, 24)[0]
+    variance = 1e-3 * noisy.clamp_min(0.0) + 1e-5
+    blind = make(domain=domain, variance_map=False)
+    assert blind.config["domain"] == domain
+    torch.testing.assert_close(blind.eval()(noisy, variance), noisy, rtol=0, atol=1e-5)
+    model = awake(blind)
+    assert (model(noisy, variance) - noisy).abs().max() > 1e-3
+    with pytest.raises(ValueError, match=f"domain='{domain}': pass the noise variance"):
+        model(noisy)
+    # The same picture at twice the gain is the same problem, whose solution is twice as bright.
+    torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="domain 'log' is none of linear, ksigma, anscombe"):
+        make(domain="log")
+
+
+def size(model: Denoiser) -> int:
+    return sum(weight.numel() for weight in model.parameters())
+
+
+def test_the_published_sizes() -> None:
+    plain: dict[str, Any] = {"channels": 3, "variance_map": False}
     with torch.device("meta"):
-        model = DHDN(width=128, channels=3, variance_map=False)
-    assert sum(weight.numel() for weight in model.parameters()) == pytest.approx(168.2e6, abs=0.1e6)
+        assert size(PMRID()) == 1_031_908
+        assert size(DHDN(width=128, **plain)) == pytest.approx(168.2e6, abs=0.1e6)
+        denoising = NAFNet(**plain)
+        deblurring = NAFNet(width=32, encoder=(1, 1, 1, 28), middle=1, decoder=(1, 1, 1, 1), **plain)
+    assert size(denoising) == pytest.approx(29.16e6, abs=0.005e6)
+    assert size(deblurring) == pytest.approx(17.11e6, abs=0.005e6)
+
+
+def test_pmrid_s_signals_keep_their_size_whatever_the_picture_s() -> None:
+    model = PMRID(variance_map=True)
+    seen: list[Tensor] = []
+    for stage in (model.enc4, model.out0):
+        stage.register_forward_hook(lambda module, inputs, output: seen.append(output))
+    for side in (64, 256):  # packed pixels: a training crop's, and the first on which deep layers see no border
+        noise = torch.randn(1, 8, side, side, generator=torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            model.residual(3.0 + noise)
+    deviations = [output.std().item() for output in seen]
+    assert 0.05 < min(deviations) < max(deviations) < 20.0
+    assert deviations[2] < 2.5 * deviations[0] and deviations[3] < 2.5 * deviations[1]
+
+
+def test_pmrid_s_published_weights_denoise(camera_files: Path) -> None:
+    from safetensors.torch import load_file
+
+    from rawaug.data import open_pairs
+    from rawaug.evaluation.scores import frozen_sample
+    from rawaug.metrics import psnr
+    from rawaug.noise import noise_model
+
+    weights = camera_files.parent / "baselines/pmrid.safetensors"
+    if not weights.is_file():
+        pytest.skip(f"no published weights in {weights}")
+    model = PMRID().eval()
+    model.load_state_dict(load_file(weights))
+    frame = open_pairs(str(camera_files / "raw/canon"))[0].middle(256)
+    sample = frozen_sample(frame, noise_model("cycleisp_sidd"), frame.cfa, seed=0)
+    with torch.no_grad():
+        denoised = model(sample.noisy, sample.variance)
+    assert psnr(denoised, sample.clean).item() > psnr(sample.noisy, sample.clean).item() + 10.0
 
 
 def test_unet_has_the_published_features() -> None:
@@ -159,6 +227,7 @@ def test_unet_has_the_published_features() -> None:
         (lambda: DHDN(width=5), "positive multiple of 2"),
         (lambda: UNet(scales=0), "scales must be at least 1"),
         (lambda: DnCNN(depth=1), "depth must be at least 2"),
+        (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "as many scales as each other"),
     ],
 )
 def test_impossible_settings_are_refused(make_bad: Make, message: str) -> None:

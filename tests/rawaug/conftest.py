@@ -1,4 +1,4 @@
-"""Bayer DNGs for the tests to read, and the way to real files where there are any."""
+"""Bayer DNGs for the tests to read."""
 
 from __future__ import annotations
 
@@ -61,13 +61,3 @@ def write_dng(
 @pytest.fixture(scope="session")
 def bayer_dng() -> Callable[..., Path]:
     return write_dng
-
-
-@pytest.fixture(scope="session")
-def camera_files() -> Path:
-    """The folder of real camera files, beside the repository or where RAWAUG_SHARED says."""
-    beside = Path(__file__).parents[3] / "shared" / "data"
-    folder = Path(os.environ.get("RAWAUG_SHARED", beside))
-    if not (folder / "raw").is_dir():
-        pytest.skip(f"no real camera files in {folder}; RAWAUG_SHARED names their folder")
-    return folder

@@ -1,0 +1,71 @@
+"""Files are whole or the old ones, equal content makes equal files, and what cannot be read is one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from rawaug.files import (
+    WEIGHTS,
+    digest,
+    find_weights,
+    fingerprint,
+    read_header,
+    read_tensors,
+    replacing,
+    sha256,
+    write_json,
+    write_tensors,
+)
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    with replacing(path) as partial:
+        partial.write_text("old")
+    with pytest.raises(OSError, match="disk full"), replacing(path) as partial:
+        partial.write_text("half")
+        raise OSError("disk full")
+    assert path.read_text() == "old" and [file.name for file in path.parent.iterdir()] == ["a.txt"]
+    with pytest.raises(TypeError):
+        write_json({"a": object()}, path)
+    assert path.read_text() == "old"
+
+
+def test_equal_tensors_make_equal_files(tmp_path: Path) -> None:
+    tensors, header = {"b": torch.arange(6.0).reshape(2, 3).T, "a": torch.ones(1)}, {"format": "rawaug", "kind": "x"}
+    for k in range(5):
+        write_tensors(tensors, dict(sorted(header.items(), reverse=bool(k % 2))), tmp_path / f"{k}.safetensors")
+    assert len({sha256(tmp_path / f"{k}.safetensors") for k in range(5)}) == 1
+    found, back = read_tensors(tmp_path / "0.safetensors", "")
+    assert found == header == read_header(tmp_path / "0.safetensors")
+    assert back.keys() == tensors.keys() and all(torch.equal(back[name], tensors[name]) for name in tensors)
+
+
+def test_what_cannot_be_read_is_named_with_what_to_do(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"not weights")
+    with pytest.raises(ValueError, match=r"bad\.safetensors: not a readable safetensors file .*; copy it again$"):
+        read_tensors(bad, "copy it again")
+    with pytest.raises(ValueError, match=r"bad\.safetensors: not a readable"):
+        read_header(bad)
+    write_tensors({"a": torch.ones(1)}, {"format": "other"}, bad)
+    with pytest.raises(ValueError, match="not rawaug's"):
+        read_header(bad)
+
+
+def test_weights_are_found_by_name_and_by_path(tmp_path: Path) -> None:
+    assert (
+        find_weights("universal")
+        == WEIGHTS / "universal.safetensors"
+        == find_weights(WEIGHTS / "universal.safetensors")
+    )
+    with pytest.raises(FileNotFoundError, match=r"nothing: no such weights.*universal"):
+        find_weights("nothing")
+
+
+def test_hashes() -> None:
+    assert digest(b"abc") == digest(b"a", b"bc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1}) != fingerprint({"a": 2, "b": 1})
