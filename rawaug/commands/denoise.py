@@ -14,7 +14,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 from torch.nn import functional as F
@@ -31,6 +30,7 @@ from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -39,23 +39,28 @@ Noise = str | Sequence[float]
 _NO_NOISE = (0.0, 0.0)
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
-    parser.add_argument("out", type=str, help="the DNG to write, or a folder")
-    parser.add_argument("--denoiser", type=str, required=True, help="a .safetensors file of rawaug run")
-    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
-    parser.add_argument("--self-ensemble", action="store_true", help="average eight views: eight times the work")
+@COMMANDS.register("denoise")
+def run(
+    source: str,
+    out: str,
+    *,
+    denoiser: str,
+    noise: tuple[float, float] | str = "auto",
+    self_ensemble: bool = False,
+) -> None:
+    """Denoise a RAW file, or a folder of them, to DNG; files that exist in the output folder are skipped.
 
-
-def run(arguments: Any) -> None:
-    """Denoise, and print what was done."""
-    a = arguments
-    if Path(a.source).is_dir():
-        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    Args:
+        source: a RAW file, or a folder of them.
+        out: the DNG to write, or a folder.
+        denoiser: a .safetensors file of rawaug run.
+        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        self_ensemble: average eight views: eight times the work.
+    """
+    if Path(source).is_dir():
+        print_denoised(denoise_folder(source, out, denoiser, noise, self_ensemble))
     else:
-        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, noise, self_ensemble)]))
 
 
 @dataclass(frozen=True)
