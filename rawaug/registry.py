@@ -69,7 +69,9 @@ def checked_settings(
     takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     for key in settings:
         if key not in takes:
-            raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes)}{nearest(key, takes)}")
+            raise ValueError(
+                f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{nearest(key, takes)}"
+            )
     for key in takes:
         if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
             raise ValueError(f"{label} needs the setting {key!r}")

@@ -51,7 +51,7 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops.
         estimator: what is learned from, a name or {name, settings}: supervised has clean targets; noisier, noise2noise,
             r2r and neighbor2neighbor know noisy frames alone, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator as recipes of 0.x had them, read for one more release.
+        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
     """
 
     augmented: float = 0.0
