@@ -63,6 +63,8 @@ class DHDN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
+    tiny = {"width": 4}
+
     def __init__(
         self,
         width: int = 16,

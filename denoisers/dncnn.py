@@ -39,6 +39,8 @@ class DnCNN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
+    tiny = {"width": 8, "depth": 3}
+
     def __init__(
         self,
         width: int = 64,

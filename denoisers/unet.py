@@ -45,6 +45,8 @@ class UNet(Denoiser):
         torch.Size([2, 4, 33, 50])
     """
 
+    tiny = {"width": 4, "scales": 2}
+
     def __init__(
         self,
         width: int = PUBLISHED_WIDTH,

@@ -37,7 +37,8 @@ def run(
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
         held_out: frames excluded from the fit; their PSNR_r is shown during the fit.
         out: output .safetensors file.
-        noise: measure the noise of the camera, for noise: camera; auto continues without it where frames do not allow it.
+        noise: measure the camera's noise, for noise: camera; auto continues without it where the frames do not
+            allow it.
         dark: folder of dark frames to measure the read variance.
         config: of the fit.
     """

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import ESTIMATORS, name_and_settings
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 
@@ -144,7 +144,6 @@ class Recipe:
 
 def smoke(recipe: Recipe) -> Recipe:
     """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
-    tiny = {"UNet": {"width": 4, "scales": 2}, "DHDN": {"width": 4}, "DnCNN": {"width": 8, "depth": 3}}
     name = recipe.denoiser.name
     few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
     return replace(
@@ -156,7 +155,7 @@ def smoke(recipe: Recipe) -> Recipe:
             validation=recipe.data.validation and "demo:validation",
         ),
         isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
-        denoiser=DenoiserConfig(name, tiny.get(name, {})),
+        denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         steps=None,
         seeds=1,

@@ -13,7 +13,7 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: UNet, DHDN or DnCNN.
+        name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
         settings: its constructor's keys.
     """
 
