@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import denoisers
+from rawaug.cli import main
+from rawaug.registry import DENOISERS, LOSSES, NOISE
 
 ROOT = Path(__file__).parents[1]
 
@@ -63,27 +69,42 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def rawaug(site: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(ROOT), str(site)])
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "rawaug.cli", *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package can be imported in this process, and nothing of it is left afterwards."""
+    kinds = (DENOISERS, NOISE, LOSSES)
+    monkeypatch.syspath_prepend(str(site))
+    for kind in kinds:
+        monkeypatch.setattr(kind, "_things", dict(kind._things))
+        vars(kind).pop("_entry_points", None)
+    yield
+    sys.modules.pop("abroad", None)
+    for kind in kinds:
+        vars(kind).pop("_entry_points", None)
 
 
 def test_a_recipe_trains_with_what_another_package_brings(site: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE)
-    done = rawaug(site, tmp_path, "run", "mine.yaml")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(site)]), "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, "-m", "rawaug.cli", "run", "mine.yaml"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     results = json.loads((tmp_path / "runs" / "abroad" / "results.json").read_text())
     assert 20.0 < results["results"]["pictures"][0]["plain"]["psnr"] < 60.0
     assert results["recipe"]["noise"] == {"name": "Banded", "settings": {"row_var": 1e-4}}
-    weights = str(tmp_path / "runs" / "abroad" / "seed0" / "pictures" / "denoiser.safetensors")
-    described = rawaug(site, tmp_path, "info", weights)
-    assert "denoiser Shallow" in described.stdout and '"width": 4' not in described.stderr
-    without = rawaug(tmp_path, tmp_path, "info", weights)  # the package is not installed
-    assert without.returncode == 2 and "denoiser 'Shallow' is unknown; use one of DHDN" in without.stderr
+    weights = tmp_path / "runs" / "abroad" / "seed0" / "pictures" / "denoiser.safetensors"
+    with pytest.raises(ValueError, match="denoiser 'Shallow' is unknown; use one of DHDN"):
+        denoisers.load(weights)  # the package is not installed in this process
 
 
+@pytest.mark.usefixtures("installed")
+def test_weights_of_its_network_are_saved_and_loaded(tmp_path: Path) -> None:
+    model = denoisers.build("Shallow", width=4)
+    denoisers.save(model, tmp_path / "x.safetensors", {})
+    assert type(denoisers.load(tmp_path / "x.safetensors")[0]) is type(model)
+
+
+@pytest.mark.usefixtures("installed")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -92,10 +113,10 @@ def test_a_recipe_trains_with_what_another_package_brings(site: Path, tmp_path: 
         (("name: charbonnier", "name: gone"), "loss 'gone': the entry point abroad:Missing cannot be loaded"),
     ],
 )
-def test_what_is_wrong_with_it_is_one_line(site: Path, tmp_path: Path, change: tuple[str, str], message: str) -> None:
-    import re
-
+def test_what_is_wrong_with_it_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], message: str
+) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE.replace(*change))
-    done = rawaug(site, tmp_path, "run", "mine.yaml")
-    assert done.returncode == 2
-    assert len(done.stderr.strip().splitlines()) == 1 and re.search(message, done.stderr), done.stderr
+    assert main(["run", str(tmp_path / "mine.yaml"), "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(message, line), line
