@@ -19,12 +19,13 @@ if TYPE_CHECKING:
     from denoisers.network import Denoiser
     from denoisers.non_local_means import NonLocalMeans
     from denoisers.pmrid import PMRID
+    from denoisers.pretrained import from_pretrained
     from denoisers.stabilised import Stabilised
     from denoisers.tiling import tiled
     from denoisers.total_variation import TotalVariation
     from denoisers.unet import UNet
     from denoisers.wavelet import Wavelet
-    from denoisers.weights import load, save
+    from denoisers.weight_files import load, save
 
 _MODULES = {
     "BM3D": "denoisers.block_matching",
@@ -41,8 +42,9 @@ _MODULES = {
     "UNet": "denoisers.unet",
     "Wavelet": "denoisers.wavelet",
     "build": "denoisers.catalogue",
-    "load": "denoisers.weights",
-    "save": "denoisers.weights",
+    "from_pretrained": "denoisers.pretrained",
+    "load": "denoisers.weight_files",
+    "save": "denoisers.weight_files",
     "tiled": "denoisers.tiling",
 }
 """Public name to the module that defines it."""
@@ -62,6 +64,7 @@ __all__ = [
     "UNet",
     "Wavelet",
     "build",
+    "from_pretrained",
     "load",
     "save",
     "tiled",

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
 import numpy as np
 
-from denoisers.classical import Classical, Planes
+from denoisers.classical import Classical, Planes, library
 from rawaug.registry import FILTERS
 
 _HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32)
@@ -28,11 +26,6 @@ class BM3D(Classical):
         Raises:
             ImportError: if the wheel is not installed.
         """
-        try:
-            bm3d = import_module("bm3d")
-        except ImportError:
-            raise ImportError(
-                "BM3D needs the bm3d wheel, whose licence is for non-commercial use only: pip install bm3d"
-            ) from None
+        bm3d = library("bm3d", "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD

@@ -10,6 +10,7 @@ Domain: packed RAW, any scale, not clipped; the work is done on the CPU.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -62,3 +63,15 @@ class Classical(ABC):
         planes = image.detach().permute(1, 2, 0).to("cpu", torch.float32).numpy() / np.float32(sigma)
         clean = np.ascontiguousarray(self.denoise(planes), np.float32) * np.float32(sigma)
         return torch.from_numpy(clean).permute(2, 0, 1).to(image)
+
+
+def library(name: str, advice: str = "run: pip install 'rawaug[train]'") -> Any:
+    """A library that not every installation has.
+
+    Raises:
+        ImportError: in one line, with ``advice``, if it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ImportError(f"{error.name} is not installed; {advice}") from None

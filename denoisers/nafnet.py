@@ -92,7 +92,7 @@ class NAFNet(Denoiser):
     ) -> None:
         require_width(width)
         if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
-            raise ValueError(f"encoder and decoder have as many scales as each other, got {encoder} and {decoder}")
+            raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
         super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from denoisers.classical import Classical, Planes
+from denoisers.classical import Classical, Planes, library
 from rawaug.registry import FILTERS
 
 
@@ -12,7 +12,6 @@ class NonLocalMeans(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_nl_means
-
+        denoise_nl_means = library("skimage.restoration").denoise_nl_means
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
         return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)

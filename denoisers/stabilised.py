@@ -56,7 +56,7 @@ class Stabilised:
 
         Args:
             noisy: packed RAW.
-            variance: its map shot_var max(noisy, 0) + read_var, from which the two are told, unless they are given.
+            variance: its map shot_var max(noisy, 0) + read_var, from which the two are derived if not given.
             shot_var, read_var: ``(B,)``.
 
         Raises:
@@ -66,7 +66,7 @@ class Stabilised:
             shot_var, read_var = _levels(noisy, variance)
         for name, value in (("shot_var", shot_var), ("read_var", read_var)):
             if value.shape != noisy.shape[:1]:
-                raise ValueError(f"{name} must be of shape ({len(noisy)},), one a picture, got {tuple(value.shape)}")
+                raise ValueError(f"{name} must have shape ({len(noisy)},), one per picture, got {tuple(value.shape)}")
         stable = self.transform.forward(noisy, shot_var, read_var)
         return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot_var, read_var)
 
@@ -80,7 +80,7 @@ def _levels(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
     spread = ((light - mean) ** 2).sum(1)
     slope = ((light - mean) * (variance - level)).sum(1) / spread.clamp(min=1e-30)
     shot_var, read_var = slope.clamp(min=0), (level[:, 0] - slope * mean[:, 0]).clamp(min=0)
-    told = shot_var[:, None] * light + read_var[:, None]
-    if not torch.allclose(told, variance, rtol=1e-2, atol=1e-12):
-        raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; give these two")
+    expected = shot_var[:, None] * light + read_var[:, None]
+    if not torch.allclose(expected, variance, rtol=1e-2, atol=1e-12):
+        raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
     return shot_var.to(noisy), read_var.to(noisy)

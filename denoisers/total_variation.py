@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from denoisers.classical import Classical, Planes
+from denoisers.classical import Classical, Planes, library
 from rawaug.registry import FILTERS
 
 
@@ -12,6 +12,5 @@ class TotalVariation(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_tv_chambolle
-
+        denoise_tv_chambolle = library("skimage.restoration").denoise_tv_chambolle
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)

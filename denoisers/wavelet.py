@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from denoisers.classical import Classical, Planes
+from denoisers.classical import Classical, Planes, library
 from rawaug.registry import FILTERS
 
 
@@ -16,8 +16,7 @@ class Wavelet(Classical):
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        from skimage.restoration import denoise_wavelet
-
+        denoise_wavelet = library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rawaug._version import __version__
+from rawaug.extras import MissingExtra
 
 BAD_INPUT = 2
 
@@ -22,13 +23,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(argv)
-    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+    except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
-    except (ValueError, OSError, ArgumentError) as error:
+    except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("rawaug: stopped; the same command goes on from here", file=sys.stderr)
+        print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
 
 
@@ -70,9 +71,9 @@ def _parser(kind: str) -> Any:
     def new(description: str) -> Any:
         return ArgumentParser(exit_on_error=False, description=description)
 
-    run = new("Every stage of a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
-    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a recipe in the package")
-    run.add_argument("--smoke", action="store_true", help="every stage in seconds on tiny built-in data")
+    run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
+    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
+    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
     run.add_class_arguments(KINDS[kind].settings)
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
     subcommands = parser.add_subcommands(dest="command")

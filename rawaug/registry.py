@@ -220,6 +220,6 @@ ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training.estimat
 LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
 """Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
 BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.isp.baselines")
-"""Subclasses of :class:`rawaug.isp.baselines.ReverseISP`."""
+"""Subclasses of :class:`rawaug.isp.baselines.base.BaselineISP`."""
 COMMANDS = Registry("command", "rawaug.commands", "rawaug.commands")
 """Functions behind ``rawaug NAME``: arguments and help are those of the signature and the docstring."""

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm.auto import tqdm
-
 import denoisers
 from denoisers.network import Denoiser
+from denoisers.pretrained import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -21,6 +20,7 @@ from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.progress import progress
 from rawaug.registry import COMMANDS, Spec
 
 
@@ -40,7 +40,7 @@ def run(
     """PSNR and SSIM of an ISP or a denoiser; the file says which.
 
     Args:
-        weights: a .safetensors file of rawaug fit or rawaug run.
+        weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
         data: folder of RAW files, one file, or kind:path.
         self_ensemble: also score the average over eight views (denoisers).
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
@@ -87,7 +87,7 @@ def evaluate(
             is for denoisers and the file is an ISP's.
     """
     require_classical(classical)
-    weights = find_weights(weights)
+    weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = open_pairs(data, split="test")
     if kind == "isp":
@@ -95,8 +95,9 @@ def evaluate(
             raise ValueError(
                 f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
             )
-        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
-        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
+        isp = DictionaryISP.from_pretrained(weights)
+        frames = progress(pairs, label="evaluate", unit="image")
+        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))

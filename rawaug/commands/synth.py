@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.commands.pair_files import (
     Format,
@@ -33,10 +32,12 @@ from rawaug.commands.pair_files import (
     write_pair,
 )
 from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
@@ -151,7 +152,8 @@ def synth(
     tasks = list(_tasks(pictures, source, out, per_image))
     result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
     todo = [task for task in tasks if task.numbers]
-    for task, error in tqdm(_done(todo, settings, workers), total=len(todo), desc="synth", unit="picture"):
+    bar = progress(_done(todo, settings, workers), label="synth", unit="picture", total=len(todo), leave=True)
+    for task, error in bar:
         if error is None:
             result.made += len(task.numbers)
         else:
@@ -274,15 +276,9 @@ def _make(task: _Task) -> str | None:
 
 
 def print_synthesis(result: Synthesis) -> None:
-    """A short table, and the broken pictures by name."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=str(result.out))
-    for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
-        table.add_column(column, justify="right")
+    """A short table, and the unreadable pictures by name."""
+    head = ("pictures", "pairs made", "existing", "unreadable", "time (s)")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
-    table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
-    Console(width=100).print(table)
+    print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"broken: {reason}")
+        print(f"unreadable: {reason}")

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
@@ -27,11 +26,9 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe
+from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
-
-TILE, OVERLAP = 384, 64
-"""Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -64,16 +61,14 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
     return Sample(noisy, clean, noise.variance(noisy, params))
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
     """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
 
     Returns:
         The same shape, on the CPU.
     """
-    run: Any = model
-    if max(sample.noisy.shape[-2:]) > TILE:
-        run = partial(denoisers.tiled, model, tile=TILE, overlap=OVERLAP)
+    run: Any = partial(denoisers.tiled, model)
     if self_ensemble:
         run = denoisers.SelfEnsemble(run, cfa, views=8)
     device = next(model.parameters()).device
@@ -85,7 +80,7 @@ def score_method(
     method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
     """Scores of every frame, with what was compared; one frame in memory at a time."""
-    for pair in tqdm(pairs, desc=label, unit="image", leave=False):
+    for pair in progress(pairs, label=label, unit="image"):
         sample = frozen_sample(pair, noise, cfa, seed)
         denoised = method(pair, sample)
         values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))

@@ -85,7 +85,7 @@ def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: Dictionar
 
 def _of_atoms(arm: ArmConfig) -> Sampling:
     if arm.sampling == "published":
-        raise ValueError("arms: sampling published is for supervised arms; use convex, perturb or chosen")
+        raise ValueError("arms: sampling published requires a supervised arm; use convex, perturb or chosen")
     return arm.sampling
 
 

@@ -17,10 +17,10 @@ class DataConfig:
     """Where pictures come from.
 
     Args:
-        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null if there are none.
+        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null for none.
         count: how many of them are used; all if null.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
-        memory_mb: pictures are kept in memory once decoded, up to so many megabytes.
+        memory_mb: pictures are kept in memory once decoded, up to this many megabytes.
         validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
             watches it on RAW made from the pictures, which chooses no weights: those of the end are kept.
         validation_crop: side of the middle of each validation frame that is looked at; null for the whole frame.
@@ -40,7 +40,7 @@ class DataConfig:
 
 @dataclass
 class ArmConfig:
-    """One way of training; arms differ in nothing else.
+    """One way of training; everything else is the same for all arms.
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
@@ -66,7 +66,7 @@ class ArmConfig:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
-            raise ValueError(f"augmented is a share between 0 and 1, got {self.augmented}")
+            raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
         name, settings = name_and_settings(self.estimator)
         for key in ("alpha", "correct", "gamma"):
             if (old := getattr(self, key)) is not None:
@@ -90,7 +90,7 @@ class Recipe:
         name: of the folder in ``out`` that it writes.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP that is taken as it is, the name of a shipped one or a file; null fits one to ``data.pairs``.
+        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
         noise: what is added to clean RAW, in training and where a test frame has no noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -124,17 +124,19 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if not self.arms:
-            raise ValueError("arms: a recipe compares at least one way of training")
+            raise ValueError("arms: a recipe needs at least one arm")
         if self.seeds < 1:
-            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
         if self.data.pairs is None and self.camera is None:
-            raise ValueError("data.pairs: an ISP is fitted to pairs; give some, or camera: universal")
+            raise ValueError("data.pairs: fitting an ISP needs pairs; set it, or camera: universal")
         if self.data.pairs is None and any(arm.augmented < 1.0 for arm in self.arms.values()):
-            raise ValueError("data.pairs: without real pairs every arm has augmented: 1")
+            raise ValueError("data.pairs: without real pairs every arm must have augmented: 1")
         if len({arm.sees_clean for arm in self.arms.values()}) > 1:
-            raise ValueError("arms: supervised and self-supervised do not mix, since these must see no clean frame")
+            raise ValueError(
+                "arms: supervised and self-supervised arms cannot be mixed; the latter must not see clean frames"
+            )
 
     @property
     def self_supervised(self) -> bool:
@@ -145,12 +147,12 @@ class Recipe:
 def smoke(recipe: Recipe) -> Recipe:
     """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
     name = recipe.denoiser.name
-    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
+    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=4, checkpoint_every=2, workers=0)
     return replace(
         recipe,
         name=f"{recipe.name.replace('/', '-')}-smoke",
         data=replace(
-            DataConfig(count=1, test_count=1),
+            DataConfig(count=1, validation_crop=64, test_count=1),
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
@@ -183,4 +185,4 @@ def find_recipe(name: str) -> Path:
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]
-    raise FileNotFoundError(f"{name}: no such recipe file, and none of the shipped recipes ({', '.join(known)})")
+    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe ({', '.join(known)})")

@@ -54,7 +54,7 @@ class WrappedLoader:
         """Set the next pass's epoch and first batch number; forwarded to the wrapped loader's ``set_epoch``, if any.
 
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
-        data, to meet the same noise again, and with ``start`` where a loader goes on in the middle of an epoch.
+        data, to repeat the same noise, and with ``start`` where a loader resumes in the middle of an epoch.
         """
         self._epoch, self._start = epoch, start
         if hasattr(self.loader, "set_epoch"):
@@ -117,7 +117,7 @@ def wrap(
             default whole pictures, without their last row or column where a side is odd.
 
     Raises:
-        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they make no batch.
+        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they do not form a batch.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP

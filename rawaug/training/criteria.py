@@ -1,4 +1,4 @@
-r"""What the distance between a denoised and a clean RAW is: a norm, and how it weighs light and shade.
+r"""The distance between a denoised and a clean RAW: a norm, and its weighting of light and shade.
 
 ==============  ====================================================================================================
 ``weigh``       what is compared
@@ -68,7 +68,7 @@ def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
     if weigh == "linear":
         return loss
     if weigh not in ("stabilised", "mixed"):
-        raise ValueError(f"train.weigh {weigh!r} is none of linear, stabilised, mixed")
+        raise ValueError(f"train.weigh {weigh!r} is unknown; use one of linear, stabilised, mixed")
     levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
 
     def stabilised(denoised: Tensor, clean: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Built-in data: a few photographs, dead leaves textured from them, and shots of both by the demo camera.
 
 The photographs are files of scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
-of texture. As for a camera at hand, there are few RAW pairs and many sRGB pictures.
+of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torch import Tensor
 from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
 from rawaug.data.demo.dead_leaves import dead_leaves
 from rawaug.data.pair import Pair
+from rawaug.extras import extra
 from rawaug.io import read_picture
 from rawaug.registry import DATASETS, PICTURES
 from rawaug.seeding import keyed_generator
@@ -138,7 +139,8 @@ def _photographs(split: str) -> dict[str, Tensor]:
 
 @cache
 def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
-    import skimage
+    with extra("train"):
+        import skimage
 
     folder = Path(skimage.__file__).parent / "data"
     return {Path(file).stem: read_picture(folder / file) for file in files}

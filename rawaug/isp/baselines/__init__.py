@@ -14,7 +14,7 @@ invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   
 Parameters are those of the reverse pass at the default, published size.
 """
 
-from rawaug.isp.baselines.base import ReverseISP
+from rawaug.isp.baselines.base import BaselineISP
 from rawaug.isp.baselines.cycleisp import CycleISP
 from rawaug.isp.baselines.invgrey import InvertibleGrey
 from rawaug.isp.baselines.invisp import InvISP
@@ -27,10 +27,10 @@ from rawaug.registry import BASELINES
 __all__ = [
     "BASELINES",
     "UPI",
+    "BaselineISP",
     "CycleISP",
     "InvISP",
     "InvertibleGrey",
-    "ReverseISP",
     "TunedUPI",
     "UNetISP",
     "fit_baseline",

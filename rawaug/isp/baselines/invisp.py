@@ -127,7 +127,7 @@ class InvISP(CropTrainedISP):
     ) -> None:
         super().__init__(cfa)
         if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality is in 1 to 100, got {jpeg_quality}")
+            raise ValueError(f"jpeg_quality must be 1 to 100, got {jpeg_quality}")
         self.jpeg_quality = jpeg_quality
         with initialised_from(derived_seed(seed, "baseline")):
             self.flow = Flow(blocks, growth)

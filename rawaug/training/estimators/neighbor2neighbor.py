@@ -43,7 +43,7 @@ class Neighbor2Neighbor(SelfSupervised):
 
     def __init__(self, gamma: float = 1.0) -> None:
         if gamma < 0:
-            raise ValueError(f"gamma is not negative, got {gamma}")
+            raise ValueError(f"gamma must be at least 0, got {gamma}")
         self.gamma = gamma
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:

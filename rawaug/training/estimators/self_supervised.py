@@ -12,7 +12,7 @@ from rawaug.training.estimators.supervised import Supervised
 
 
 def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """The noise variance as the noisy signal tells it, shape of ``noisy``."""
+    """The noise variance computed from the noisy signal, shape of ``noisy``."""
     return read_var + shot_var * noisy.clamp_min(0.0)
 
 
@@ -43,5 +43,5 @@ def recorrupted(noisy: Tensor, shot_var: float, read_var: float, alpha: float, d
 def positive(alpha: float) -> float:
     """``alpha``, or an error."""
     if not alpha > 0:
-        raise ValueError(f"alpha is positive, got {alpha}")
+        raise ValueError(f"alpha must be positive, got {alpha}")
     return alpha

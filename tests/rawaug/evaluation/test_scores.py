@@ -71,9 +71,9 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     pair = demo_pairs("test", count=1)[0]
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
-    told, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
-    assert torch.equal(measured.noisy, told.noisy)
-    assert (measured.variance / told.variance).mean() == pytest.approx(1.0, abs=0.1)
+    with_levels, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
+    assert torch.equal(measured.noisy, with_levels.noisy)
+    assert (measured.variance / with_levels.variance).mean() == pytest.approx(1.0, abs=0.1)
     levels = frozen_levels(bare, noise, seed=0)
     assert levels is not None
     y = pair.raw.mean().item()

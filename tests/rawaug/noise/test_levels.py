@@ -54,7 +54,7 @@ def test_presets_follow_their_published_law(name: str) -> None:
     assert stats.kstest((residual / sigma).numpy(), "norm").pvalue > 1e-3
 
 
-def test_natural_and_base_10_logarithms_are_told_apart() -> None:
+def test_natural_and_base_10_logarithms_are_reported_apart() -> None:
     """The same constants in base 10 give 10^1.2 / e^1.2 = 4.8 times the read variance, at the median."""
     (_, upi), (_, dnd) = draw(Preset("upi")), draw(Preset("cycleisp_dnd"))
     assert dnd.median() / upi.median() == pytest.approx(10**1.2 / math.e**1.2, rel=0.05)
