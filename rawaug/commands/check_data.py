@@ -8,7 +8,7 @@ from rawaug.registry import COMMANDS
 
 @COMMANDS.register("data check")
 def run(path: str, *, first: int | None = None) -> None:
-    """What is in a folder: which dataset, how many, sizes, patterns, levels, and what is damaged.
+    """Identify the dataset, count items, sizes, CFAs and levels, and list damaged files.
 
     Args:
         path: a folder, a RAW file, or a submission to SIDD.

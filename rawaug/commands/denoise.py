@@ -50,7 +50,7 @@ def run(
     noise: tuple[float, float] | str = "auto",
     self_ensemble: bool = False,
 ) -> None:
-    """Denoise a RAW file, or a folder of them, to DNG; files that exist in the output folder are skipped.
+    """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
 
     Args:
         source: a RAW file, or a folder of them.

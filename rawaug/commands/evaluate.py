@@ -37,7 +37,7 @@ def run(
     report: str | None = None,
     json: str | None = None,
 ) -> None:
-    """PSNR and SSIM of an ISP or a denoiser; the file says which.
+    """PSNR and SSIM of an ISP or a denoiser.
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.

@@ -30,7 +30,7 @@ def run(
     dark: str | None = None,
     config: FitConfig,
 ) -> None:
-    """Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where they exist).
+    """Fit a dictionary ISP to RAW files, with the camera's JPEGs of the same stems if present.
 
     Args:
         data: RAW files, folders of them, or one kind:path.

@@ -14,7 +14,7 @@ from rawaug.registry import COMMANDS
 
 @COMMANDS.register("info")
 def run(weights: str) -> None:
-    """What is in a file of weights.
+    """Describe a weights file.
 
     Args:
         weights: a .safetensors file, or the name of a shipped ISP or denoiser.

@@ -30,7 +30,7 @@ _MAXIMUM = 768
 
 @COMMANDS.register("preview")
 def run(picture: str, *, out: str, isp: str = "universal", count: int = 4, seed: int = 0) -> None:
-    """Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
+    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
     Args:
         picture: an sRGB picture.

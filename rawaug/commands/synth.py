@@ -57,7 +57,7 @@ def run(
     seed: int = 0,
     workers: int | None = None,
 ) -> None:
-    """RAW pairs on disk from a folder of sRGB pictures; an interrupted run resumes with the same command.
+    """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
     Args:
         pictures: folder of sRGB pictures.
