@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 
 class ChannelNorm(nn.Module):
@@ -56,6 +57,7 @@ class Block(nn.Module):
         return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
 
 
+@DENOISERS.register("NAFNet")
 class NAFNet(Denoiser):
     """See the module's head. Any h, w >= 2: padded by reflection inside.
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -81,6 +81,9 @@ class Denoiser(nn.Module, ABC):
     Raises:
         ValueError: if there is no such domain.
     """
+
+    tiny: ClassVar[dict[str, Any]] = {}
+    """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
 
     def __init__(
         self,

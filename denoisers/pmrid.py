@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 16
 BLOCKS = (2, 2, 4, 4)
@@ -84,6 +85,7 @@ class DecoderStage(nn.Module):
         return y.add_(self.proj_conv(skip).relu_())
 
 
+@DENOISERS.register("PMRID")
 class PMRID(Denoiser):
     """See the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
 

@@ -117,7 +117,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_fitted(capsys: pytest.
         assert flags[0].removeprefix("--train.").removeprefix("--") in refused(capsys, "run", "fewshot", *flags)
     assert "noise 'Foo' is unknown" in refused(capsys, "run", "fewshot", "--noise", "Foo")
     assert "thickness" in refused(capsys, "run", "fewshot", "--denoiser.settings", "{thickness: 3}")
-    assert "Median is unknown" in refused(capsys, "run", "fewshot", "--classical", "[Median]")
+    assert "'Median' is unknown" in refused(capsys, "run", "fewshot", "--classical", "[Median]")
     assert "sidd/full" in refused(capsys, "run", "sidd/nothing")
 
 

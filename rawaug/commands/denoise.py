@@ -14,7 +14,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,6 +32,7 @@ from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.progress import progress
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -41,24 +41,28 @@ Noise = str | Sequence[float]
 _NO_NOISE = (0.0, 0.0)
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
-    parser.add_argument("out", type=str, help="output DNG, or output folder")
-    denoiser_help = ".safetensors file written by rawaug run, or the name of a shipped denoiser"
-    parser.add_argument("--denoiser", type=str, default=DEFAULT, help=denoiser_help)
-    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
-    parser.add_argument("--self-ensemble", action="store_true", help="average eight views, at eight times the cost")
+@COMMANDS.register("denoise")
+def run(
+    source: str,
+    out: str,
+    *,
+    denoiser: str = DEFAULT,
+    noise: tuple[float, float] | str = "auto",
+    self_ensemble: bool = False,
+) -> None:
+    """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
 
-
-def run(arguments: Any) -> None:
-    """Denoise and print a summary."""
-    a = arguments
-    if Path(a.source).is_dir():
-        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    Args:
+        source: a RAW file, or a folder of them.
+        out: output DNG, or output folder.
+        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser.
+        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        self_ensemble: average eight views, at eight times the cost.
+    """
+    if Path(source).is_dir():
+        print_denoised(denoise_folder(source, out, denoiser, noise, self_ensemble))
     else:
-        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, noise, self_ensemble)]))
 
 
 @dataclass(frozen=True)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import denoisers
 from denoisers.pretrained import FOLDER
 from rawaug.files import find_weights, read_header
 from rawaug.isp.model import DictionaryISP
+from rawaug.registry import COMMANDS
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("weights", type=str, help="a .safetensors file, or the name of a shipped ISP or denoiser")
+@COMMANDS.register("info")
+def run(weights: str) -> None:
+    """Describe a weights file.
 
-
-def run(arguments: Any) -> None:
-    """Print the description."""
-    print(describe(arguments.weights))
+    Args:
+        weights: a .safetensors file, or the name of a shipped ISP or denoiser.
+    """
+    print(describe(weights))
 
 
 def describe(weights: str | Path) -> str:

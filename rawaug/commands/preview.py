@@ -20,6 +20,7 @@ from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 _STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}
@@ -27,18 +28,18 @@ _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("picture", type=str, help="an sRGB picture")
-    parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    parser.add_argument("--count", type=int, default=4, help="number of augmented RAWs to plot")
-    parser.add_argument("--seed", type=int, default=0, help="random seed")
+@COMMANDS.register("preview")
+def run(picture: str, *, out: str, isp: str = "universal", count: int = 4, seed: int = 0) -> None:
+    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
-
-def run(arguments: Any) -> None:
-    """Draw, and print the paths of the figures."""
-    for path in preview(arguments.picture, arguments.isp, arguments.out, arguments.count, arguments.seed):
+    Args:
+        picture: an sRGB picture.
+        out: output PNG; the atoms are written to NAME-atoms.png.
+        isp: ISP file, or the name of a shipped ISP.
+        count: number of augmented RAWs to plot.
+        seed: of these.
+    """
+    for path in preview(picture, isp, out, count, seed):
         print(path)
 
 

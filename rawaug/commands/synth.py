@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -38,29 +38,39 @@ from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
 from rawaug.progress import progress
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("pictures", type=str, help="folder of sRGB pictures")
-    parser.add_argument("out", type=str, help="output folder")
-    parser.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
-    parser.add_argument("--per-image", type=int, default=1, help="pairs per picture")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    noise_help = "a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
-    parser.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="random seed")
-    parser.add_argument("--workers", type=int | None, default=None, help="number of processes; by default one per core")
+@COMMANDS.register("synth")
+def run(
+    pictures: str,
+    out: str,
+    *,
+    format: Format = "dng",
+    per_image: int = 1,
+    isp: str = "universal",
+    noise: tuple[float, float] | str = "cycleisp_sidd",
+    sampling: Sampling = "convex",
+    seed: int = 0,
+    workers: int | None = None,
+) -> None:
+    """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
-
-def run(arguments: Any) -> None:
-    """Make the pairs, and print a table."""
-    settings = vars(arguments)
-    print_synthesis(synth(settings.pop("pictures"), settings.pop("out"), **settings))
+    Args:
+        pictures: folder of sRGB pictures.
+        out: output folder.
+        format: 16-bit DNG, packed float32 NPZ or float32 TIFF.
+        per_image: pairs per picture.
+        isp: ISP file, or the name of a shipped ISP.
+        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
+        sampling: how camera settings are drawn.
+        seed: random seed.
+        workers: number of processes; by default one per core.
+    """
+    print_synthesis(synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers))
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 import denoisers
-from denoisers.classical import Classical, Stabilised
 from denoisers.network import Denoiser
+from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed, exposure_of
@@ -27,6 +27,7 @@ from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe
 from rawaug.progress import progress
+from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
 
 Method = Callable[[Pair, Sample], Tensor]
@@ -114,35 +115,25 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
     return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
-CLASSICAL: dict[str, Callable[[], Classical]] = {
-    "NonLocalMeans": denoisers.NonLocalMeans,
-    "Wavelet": denoisers.Wavelet,
-    "TotalVariation": denoisers.TotalVariation,
-    "BM3D": denoisers.BM3D,
-}
-"""By name; BM3D needs a wheel of its own."""
-
-
-def require_classical(names: Sequence[str]) -> None:
-    """Check the name of a classical denoiser.
+def require_classical(specs: Sequence[Spec]) -> None:
+    """Check the names and settings of classical denoisers.
 
     Raises:
-        ValueError: if it is unknown.
+        ValueError: if one is unknown.
     """
-    for name in names:
-        if name not in CLASSICAL:
-            raise ValueError(f"classical: {name} is unknown; use one of {', '.join(CLASSICAL)}")
+    for spec in specs:
+        FILTERS.make(spec)
 
 
-def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
+def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
     """A classical denoiser as something to score; shot noise is stabilised before and after."""
-    require_classical([name])
-    denoiser = CLASSICAL[name]()
+    denoiser = FILTERS.make(spec)
 
     def method(pair: Pair, sample: Sample) -> Tensor:
         levels = frozen_levels(pair, noise, seed)
         if levels is None or not levels[0] > 0:
-            return denoiser(sample.noisy, sample.variance)
+            denoised: Tensor = denoiser(sample.noisy, sample.variance)
+            return denoised
         shot_var, read_var = (torch.tensor([level]) for level in levels)
         return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
 
@@ -159,14 +150,19 @@ def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, floa
 
 
 def score_classical(
-    names: Sequence[str], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
+    specs: Sequence[Spec], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """The summary of each classical denoiser, by name."""
-    methods = {name: classical_method(name, noise, seed) for name in names}
+    """The summary of each classical denoiser, by name, with its settings where it has some."""
+    methods = {_label(spec): classical_method(spec, noise, seed) for spec in specs}
     return {
         name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
         for name, method in methods.items()
     }
+
+
+def _label(spec: Spec) -> str:
+    name, settings = name_and_settings(spec)
+    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
 
 def summary(scores: Sequence[Score]) -> dict[str, Any]:

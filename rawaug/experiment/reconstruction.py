@@ -26,10 +26,10 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.methods import (
     FAMILIES,
-    POINTWISE,
     ROWS,
     cycle_psnr,
     fit_family,
+    learns_by_descent,
     mosaic_only_psnr,
     score_rows,
 )
@@ -126,7 +126,7 @@ class _Comparison:
         self.pairs = list(open_pairs(settings.data, split="train"))
         if len(self.pairs) < 2:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
-        exact = any(method not in POINTWISE for method in settings.methods)
+        exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
                 what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has a different CFA"
@@ -156,7 +156,7 @@ class _Comparison:
     def _families(self) -> Iterator[tuple[str, float]]:
         for family in self.settings.methods:
             yield family, 1.0
-            if self.settings.longer and family in ("unet", "cycleisp", "invisp", "invgrey"):
+            if self.settings.longer and learns_by_descent(family):
                 yield family, self.settings.longer
 
     def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:

@@ -27,8 +27,9 @@ from rawaug.extras import extra
 from rawaug.files import replacing
 from rawaug.metrics import psnr
 from rawaug.progress import progress
+from rawaug.registry import LOSSES
 from rawaug.seeding import derived_seed
-from rawaug.training.criteria import LOSSES, weighed
+from rawaug.training.criteria import Criterion, weighed
 from rawaug.training.estimators import Supervised
 from rawaug.training.stream import StepSampler, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -67,6 +68,7 @@ def train(
         ValueError: if no validation score was a number: the training has diverged.
     """
     estimator = estimator or Supervised()
+    norm: Criterion = LOSSES.make(config.loss)
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
@@ -91,8 +93,7 @@ def train(
     )
     for step, batch in enumerate(bar, start=start + 1):
         sample = type(batch)(*(x.to(fabric.device, memory_format=layout) for x in batch))
-        criterion = weighed(LOSSES[config.loss], config.weigh, sample)
-        loss = estimator.loss(step_model, sample, criterion, step / config.steps)
+        loss = estimator.loss(step_model, sample, weighed(norm, config.weigh, sample), step / config.steps)
         optimiser.zero_grad(set_to_none=True)
         fabric.backward(loss)
         if config.clip_norm:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from rawaug.files import fingerprint
+from rawaug.registry import LOSSES
 
 
 @dataclass
@@ -13,7 +14,7 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: UNet, DHDN or DnCNN.
+        name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
         settings: its constructor's keys.
     """
 
@@ -33,7 +34,7 @@ class TrainConfig:
         warmup: steps of linear warm-up.
         schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
         halve_every: steps.
-        loss: l1, l2 or charbonnier.
+        loss: l1, l2 or charbonnier, or {name, settings}.
         weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
@@ -52,7 +53,7 @@ class TrainConfig:
     warmup: int = 50
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: int = 20000
-    loss: Literal["l1", "l2", "charbonnier"] = "l1"
+    loss: str | dict[str, Any] = "l1"
     weigh: Literal["linear", "stabilised", "mixed"] = "linear"
     ema: float = 0.99
     clip_norm: float = 0.1
@@ -67,6 +68,7 @@ class TrainConfig:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
             if getattr(self, key) < 1:
                 raise ValueError(f"train.{key} must be at least 1, got {getattr(self, key)}")
+        LOSSES.make(self.loss)
         if self.crop < 8 or self.crop % 2:
             raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:

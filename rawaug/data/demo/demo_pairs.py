@@ -17,6 +17,7 @@ from rawaug.data.demo.dead_leaves import dead_leaves
 from rawaug.data.pair import Pair
 from rawaug.extras import extra
 from rawaug.io import read_picture
+from rawaug.registry import DATASETS, PICTURES
 from rawaug.seeding import keyed_generator
 
 PHOTOGRAPHS = {
@@ -88,6 +89,24 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
         for k in range(count - len(photographs))
     )
     return [*photographs[:count], *leaves]
+
+
+@DATASETS.register("demo")
+def open_demo(path: str = "", split: str = "test") -> list[Pair]:
+    """``demo:SPLIT``, or ``demo:`` and the split that is asked for."""
+    return demo_pairs(path or split)
+
+
+@PICTURES.register("demo")
+def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
+    """``demo:``, all of them.
+
+    Raises:
+        ValueError: if a path follows.
+    """
+    if path:
+        raise ValueError(f"demo:{path}: the demo's pictures have no parts; use demo:")
+    return demo_pictures()
 
 
 def _pair(split: str, k: int, seed: int) -> Pair:
