@@ -9,6 +9,8 @@ Source: Park, Yu and Jeong, "Densely Connected Hierarchical Network for Image De
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -63,7 +65,7 @@ class DHDN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
-    tiny = {"width": 4}
+    tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
     def __init__(
         self,

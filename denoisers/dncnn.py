@@ -7,6 +7,8 @@ Source: Zhang et al., "Beyond a Gaussian Denoiser: Residual Learning of Deep CNN
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 from torch import Tensor, nn
 
 from denoisers.network import PACKED, Denoiser, conv, require_width
@@ -39,7 +41,7 @@ class DnCNN(Denoiser):
         torch.Size([1, 4, 20, 30])
     """
 
-    tiny = {"width": 8, "depth": 3}
+    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
 
     def __init__(
         self,

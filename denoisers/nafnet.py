@@ -10,6 +10,8 @@ The channel attention averages over the whole input: a tile and the whole pictur
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -77,6 +79,8 @@ class NAFNet(Denoiser):
         >>> NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1))(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "encoder": (1, 1), "middle": 1, "decoder": (1, 1)}
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ published weights.
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -102,6 +103,8 @@ class PMRID(Denoiser):
         >>> PMRID(width=4)(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
     def __init__(
         self,

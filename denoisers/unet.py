@@ -7,6 +7,8 @@ last convolution to four channels. Source: Brooks et al., "Unprocessing Images f
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -45,7 +47,7 @@ class UNet(Denoiser):
         torch.Size([2, 4, 33, 50])
     """
 
-    tiny = {"width": 4, "scales": 2}
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
 
     def __init__(
         self,

@@ -78,7 +78,7 @@ class Visits(_Epochs):
 
     Two draws of a picture never share an epoch. Pictures that are drawn with replacement count up singly; which of two
     workers is first with the same picture is then left to chance. A pass that is broken off counts what its workers had
-    fetched ahead. In a distributed run a picture comes to the processes in turns, so counted draws also have the rank as
+    fetched ahead. In a distributed run the processes take turns with a picture, so counted draws also have the rank as
     a key.
 
     Args:

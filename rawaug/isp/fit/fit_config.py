@@ -16,7 +16,7 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
-        size: "small" has at most 8 atoms in each dictionary and narrow encoders: with encoders 0.12 M parameters instead
+        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
             of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
         reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
