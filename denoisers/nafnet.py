@@ -10,11 +10,14 @@ The channel attention averages over the whole input: a tile and the whole pictur
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 
 class ChannelNorm(nn.Module):
@@ -56,6 +59,7 @@ class Block(nn.Module):
         return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
 
 
+@DENOISERS.register("NAFNet")
 class NAFNet(Denoiser):
     """See the module's head. Any h, w >= 2: padded by reflection inside.
 
@@ -75,6 +79,8 @@ class NAFNet(Denoiser):
         >>> NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1))(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "encoder": (1, 1), "middle": 1, "decoder": (1, 1)}
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -82,6 +82,9 @@ class Denoiser(nn.Module, ABC):
         ValueError: if there is no such domain.
     """
 
+    tiny: ClassVar[dict[str, Any]] = {}
+    """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
+
     def __init__(
         self,
         channels: int,
@@ -107,6 +110,11 @@ class Denoiser(nn.Module, ABC):
         """Channels that enter the first layer."""
         return self.channels * (1 + self.variance_map)
 
+    @property
+    def reads_variance(self) -> bool:
+        """Whether calls must pass the noise variance."""
+        return self.variance_map or self.domain != "linear"
+
     @abstractmethod
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
@@ -125,7 +133,7 @@ class Denoiser(nn.Module, ABC):
         name = type(self).__name__
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
-        if not self.variance_map and self.domain == "linear":
+        if not self.reads_variance:
             return noisy + self._correction(noisy)
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"

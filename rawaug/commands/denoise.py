@@ -14,14 +14,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
+import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
+from denoisers.pretrained import DEFAULT, find
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.commands.synth import require_same_settings
@@ -31,6 +31,8 @@ from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.progress import progress
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -39,23 +41,28 @@ Noise = str | Sequence[float]
 _NO_NOISE = (0.0, 0.0)
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
-    parser.add_argument("out", type=str, help="output DNG, or output folder")
-    parser.add_argument("--denoiser", type=str, required=True, help=".safetensors file written by rawaug run")
-    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
-    parser.add_argument("--self-ensemble", action="store_true", help="average eight views, at eight times the cost")
+@COMMANDS.register("denoise")
+def run(
+    source: str,
+    out: str,
+    *,
+    denoiser: str = DEFAULT,
+    noise: tuple[float, float] | str = "auto",
+    self_ensemble: bool = False,
+) -> None:
+    """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
 
-
-def run(arguments: Any) -> None:
-    """Denoise and print a summary."""
-    a = arguments
-    if Path(a.source).is_dir():
-        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    Args:
+        source: a RAW file, or a folder of them.
+        out: output DNG, or output folder.
+        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser.
+        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        self_ensemble: average eight views, at eight times the cost.
+    """
+    if Path(source).is_dir():
+        print_denoised(denoise_folder(source, out, denoiser, noise, self_ensemble))
     else:
-        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, noise, self_ensemble)]))
 
 
 @dataclass(frozen=True)
@@ -154,7 +161,7 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
 def denoise_file(
     source: str | Path,
     out: str | Path,
-    weights: str | Path,
+    weights: str | Path = DEFAULT,
     noise: Noise = "auto",
     self_ensemble: bool = False,
 ) -> Denoised:
@@ -163,7 +170,7 @@ def denoise_file(
     Args:
         source: the RAW file.
         out: the DNG to write; its folder is made.
-        weights: a denoiser's file.
+        weights: a denoiser's file, or the name of a shipped one.
         noise: see :data:`Noise`; ignored by networks without a noise map.
         self_ensemble: average eight flips and turns, eight times the work.
 
@@ -172,14 +179,14 @@ def denoise_file(
         ValueError: if the source is no Bayer RAW, its noise is unknown, or ``out`` is no DNG or the source itself.
 
     Example:
-        >>> denoise_file("shot.dng", "shot-denoised.dng", "denoiser.safetensors")  # doctest: +SKIP
+        >>> denoise_file("shot.dng", "shot-denoised.dng")  # doctest: +SKIP
     """
     return _denoise_file(Path(source), Path(out), _load(weights), noise, self_ensemble)
 
 
 def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
-    model, info = denoisers.load(weights)
-    return model, CFA(info.get("cfa", "RGGB"))
+    model, info = denoisers.load(find(weights))
+    return model.to(memory_format=torch.channels_last), CFA(info.get("cfa", "RGGB"))  # type: ignore[call-overload]
 
 
 def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
@@ -190,7 +197,7 @@ def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: 
         raise ValueError(f"{out}: is the input file; give another name")
     model, cfa = loaded
     frame = read_raw(source)
-    shot_var, read_var, noise_source = levels_of(frame, noise) if model.variance_map else (*_NO_NOISE, "not needed")
+    shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
     mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
     below = _clip_below_zero(mosaic, frame)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +222,7 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
 def denoise_folder(
     source: str | Path,
     out: str | Path,
-    weights: str | Path,
+    weights: str | Path = DEFAULT,
     noise: Noise = "auto",
     self_ensemble: bool = False,
 ) -> DenoisedFolder:
@@ -229,10 +236,10 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
     loaded = _load(weights)
-    settings = {"denoiser_sha256": sha256(Path(weights)), "self_ensemble": self_ensemble}
+    settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
     require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
     result = DenoisedFolder()
-    for file, target in tqdm(targets.items(), desc="denoise", unit="file"):
+    for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists():
             result.existing += 1
             continue

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import denoisers
+from denoisers.pretrained import FOLDER
 from rawaug.files import find_weights, read_header
 from rawaug.isp.model import DictionaryISP
+from rawaug.registry import COMMANDS
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("weights", type=str, help="a .safetensors file, or the name of a shipped ISP")
+@COMMANDS.register("info")
+def run(weights: str) -> None:
+    """Describe a weights file.
 
-
-def run(arguments: Any) -> None:
-    """Print the description."""
-    print(describe(arguments.weights))
+    Args:
+        weights: a .safetensors file, or the name of a shipped ISP or denoiser.
+    """
+    print(describe(weights))
 
 
 def describe(weights: str | Path) -> str:
@@ -27,7 +28,7 @@ def describe(weights: str | Path) -> str:
     Raises:
         FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
     """
-    path = find_weights(weights)
+    path = find_weights(weights, FOLDER)
     kind = read_header(path)["kind"]
     if kind == "isp":
         return _describe_isp(path)

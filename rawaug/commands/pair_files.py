@@ -26,6 +26,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug._version import __version__
+from rawaug.extras import extra
 from rawaug.files import find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
 from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
@@ -112,7 +113,8 @@ def _beside(stem: Path, ending: str) -> Path:
 
 
 def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
     with replacing(path) as partial:

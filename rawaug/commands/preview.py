@@ -14,30 +14,32 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.extras import extra
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("picture", type=str, help="an sRGB picture")
-    parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    parser.add_argument("--count", type=int, default=8, help="number of augmented RAWs to plot")
-    parser.add_argument("--seed", type=int, default=0, help="of these")
+@COMMANDS.register("preview")
+def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0) -> None:
+    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
-
-def run(arguments: Any) -> None:
-    """Draw, and print the paths of the figures."""
-    for path in preview(arguments.picture, arguments.isp, arguments.out, arguments.count, arguments.seed):
+    Args:
+        picture: an sRGB picture.
+        out: output PNG; the atoms are written to NAME-atoms.png.
+        isp: ISP file, or the name of a shipped ISP.
+        count: number of augmented RAWs to plot.
+        seed: of these.
+    """
+    for path in preview(picture, isp, out, count, seed):
         print(path)
 
 
@@ -75,7 +77,8 @@ def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
 
 @torch.no_grad()
 def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
@@ -106,7 +109,8 @@ def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> An
 
 @torch.no_grad()
 def _draw_atoms(isp: DictionaryISP) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])

@@ -13,8 +13,9 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
-from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
+from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 
@@ -26,18 +27,11 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     """The estimator that the arm names.
 
     Example:
-        >>> estimator_of(ArmConfig(estimator="r2r", alpha=0.5)).alpha
+        >>> estimator_of(ArmConfig(estimator={"name": "r2r", "settings": {"alpha": 0.5}})).alpha
         0.5
     """
-    if arm.estimator == "noisier":
-        return Noisier(arm.alpha, arm.correct)
-    if arm.estimator == "noise2noise":
-        return Noise2Noise()
-    if arm.estimator == "r2r":
-        return R2R(arm.alpha)
-    if arm.estimator == "neighbor2neighbor":
-        return Neighbor2Neighbor(arm.gamma)
-    return Supervised()
+    estimator: Supervised = ESTIMATORS.make(arm.estimator)
+    return estimator
 
 
 def training_stream(

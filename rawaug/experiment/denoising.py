@@ -33,12 +33,14 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
+from rawaug.extras import extra
 from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
+from rawaug.training.train_config import weights_key
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -118,9 +120,7 @@ class _Run:
         recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
         path = place / "denoiser.safetensors"
         config, network = recipe.train, recipe.denoiser
-        parts = (recipe.arms[arm], config, network, self.data)
-        seen = (stamps(self.pairs), stamps(self.validation), len(self.pictures))
-        key = fingerprint(isp.info["key"], recipe.noise, *seen, *(asdict(part) for part in parts))
+        key = self.weights_key(arm, isp, seed)
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
@@ -141,6 +141,14 @@ class _Run:
         denoisers.save(model, path, info)
         (place / "last.pt").unlink(missing_ok=True)
         return model
+
+    def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
+        """What the weights of an arm depend on."""
+        recipe, data = self.recipe, self.data
+        pictures = (data.pictures, len(self.pictures))
+        samples = (isp.info["key"], recipe.noise, asdict(recipe.arms[arm]), data.pairs, stamps(self.pairs), pictures)
+        validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
+        return weights_key(recipe.denoiser, recipe.train, (seed, *samples), validation)
 
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
@@ -199,14 +207,16 @@ def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
 
 def _leads() -> bool:
     """Whether this is the one of several training processes that writes and evaluates."""
-    from lightning_fabric.utilities.rank_zero import rank_zero_only
+    with extra("train"):
+        from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _device(accelerator: str) -> torch.device:
     """Where Fabric would put a network."""
-    from lightning_fabric import Fabric
+    with extra("train"):
+        from lightning_fabric import Fabric
 
     return Fabric(accelerator=accelerator, devices=1).device
 

@@ -40,9 +40,9 @@ class DownstreamConfig:
     """The denoising experiment.
 
     Args:
-        methods: families that are tried.
-        test: RAW frames of cameras that no method has seen; folders, or ``kind:path``.
-        test_crop: side of the piece at each test frame's centre that is scored; null scores all of it.
+        methods: families to compare.
+        test: RAW frames of unseen cameras; folders, or ``kind:path``.
+        test_crop: side of the central crop scored of each test frame; null for the whole frame.
         exposure: lowest and highest exposure in stops at which the dictionary ISP's RAW is drawn, for the test cameras'
             headroom is not known; UPI's published distributions have theirs.
         noise: preset, in training and on the test frames.
@@ -57,6 +57,10 @@ class DownstreamConfig:
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    def sampling(self) -> tuple[object, ...]:
+        """What the training samples depend on."""
+        return self.noise, self.exposure
 
     def smoke(self) -> DownstreamConfig:
         """In seconds, on the demo camera."""

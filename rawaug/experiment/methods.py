@@ -20,7 +20,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.isp import conditioning
-from rawaug.isp.baselines import BASELINES, BaselineISP, fit_baseline
+from rawaug.isp.baselines import BASELINES, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages, sample_pixels
@@ -32,8 +32,6 @@ from rawaug.metrics import PATCH, psnr
 from rawaug.seeding import keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
-POINTWISE = ("dictionary", "dictionary-encoders", "upi", "upi-tuned")
-"""Families that need no pixel-exact pairs."""
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
 ORACLE_STEPS = 300
@@ -56,6 +54,11 @@ class Fitted(NamedTuple):
     parameters: int
 
 
+def learns_by_descent(family: str) -> bool:
+    """Whether a family trains on crops: it has a budget, and needs pairs that are registered pixel by pixel."""
+    return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
+
+
 def fit_family(
     family: str, pairs: Sequence[Pair], config: FitConfig, budget: tuple[float, int, int], seed: int
 ) -> Fitted:
@@ -75,7 +78,7 @@ def fit_family(
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
     """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass.
 
-    An unregistered pair is scored over blocks, by methods of :data:`POINTWISE`.
+    An unregistered pair is scored over blocks, by methods that do not learn by descent.
     """
     model = fitted.model
     if not pair.registered:
@@ -95,7 +98,7 @@ def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
 
 
 @singledispatch
-def _block_rows(model: BaselineISP, pair: Pair) -> dict[str, float]:
+def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     with torch.no_grad():
         made = model.unprocess(blocks.srgb[None])[0]

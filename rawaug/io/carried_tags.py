@@ -13,6 +13,7 @@ from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rawaug.extras import extra
 from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_as_os_error
 
 _DNG_VERSION, _ASCII = 50706, 2
@@ -83,7 +84,8 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
     Raises:
         OSError: if the tags are damaged.
     """
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
         with damage_as_os_error(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:

@@ -19,6 +19,7 @@ import torch
 
 from rawaug._version import __version__
 from rawaug.bayer import CFA
+from rawaug.extras import extra
 from rawaug.files import replacing
 from rawaug.io.carried_tags import CarriedTags, Entry, Tag, append_directory, read_carried_tags
 from rawaug.io.gain_map import opcode_list
@@ -78,7 +79,8 @@ def write_dng(
 
 
 def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]) -> None:
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     software = f"rawaug {__version__}"
     tifffile.imwrite(

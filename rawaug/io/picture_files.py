@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import turn
+from rawaug.extras import extra
 from rawaug.io.icc import to_srgb
 
 MAX_PIXELS = 2**28
@@ -95,7 +96,8 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         ValueError: if the shape is wrong, a value leaves [0, 1], or the extension is unknown.
         OSError: if the file cannot be written.
     """
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     if srgb.ndim != 3 or srgb.shape[0] != 3:
         raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
@@ -139,7 +141,8 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
 
 def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
     """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
@@ -164,7 +167,8 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
 
 def _floating() -> tuple[Any, ...]:
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.extras import extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
 
 _MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
@@ -55,7 +56,8 @@ def read_tiff_tags(path: Path) -> TiffTags:
     Raises:
         OSError: if the tags are damaged.
     """
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
         with damage_as_os_error(path), tifffile.TiffFile(path) as tiff:
@@ -73,7 +75,8 @@ def read_tiff_tags(path: Path) -> TiffTags:
 @contextmanager
 def damage_as_os_error(path: Path) -> Iterator[None]:
     """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
         yield

@@ -56,9 +56,7 @@ class CameraSampler:
         lamps: float = LAMP_SHARE,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
-            raise ValueError(
-                f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}"
-            )
+            raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
         self.cameras, self.tone_atoms = cameras, tone_atoms
         self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
         self.kelvin, self.lamps = kelvin, lamps

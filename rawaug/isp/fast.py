@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from importlib import import_module
 from itertools import pairwise
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -115,7 +116,7 @@ class BakedISP(nn.Module):
             table.new_empty(0),
         )
         for stage in self.stages:
-            dials = stage.adjust(dials, params, place, (height, width))
+            dials = cast(Stage, stage).adjust(dials, params, place, (height, width))
         matrix, floor, frame, curves, shading = dials
         if curves.numel():
             table = table[:0]

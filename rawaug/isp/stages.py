@@ -52,11 +52,13 @@ def display_referred(srgb: Tensor) -> Tensor:
 
 
 def require_display_range(image: Tensor) -> None:
-    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level."""
+    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level, or are NaN."""
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
     low, high = (float(value) for value in torch.aminmax(image.detach()))
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
+        if missing := int(image.isnan().sum()):
+            raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values; mend it")
         raise ValueError(
             f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
         )

@@ -52,13 +52,13 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
     """One row of :attr:`Camera.frame`.
 
     Args:
-        place: top, left, height, width of the full frame, the view in which the crop was turned, and the side of the
-            square that was enlarged to it (neither if left out).
+        place: top, left, height, width of the full frame, the view in which the crop was turned, and how many rows
+            were enlarged to it (neither if left out).
         height, width: of the picture as it is, turned.
         centre: y and x of the mask's centre in the coordinates of :func:`rawaug.isp.stages.place_in_frame`.
     """
-    top, left, frame_height, frame_width, view, side = (*place, 0, 0)[:6]
-    step = side / height if side else 1.0
+    top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
+    step = rows / height if rows else 1.0
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
 
     def position(i: int, j: int) -> tuple[float, float]:

@@ -43,12 +43,11 @@ def tukey_lambda_variance(shape: float) -> float:
     Raises:
         ValueError: for a shape of -1/2 or less, where it is infinite.
     """
+    from scipy.stats import tukeylambda
+
     if shape <= -0.5:
         raise ValueError(f"a Tukey lambda shape must be above -0.5 (finite variance), got {shape}")
-    if abs(shape) < 1e-4:
-        return math.pi**2 / 3
-    beta = math.exp(2 * math.lgamma(shape + 1) - math.lgamma(2 * shape + 2))
-    return 2 / shape**2 * (1 / (1 + 2 * shape) - beta)
+    return float(tukeylambda.var(shape))
 
 
 class TukeyLambdaNoise(PoissonGaussianNoise):

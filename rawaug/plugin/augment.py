@@ -27,7 +27,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
@@ -260,7 +260,7 @@ def _float32(like: Tensor) -> torch.autocast:
     return torch.autocast(like.device.type, enabled=False)
 
 
-def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] | NoiseModel) -> NoiseModel:
+def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
     """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels in its file.
 
     Raises:

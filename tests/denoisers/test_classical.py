@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.classical import _HADAMARD, Classical
+from denoisers.block_matching import _HADAMARD
+from denoisers.classical import Classical
 
 SIGMA = 0.03
 OWN = [NonLocalMeans, Wavelet, TotalVariation]

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
+from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
@@ -123,6 +124,7 @@ class RAW2RGB(Trunk):
         return F.pixel_shuffle(self.tail_rgb(self.tail(features)), 2)
 
 
+@BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
     """CycleISP. To render RAW it needs a picture whose colours it takes: ``model(raw, reference=srgb)``.
 

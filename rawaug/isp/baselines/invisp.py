@@ -22,6 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
 from rawaug.isp.fit.samples import FramePair
+from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 SCALE_CLAMP = 0.8
@@ -96,6 +97,7 @@ class Flow(nn.Module):
         return x
 
 
+@BASELINES.register("invisp")
 class InvISP(CropTrainedISP):
     """InvISP; both passes take the shot's white balance, or use the geometric mean of the training pairs'.
 

@@ -12,16 +12,15 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import BaselineISP, Crops, CropTrainedISP
-from rawaug.isp.baselines.upi_tuned import TunedUPI
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
+from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
 Model = TypeVar("Model", bound=BaselineISP)
@@ -68,7 +67,7 @@ def fit_baseline(
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
     start = time.perf_counter()
     steps_done, loss = 0, math.nan
-    if isinstance(model, TunedUPI):
+    if isinstance(model, SolvedISP):
         model.tune(frames, seed)
         steps_done = 1
     elif isinstance(model, CropTrainedISP):
@@ -80,6 +79,14 @@ def fit_baseline(
     if not math.isnan(loss):
         model.info["loss"] = loss
     return model.eval()
+
+
+@runtime_checkable
+class SolvedISP(Protocol):
+    """A method that is solved in closed form."""
+
+    def tune(self, pairs: Sequence[FramePair], seed: int = 0) -> Any:
+        """Solve for what it learns from the pairs."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ def _descend(
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     rate = model.learning_rate if learning_rate is None else learning_rate
     optimiser = torch.optim.Adam(parameters, lr=rate)
-    bar = tqdm(desc=f"fit {model.name}", total=budget.steps, disable=not progress, unit="step", leave=False)
+    bar = progress_bar(label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
     start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
     while spent < 1.0:
         for group in optimiser.param_groups:

@@ -19,6 +19,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.isp import stages
 from rawaug.isp.baselines.base import BaselineISP, checked_raw, checked_srgb
+from rawaug.registry import BASELINES
 
 GAMMA = 2.2
 XYZ_TO_CAMERA = (
@@ -109,6 +110,7 @@ def render_pixels(x: Tensor, params: UPIParams) -> Tensor:
     return smoothstep(stages.gamma_compress(linear, GAMMA))
 
 
+@BASELINES.register("upi")
 class UPI(SmoothstepISP):
     """UPI as published: a random camera a picture, or the mean one.
 

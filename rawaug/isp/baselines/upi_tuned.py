@@ -24,6 +24,7 @@ from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.upi import GAMMA, SmoothstepISP, UPIParams, inverse_smoothstep
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
+from rawaug.registry import BASELINES
 
 Criterion = Literal["log", "mse", "mean"]
 
@@ -34,6 +35,7 @@ PIXELS = 32768
 """Drawn of each frame."""
 
 
+@BASELINES.register("upi-tuned")
 class TunedUPI(SmoothstepISP):
     """UPI's stages with a fitted camera's matrix and gains; identity until tuned.
 

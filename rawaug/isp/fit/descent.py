@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug.files import read_tensors, write_tensors
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 SAVE_SECONDS = 10.0
@@ -83,7 +83,7 @@ class Descent:
             self._note(stage, 0, watch(), tensors)
         for tensor in tensors.values():
             tensor.requires_grad_()
-        bar = tqdm(range(start, steps), desc=stage, unit="step", leave=False, disable=None if self.progress else True)
+        bar = progress(range(start, steps), label=stage, unit="step", initial=start, total=steps, shown=self.progress)
         saved = time.monotonic()
         for step in bar:
             optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
@@ -92,9 +92,9 @@ class Descent:
             value.backward()
             optimiser.step()
             if (step + 1) % REPORT_STEPS == 0 or step + 1 == steps:
-                status = "" if report is None else report()
-                status += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
-                bar.set_postfix_str(f"loss {value.item():.2e} {status}")
+                scores = "" if report is None else report()
+                scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
+                bar.set_postfix_str(f"loss {value.item():.2e} {scores}", refresh=False)
             if self.path is not None and time.monotonic() - saved > SAVE_SECONDS:
                 self._keep(stage, step + 1, tensors, optimiser)
                 saved = time.monotonic()

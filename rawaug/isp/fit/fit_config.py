@@ -16,7 +16,7 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
-        size: "small" has at most 8 atoms in each dictionary and narrow encoders: with encoders 0.12 M parameters instead
+        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
             of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
         reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
@@ -25,16 +25,16 @@ class FitConfig:
         steps: refinement steps of each direction.
         pixels: random pixels kept of each frame.
         batch: pixels of each frame in a step.
-        learning_rate: of Adam, falling to 0 by a cosine.
-        shading: "on" fits the lens shading mask, "off" leaves the stage out, "auto" keeps a mask that takes
-            away half of the squared error at least.
+        learning_rate: initial learning rate of Adam, with cosine decay to 0.
+        shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
+            at least half of the squared error.
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
-            and keeps them where they beat the constants on frames left out.
-        joint_steps: steps of a last end-to-end training of everything at once; None takes 1000 from 50 frames upwards
-            and else 0. Kept only as far as frames left out of it gain.
+            and keeps them if they beat the constants on held-out frames.
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
+            else 0. Kept only if held-out frames improve.
         noisy: fit on the captured noisy RAW of the pairs.
-        seed: of the pixels drawn and of the networks' start.
+        seed: random seed of the drawn pixels and initial networks.
         isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
     """
 

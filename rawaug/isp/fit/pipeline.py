@@ -23,7 +23,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug._version import __version__
 from rawaug.files import digest
@@ -41,6 +40,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stage import Stage
 from rawaug.kernels.threads import one_thread
+from rawaug.progress import progress as progress_of
 from rawaug.seeding import derived_seed
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
@@ -73,7 +73,7 @@ def fit_isp(
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
     """
     config = config or FitConfig()
-    reading = tqdm(pairs, desc="read", unit="frame", leave=False, disable=None if progress else True)
+    reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
     with one_thread():

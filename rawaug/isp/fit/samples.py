@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.extras import extra
 from rawaug.isp.encoder import thumbnail
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.seeding import keyed_generator
@@ -207,7 +208,8 @@ def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
 
     By phase correlation of the green, at half the resolution; the nearest integer to a quarter of a pixel there.
     """
-    from skimage.registration import phase_cross_correlation
+    with extra("raw"):
+        from skimage.registration import phase_cross_correlation
 
     green = _colours(raw, cfa)[1].clamp_min(0.0).sqrt()
     height, width = green.shape

@@ -94,7 +94,7 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
 
 
 def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
-    with pytest.raises(ValueError, match="3 pictures, the batch has 2"):
+    with pytest.raises(ValueError, match="3 pictures, but the batch has 2"):
         augment.apply(srgb[:2], augment.sample(srgb))
 
 

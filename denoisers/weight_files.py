@@ -2,7 +2,7 @@ r"""Files of weights: safetensors, with what is needed to build the network agai
 
 ``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
 "info": <JSON: anything else>}``. Nothing in such a file is code; only the classes in
-:data:`denoisers.catalogue.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
+:data:`rawaug.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
     from safetensors.torch import save_file
 
     path = Path(path)
-    name = type(model).__name__
-    if DENOISERS.get(name) is not type(model):
-        raise ValueError(f"{path}: cannot save a {name}; only {', '.join(DENOISERS)} can be loaded again")
+    name = DENOISERS.name_of(type(model))
+    if name is None:
+        known = ", ".join(DENOISERS)
+        raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {known} can be loaded again")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
     try:
