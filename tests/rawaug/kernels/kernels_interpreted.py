@@ -29,6 +29,8 @@ def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
     isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
     if tone := isp.find(ToneMap):
         list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
+    if isp.tone:
+        isp.tone.curves[0] **= 2
     if lens := isp.find(LensShading):
         lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
         if lens.reverse_attention:
@@ -74,6 +76,7 @@ def check_kernels_are_used() -> None:
 
 if __name__ == "__main__":
     cameras: list[dict[str, Any]] = [{}, {"attention": False}, {"stages": ("tone", "colour", "gains")}]
+    cameras += [{"stages": ("curve", "colour", "gains", "shading"), "tone_atoms": 2}]
     for settings, dtype in product(cameras, (torch.uint8, torch.float32)):
         check_raw(settings, dtype)
         print("raw")

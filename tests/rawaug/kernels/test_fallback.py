@@ -22,7 +22,7 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
     environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == 6 * ["raw"] + 2 * ["noise"] + ["used"]
+    assert done.stdout.split() == 8 * ["raw"] + 2 * ["noise"] + ["used"]
 
 
 @pytest.mark.parametrize("with_map", [True, False])
@@ -38,9 +38,12 @@ def test_the_noise_compiles_for_a_gpu(with_map: bool) -> None:
 def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
     from rawaug.kernels import raw_triton as raw
 
-    types = {"srgb": pixels, **dict.fromkeys(("table", "attention", "colour", "frame", "shading", "raw"), "*fp32")}
+    types = {
+        "srgb": pixels,
+        **dict.fromkeys(("table", "curves", "attention", "colour", "frame", "shading", "raw"), "*fp32"),
+    }
     types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
-    constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "BLOCK": 256}
+    constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "ENTRIES": 0 if all_stages else 256, "BLOCK": 256}
     constants |= {"ATTENDS": all_stages, "SHADES": all_stages}
     assert "st.global" in compiled_for_a_gpu(raw._cells, types, constants)
 

@@ -281,3 +281,28 @@ def test_forked_workers_do_not_hang_after_libraw_has_developed(bayer_dng: Callab
     command = [sys.executable, "-c", FORKED_AFTER_LIBRAW, *files]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=many_threads, check=False)
     assert done.stdout == "done\n", done.stderr
+
+
+def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures * 8, augment, crop=16, zoom=2.0)
+    rows = []
+    for i in range(len(pairs)):
+        pair = pairs[i]
+        assert pair.noisy.shape == (4, 8, 8) and len(pair.params.place) == 6
+        assert torch.equal(pairs.replay(i, pair.params).noisy, pair.noisy)
+        rows.append(int(pair.params.place[5]))
+    assert 8 <= min(rows) < 12 and max(rows) == 16
+    assert 0.2 < sum(side < 16 for side in rows) / len(rows) < 0.8
+    for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}):
+        with pytest.raises(ValueError, match="zoom must be at least 1"):
+            RawPairs(pictures, augment, **wrong)  # type: ignore[arg-type]
+
+
+def test_an_enlarged_crop_keeps_its_place_in_the_frame() -> None:
+    """Twice the size: its pixels lie half as far apart, and its first half a step nearer to the corner."""
+    from rawaug.kernels.raw_torch import frame_of
+
+    plain, large = (frame_of([10, 20, 100, 200, 0, rows], 16, 16, (0.0, 0.0)) for rows in (16, 8))
+    y, x, down, _, _, right = large
+    assert (down, right) == pytest.approx((plain[2] / 2, plain[5] / 2))
+    assert (y, x) == pytest.approx((plain[0] - plain[2] / 4, plain[1] - plain[5] / 4))
