@@ -53,7 +53,7 @@ class DownstreamConfig:
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
     test: list[str] = field(default_factory=lambda: ["demo:test"])
     test_crop: int | None = 1024
-    exposure: tuple[float, float] = (-1.5, 0.0)
+    exposure: tuple[float, float] | None = (-1.5, 0.0)
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
