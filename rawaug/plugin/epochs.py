@@ -76,10 +76,9 @@ class _Epochs:
 class Visits(_Epochs):
     """Epochs of pictures that are asked for by index.
 
-    Two draws of a picture never share an epoch. Pictures that are drawn with replacement count up singly; which of two
-    workers is first with the same picture is then left to chance. A pass that is broken off counts what its workers had
-    fetched ahead. In a distributed run a picture comes to the processes in turns, so counted draws also have the rank as
-    a key.
+    Two draws of a picture never share an epoch. Drawn with replacement, it counts each time; which of two workers is
+    first is then left to chance. A pass that is broken off counts what its workers had fetched ahead. In a distributed
+    run a picture comes to the processes in turns, so counted draws also have the rank as a key.
 
     Args:
         size: number of pictures.
