@@ -4,8 +4,8 @@ Domain: packed RAW of any size. The equality is exact (to rounding) where the ov
 receptive radius and the tiles start at multiples of its stride, so that pooling grids fall on the same pixels as in the
 whole picture: from 17 pixels for a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with
 distance: with a trained U-Net of four scales the largest difference was 0.3 of the noise's deviation at an overlap of
-32, and 2e-6 at 64, which is the default. Only the middle of each tile is kept; nothing is blended: that would hide an
-overlap that is too small.
+32, and 2e-6 at 64; the default is 96. Only the middle of each tile is kept; nothing is blended: that would hide an
+overlap that is too small. Along each side all tiles have the same size, the smallest that does with as many of them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ import torch
 from torch import Tensor
 
 
-def _starts(size: int, tile: int, overlap: int, stride: int) -> list[int]:
-    """Where the tiles begin along a side: steps of ``tile - 2 overlap``, and a last one that reaches the end."""
-    last = max(0, -(-(size - tile) // stride) * stride)
-    return [*range(0, last, tile - 2 * overlap), last]
+def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
+    """Where the tiles begin along a side, and how long they are, at most ``tile``; the last one reaches the end."""
+    count = max(1, -(-(size - 2 * overlap) // (tile - 2 * overlap)))
+    step = -(-(size - 2 * overlap) // (count * stride)) * stride if count > 1 else tile - 2 * overlap
+    side = max(step + 2 * overlap, 2 * stride)
+    last = max(0, -(-(size - side) // stride) * stride)
+    return [*range(0, last, side - 2 * overlap), last], side
 
 
 @torch.no_grad()
@@ -27,13 +30,13 @@ def tiled(
     model: Callable[[Tensor, Tensor | None], Tensor],
     noisy: Tensor,
     variance: Tensor | None = None,
-    tile: int = 384,
-    overlap: int = 64,
+    tile: int = 1536,
+    overlap: int = 96,
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients.
 
     Peak memory is the result plus what the model needs for one ``(B, 4, tile, tile)`` piece, whatever the picture's
-    size; about ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
+    size; at most ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
 
     Args:
         model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles.
@@ -60,10 +63,11 @@ def tiled(
         raise ValueError(f"tile must be at least {2 * stride}, twice the model's stride, got {tile}")
     denoised = torch.empty_like(noisy)
     # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
-    for top in _starts(noisy.shape[-2], tile, overlap, stride):
-        for left in _starts(noisy.shape[-1], tile, overlap, stride):
-            window = (..., slice(top, top + tile), slice(left, left + tile))
+    (tops, height), (lefts, width) = (_pieces(side, tile, overlap, stride) for side in noisy.shape[-2:])
+    for top in tops:
+        for left in lefts:
+            window = (..., slice(top, top + height), slice(left, left + width))
             piece = model(noisy[window], None if variance is None else variance[window])
             above, before = (overlap if start else 0 for start in (top, left))
-            denoised[..., top + above : top + tile, left + before : left + tile] = piece[..., above:, before:]
+            denoised[..., top + above : top + height, left + before : left + width] = piece[..., above:, before:]
     return denoised

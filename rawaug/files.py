@@ -89,17 +89,22 @@ def read_header(path: str | Path) -> dict[str, str]:
     return header
 
 
-def find_weights(name: str | Path) -> Path:
+def find_weights(name: str | Path, *more: Path) -> Path:
     """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package.
+
+    Args:
+        more: further folders of shipped weights, such as :data:`denoisers.pretrained.FOLDER`.
 
     Raises:
         FileNotFoundError: naming the shipped ones.
     """
-    path = Path(name) if Path(name).suffix else WEIGHTS / f"{name}.safetensors"
-    if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in WEIGHTS.glob("*.safetensors")))
-        raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped ISP ({shipped})")
-    return path
+    folders = (WEIGHTS, *more)
+    paths = [Path(name)] if Path(name).suffix else [folder / f"{name}.safetensors" for folder in folders]
+    for path in paths:
+        if path.is_file():
+            return path
+    shipped = ", ".join(sorted(p.stem for folder in folders for p in folder.glob("*.safetensors")))
+    raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped name ({shipped})")
 
 
 def digest(*parts: bytes) -> str:

@@ -13,11 +13,14 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.extras import extra
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 _STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}
@@ -25,18 +28,18 @@ _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("picture", type=str, help="an sRGB picture")
-    parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    parser.add_argument("--count", type=int, default=4, help="number of augmented RAWs to plot")
-    parser.add_argument("--seed", type=int, default=0, help="of these")
+@COMMANDS.register("preview")
+def run(picture: str, *, out: str, isp: str = "universal", count: int = 4, seed: int = 0) -> None:
+    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
-
-def run(arguments: Any) -> None:
-    """Draw, and print the paths of the figures."""
-    for path in preview(arguments.picture, arguments.isp, arguments.out, arguments.count, arguments.seed):
+    Args:
+        picture: an sRGB picture.
+        out: output PNG; the atoms are written to NAME-atoms.png.
+        isp: ISP file, or the name of a shipped ISP.
+        count: number of augmented RAWs to plot.
+        seed: of these.
+    """
+    for path in preview(picture, isp, out, count, seed):
         print(path)
 
 
@@ -74,7 +77,8 @@ def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
 
 @torch.no_grad()
 def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
@@ -104,28 +108,30 @@ def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> An
 
 @torch.no_grad()
 def _draw_atoms(isp: DictionaryISP) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])
     _swatches(colour, isp)
     _gain_swatches(gains, isp)
-    mask = isp.shading(place_in_frame(75, 100))[0, 0] if "shading" in isp.config.stages else torch.ones(75, 100)
+    lens = isp.find(LensShading)
+    mask = lens.mask(place_in_frame(75, 100))[0, 0] if lens else torch.ones(75, 100)
     image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
     figure.colorbar(image, ax=shading, shrink=0.6)
     shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)
     shading.set(xticks=[], yticks=[])
     grey = torch.linspace(0, 1, 256)
-    curve = isp.reverse_networks.tone(grey.expand(1, 3, 1, 256))[0, :, 0]
+    curve = isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0]
     for line, name in zip(curve, ("tab:red", "tab:green", "tab:blue"), strict=True):
         tone.plot(grey.numpy(), line.numpy(), color=name)
-    tone.set(xlabel="sRGB grey", ylabel="x1", aspect="equal")
-    tone.set_title(f"inverse tone curve, then gamma {isp.reverse_networks.gamma.item():.2f}", fontsize=9)
+    tone.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
+    tone.set_title("inverse tone curve and gamma", fontsize=9)
     return figure
 
 
 def _swatches(axis: Any, isp: DictionaryISP) -> None:
-    """One row an atom: what it makes of sRGB red, green, blue, white, skin and sky."""
+    """One row per atom: the result for sRGB red, green, blue, white, skin and sky."""
     tones = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])
     patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
     axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")
@@ -140,7 +146,7 @@ def _gain_swatches(axis: Any, isp: DictionaryISP) -> None:
     atoms, channels = isp.gain.atoms(), isp.gain.channel_gains()
     light = channels.amin(1, keepdim=True) / channels
     axis.imshow(encode_srgb(light)[:, None].numpy(), aspect="auto", extent=(0, 1, len(atoms) - 0.5, -0.5))
-    weight = isp.reverse_networks.gain_encoder.prior.softmax(0)
+    weight = isp.reverse_encoders.gain.prior.softmax(0)
     for row, ((digital, red, blue), share) in enumerate(zip(atoms.tolist(), weight.tolist(), strict=True)):
         text = f"{digital:.2f}   {red:.2f}   {blue:.2f}   {share:.0%}"
         axis.text(0.5, row, text, ha="center", va="center", fontsize=min(8, 120 / len(atoms)), color="black")

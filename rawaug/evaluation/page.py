@@ -23,6 +23,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
 from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, table_rows
+from rawaug.extras import extra
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -114,7 +115,8 @@ def most_detailed(packed: Tensor) -> tuple[int, int]:
 
 def encode_png(srgb: Tensor) -> bytes:
     """sRGB ``(3, H, W)`` in [0, 1] as a PNG file."""
-    from PIL import Image
+    with extra("train"):
+        from PIL import Image
 
     file = io.BytesIO()
     Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).numpy()).save(file, "PNG")
@@ -123,7 +125,8 @@ def encode_png(srgb: Tensor) -> bytes:
 
 def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
     """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm."""
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = dict(zip(("loss", "psnr"), figure.subplots(1, 2), strict=True))

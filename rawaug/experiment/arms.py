@@ -14,9 +14,10 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.dataset import RawPairs
+from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.camera_crops import CameraCrops
-from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
+from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 
@@ -28,18 +29,11 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     """The estimator that the arm names.
 
     Example:
-        >>> estimator_of(ArmConfig(estimator="r2r", alpha=0.5)).alpha
+        >>> estimator_of(ArmConfig(estimator={"name": "r2r", "settings": {"alpha": 0.5}})).alpha
         0.5
     """
-    if arm.estimator == "noisier":
-        return Noisier(arm.alpha, arm.correct)
-    if arm.estimator == "noise2noise":
-        return Noise2Noise()
-    if arm.estimator == "r2r":
-        return R2R(arm.alpha)
-    if arm.estimator == "neighbor2neighbor":
-        return Neighbor2Neighbor(arm.gamma)
-    return Supervised()
+    estimator: Supervised = ESTIMATORS.make(arm.estimator)
+    return estimator
 
 
 def training_stream(
@@ -91,7 +85,7 @@ def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: Dictionar
 
 def _of_atoms(arm: ArmConfig) -> Sampling:
     if arm.sampling == "published":
-        raise ValueError("arms: sampling published is for supervised arms; use convex, perturb or chosen")
+        raise ValueError("arms: sampling published requires a supervised arm; use convex, perturb or chosen")
     return arm.sampling
 
 

@@ -5,8 +5,8 @@ r"""Camera-consistent sampling: one draw is a camera in a light, not a colour ma
 
 with h Brooks' highlight-preserving inverse gains (:func:`rawaug.isp.stages.inverse_gains`), M a mixture of two
 published cameras, L a light (:mod:`rawaug.isp.light`), T a mixture of three inverse tone curves
-(:mod:`rawaug.isp.tone_curves`) and e an exposure in stops. The smallest gain is 1, as cameras and LibRaw have it, lest
-clipped RAW develop to a coloured white.
+(:mod:`rawaug.isp.tone_curves`) and e an exposure in stops. The smallest gain is 1, as in cameras and LibRaw, so that
+clipped RAW develops to white.
 
 Weights w and v follow the Dirichlet distribution of concentration 1/2, squares of normals divided by their sum: it
 crowds the corners and edges of a hull. Flat weights of many atoms crowd its middle; therefore few are mixed at a time.
@@ -79,9 +79,11 @@ class CameraSampler:
         exposure: tuple[float, float] = (-1.0, 0.2),
     ) -> None:
         if not exposure[0] <= exposure[1]:
-            raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
+            raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
         if min(cameras_mixed, tones_mixed) < 1:
-            raise ValueError(f"at least one camera and one tone make a draw, got {cameras_mixed} and {tones_mixed}")
+            raise ValueError(
+                f"a draw needs at least one camera and one tone curve, got {cameras_mixed} and {tones_mixed}"
+            )
         if cameras is None:
             self.cameras = published_cameras().distinct()
         elif isinstance(cameras, Tensor):
@@ -114,7 +116,7 @@ class CameraSampler:
             if not len(open_):
                 return camera, balance
         raise ValueError(
-            f"no light of {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
+            f"no light at {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
         )
 
 

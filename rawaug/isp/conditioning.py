@@ -1,4 +1,4 @@
-r"""What the user knows of a shot, put in place of what the ISP would guess: the camera's gains, or a few RAW readings.
+r"""Known data of a shot that replace the ISP's guess: the camera's gains, or a few RAW readings.
 
 Grey ``(1, 1, 1)`` becomes ``C 1 / g``, and the file says that it is ``1 / (wb d)``; hence ``g = wb d (C 1)``. Readings
 ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1,
@@ -19,7 +19,7 @@ from rawaug.isp.setting import ISPParams
 
 CLIPPED = 0.98
 SHADOW = 0.01
-"""Added to a reading where it stands for a variance: the read noise's share."""
+"""Added to a reading used as a variance: the share of read noise."""
 ROUNDS = 4
 
 
@@ -45,7 +45,7 @@ def with_white_balance(
     Args:
         isp: whose dictionaries are used.
         params: chosen parameters.
-        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as the file tells them; green is made 1.
+        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as in the file; scaled to green 1.
         digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
 
     Raises:
@@ -55,14 +55,14 @@ def with_white_balance(
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
-            raise ValueError(f"white_balance is (3,) or ({batch}, 3), got {tuple(balance.shape)}")
+            raise ValueError(f"white_balance must be (3,) or ({batch}, 3), got {tuple(balance.shape)}")
         _require_factor("white_balance", balance)
         balance = balance / balance[..., 1:2]
         params = _in_light(isp, params, balance.expand_as(params.gains))
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
         if len(digital) not in (1, batch):
-            raise ValueError(f"digital_gain is one number or ({batch},), got {len(digital)}")
+            raise ValueError(f"digital_gain must be a number or ({batch},), got {len(digital)}")
         _require_factor("digital_gain", digital)
         own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
         params = params._replace(gains=params.gains / own * digital)
@@ -71,7 +71,7 @@ def with_white_balance(
 
 def _require_factor(name: str, value: Tensor) -> None:
     if not (value.isfinite() & (value > 0)).all():
-        raise ValueError(f"{name} is positive, got {value.flatten().tolist()}")
+        raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
 
 
 def _in_light(isp: Camera, params: ISPParams, balance: Tensor) -> ISPParams:
@@ -112,12 +112,14 @@ def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Ten
 
 def _require_places(raw_samples: Tensor, x: Tensor) -> None:
     if raw_samples.ndim != 3 or len(raw_samples) != len(x) or raw_samples.shape[2] != 3 or not raw_samples.shape[1]:
-        raise ValueError(f"raw_samples is ({len(x)}, K, 3): row, column, value; got {tuple(raw_samples.shape)}")
+        raise ValueError(
+            f"raw_samples must be ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}"
+        )
     if not raw_samples.isfinite().all():
-        raise ValueError("raw_samples: a value is not a number; leave such readings out")
+        raise ValueError("raw_samples: a value is NaN; remove such readings")
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
     if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
-        raise ValueError(f"raw_samples: a row or column lies outside the picture, {x.shape[-2]} x {x.shape[-1]}")
+        raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
 def _solve(isp: Camera, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:

@@ -8,20 +8,21 @@ from rawaug.bayer import CFA
 from rawaug.isp.stages import HIGHLIGHT_KNEE
 
 POINTWISE_STAGES = ("tone", "gamma", "colour", "gains", "shading")
-"""The stages between sRGB and the mosaic, in reverse order; stage k makes x_k."""
+"""The stages of the paper between sRGB and the mosaic, in reverse order; the k-th makes x_k."""
 
 
 @dataclass(frozen=True)
 class ISPConfig:
-    """What a :class:`DictionaryISP` is made of; stands in the header of its file.
+    """Configuration of a :class:`DictionaryISP`, stored in the header of its file.
 
     Args:
         colour_atoms: N, colour correction matrices in the dictionary.
         gain_atoms: M, triplets of gains in the dictionary.
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
-        stages: the stages in reverse order, a subset of ``tone gamma colour gains shading``.
-        encoders: whether the encoders look at the picture; if not, learned constant weights are used.
+        stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered
+            (:func:`rawaug.isp.stage.register`).
+        encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights.
     """
@@ -39,13 +40,13 @@ class ISPConfig:
         CFA(self.cfa)
         for key in ("stages", "encoder_widths"):  # a recipe or a file gives lists
             object.__setattr__(self, key, tuple(getattr(self, key)))
-        wrong = [stage for stage in self.stages if stage not in POINTWISE_STAGES or self.stages.count(stage) > 1]
+        wrong = [stage for stage in self.stages if self.stages.count(stage) > 1]
         if wrong or not self.stages:
-            raise ValueError(f"stages: {wrong or 'none'}; choose each at most once of {' '.join(POINTWISE_STAGES)}")
+            raise ValueError(f"stages: {wrong or 'none'}; choose one or more, each at most once")
         if len(self.encoder_widths) != 3 or min(self.colour_atoms, self.gain_atoms, *self.encoder_widths) < 1:
-            raise ValueError("encoder_widths are three, and these and the numbers of atoms at least 1")
+            raise ValueError("encoder_widths must be three numbers; they and the numbers of atoms must be at least 1")
         if not 0.0 <= self.knee < 1.0:
-            raise ValueError(f"knee is in [0, 1), got {self.knee}")
+            raise ValueError(f"knee must be in [0, 1), got {self.knee}")
 
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))

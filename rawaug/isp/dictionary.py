@@ -23,14 +23,14 @@ def l1_normalised(matrices: Tensor) -> Tensor:
 class ColourDictionary(nn.Module):
     """N colour correction matrices, sRGB to camera, rows l1-normalised.
 
-    Each atom remembers the light that it was seen in, so that a known white balance can choose among them, as a DNG's
+    Each atom stores the light it was seen in, so that a known white balance can choose among them, as a DNG's
     two illuminants do.
 
     Attributes:
         matrices: ``(N, 3, 3)``, normalised on use.
         light: ``(N, 2)`` log of the as-shot red and blue multipliers over green.
         neutral: ``(N, 3)`` log of what the channels' gains are beyond as-shot balance and matrix: the digital gain.
-        spread: width of the kernel in ``light``; infinite where the light tells nothing.
+        spread: width of the kernel in ``light``; infinite where the light is uninformative.
     """
 
     light: Tensor

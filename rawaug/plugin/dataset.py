@@ -151,10 +151,10 @@ class RawPairs(Dataset[Any]):
 
 
 class RawPairStream(RawPairs, IterableDataset[Any]):
-    """An iterable Dataset of pictures as one of RAW pairs; what :class:`RawPairs` makes of it.
+    """An iterable Dataset of pictures as one of RAW pairs; :class:`RawPairs` creates it.
 
     A stream has no index. Without ``identity`` the n-th sample that worker w of W meets is number nW + w: no two share
-    a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that hands out
+    a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that distributes
     whole shards needs ``identity`` for that. Processes of a distributed run draw apart, by their rank, unless it is
     given. Each pass is a new epoch, unless one is pinned.
 

@@ -78,7 +78,7 @@ class Visits(_Epochs):
 
     Two draws of a picture never share an epoch. Drawn with replacement, it counts each time; which of two workers is
     first is then left to chance. A pass that is broken off counts what its workers had fetched ahead. In a distributed
-    run a picture comes to the processes in turns, so counted draws also have the rank as a key.
+    run the processes take turns with a picture, so counted draws also have the rank as a key.
 
     Args:
         size: number of pictures.

@@ -76,7 +76,7 @@ class WrappedLoader:
         """Set the next pass's epoch and first batch number; forwarded to the wrapped loader's ``set_epoch``, if any.
 
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
-        data, to meet the same noise again, and with ``start`` where the wrapped loader itself goes on in the middle of
+        data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
         an epoch.
         """
         self._next = self._at = Position(epoch, start)
@@ -195,7 +195,7 @@ def wrap(
 
     Raises:
         TypeError: if ``augment`` is none of these.
-        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they make no batch.
+        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they do not form a batch.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP

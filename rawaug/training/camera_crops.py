@@ -37,7 +37,7 @@ class CameraCrops:
         self, pictures: Any, sampler: CameraSampler, noise: NoiseModel, crop: int, cfa: CFA, zoom: float = 1.0
     ) -> None:
         if not zoom >= 1.0:
-            raise ValueError(f"zoom is at least 1, got {zoom}")
+            raise ValueError(f"zoom must be at least 1, got {zoom}")
         self.pictures, self.sampler, self.noise = pictures, sampler, noise
         self.crop, self.cfa, self.zoom = crop, cfa, zoom
 

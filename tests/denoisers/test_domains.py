@@ -1,4 +1,4 @@
-"""Domains: a transform and its inverse, noise of variance 1 in Anscombe's, of one camera in k-sigma's, bounded inputs."""
+"""Domains: a transform and its inverse, unit noise for Anscombe, one camera for k-sigma; bounded inputs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_inverse_gives_back_what_went_in(name: str, levels: tuple[float, flo
 @pytest.mark.parametrize("level", [0.02, 0.2, 0.8])
 def test_noise_has_deviation_1_in_anscombe_s(level: float, levels: tuple[float, float]) -> None:
     seen = DOMAINS["anscombe"].forward(noisy_picture(level, *levels), *of(*levels))
-    assert seen.std().item() == pytest.approx(1.0, abs=0.03)
+    assert seen.std().item() == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("levels", LEVELS)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from denoisers import DnCNN, SelfEnsemble, UNet, tiled
-from denoisers.tiling import _starts
+from denoisers.tiling import _pieces
 
 
 def pair(*shape: int) -> tuple[Tensor, Tensor]:
@@ -31,11 +31,12 @@ def awake(model: DnCNN | UNet) -> DnCNN | UNet:
 @settings(max_examples=200, deadline=None)
 def test_starts_are_aligned_and_leave_no_gap(size: int, stride: int, tile: int, overlap: int) -> None:
     tile, overlap = tile * stride, min(overlap, (tile - 1) // 2) * stride
-    starts = _starts(size, tile, overlap, stride)
+    starts, side = _pieces(size, tile, overlap, stride)
+    assert side <= tile and side % stride == 0 and side > 2 * overlap
     assert starts[0] == 0 and all(start % stride == 0 for start in starts)
-    assert starts[-1] + tile >= size and (starts == [0] or size - starts[-1] > tile - stride)
+    assert starts[-1] + side >= size and (starts == [0] or size - starts[-1] > side - stride)
     # The part of a tile that is kept begins where the one before still had its context.
-    assert all(b + overlap <= a + tile - overlap for a, b in pairwise(starts))
+    assert all(b + overlap <= a + side - overlap for a, b in pairwise(starts))
     assert starts == sorted(set(starts))
 
 
@@ -48,7 +49,14 @@ def test_convolutions_are_seamless(size: tuple[int, int]) -> None:
     assert min(size) < 24 or (tiled(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
 
 
-@pytest.mark.parametrize("size", [(100, 61), (64, 128), (35, 30)])
+@pytest.mark.parametrize("side", [383, 384, 385, 387, 400, 513, 640, 2000])
+def test_equal_tiles_are_no_more_than_needed(side: int) -> None:
+    starts, length = _pieces(side, 384, 64, 16)
+    assert len(starts) == max(1, -(-(side - 128) // 256))
+    assert len(starts) == 1 or len(starts) * (length - 128) - (side - 128) < 16 * len(starts)
+
+
+@pytest.mark.parametrize("size", [(100, 61), (64, 128), (35, 30), (63, 65), (80, 81), (129, 127)])
 def test_pooling_grids_fall_together(size: tuple[int, int]) -> None:
     model = awake(UNet(width=4, scales=2))  # receptive radius below 24
     noisy, variance = pair(1, 4, *size)

@@ -70,7 +70,7 @@ def test_weights_are_sparse_and_reach_the_corners() -> None:
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
-    with pytest.raises(ValueError, match="lowest and the highest"):
+    with pytest.raises(ValueError, match=r"\(lowest, highest\)"):
         CameraSampler(exposure=(0.2, -1.0))
     with pytest.raises(ValueError, match="not listed"):
         CameraSampler(cameras=["Box Brownie"])

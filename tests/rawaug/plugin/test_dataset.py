@@ -244,7 +244,9 @@ def test_workers_of_a_stream_share_no_draw(augment: RawAugment) -> None:
     assert len(values(DataLoader(stream, num_workers=2))) == 12  # as plain PyTorch: each worker has all
 
 
-def test_an_iterable_is_a_stream_and_tells_its_dataset_the_epoch(augment: RawAugment, pictures: list[Tensor]) -> None:
+def test_an_iterable_is_a_stream_and_forwards_the_epoch_to_its_dataset(
+    augment: RawAugment, pictures: list[Tensor]
+) -> None:
     dataset = Counted(pictures, strided=True)
     stream = RawPairs(dataset, augment, crop=16)
     stream.set_epoch(4)
