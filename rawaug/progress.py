@@ -46,7 +46,7 @@ def progress(
     if stream.isatty() or tqdm is not terminal_tqdm:  # tqdm.auto is another class in a notebook
         return tqdm(items, file=stream, leave=leave, **options)
     seconds = float(os.environ.get("RAWAUG_PROGRESS_SECONDS", "30"))
-    pace = {"mininterval": seconds, "maxinterval": float("inf"), "miniters": 1, "delay": seconds}
+    pace: dict[str, Any] = {"mininterval": seconds, "maxinterval": float("inf"), "miniters": 1, "delay": seconds}
     return terminal_tqdm(items, file=_Lines(stream), leave=True, bar_format=LINE, **pace, **options)
 
 

@@ -41,10 +41,11 @@ def add_arguments(parser: Any, function: Callable[..., Any]) -> None:
 
 def call(function: Callable[..., Any], values: dict[str, Any]) -> Any:
     """Call ``function`` with what its arguments were parsed to."""
-    arguments = {}
+    arguments: dict[str, Any] = {}
     for name, hint in get_type_hints(function).items():
         if is_dataclass(hint):
-            arguments[name] = hint(**{field.name: values[field.name] for field in fields(hint)})
+            settings: Callable[..., Any] = hint  # type: ignore[assignment]
+            arguments[name] = settings(**{field.name: values[field.name] for field in fields(hint)})
         elif name in values:
             arguments[name] = values[name]
     return function(**arguments)

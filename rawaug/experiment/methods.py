@@ -20,7 +20,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.isp import conditioning
-from rawaug.isp.baselines import BASELINES, BaselineISP, fit_baseline
+from rawaug.isp.baselines import BASELINES, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages, sample_pixels
@@ -98,7 +98,7 @@ def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
 
 
 @singledispatch
-def _block_rows(model: BaselineISP, pair: Pair) -> dict[str, float]:
+def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     with torch.no_grad():
         made = model.unprocess(blocks.srgb[None])[0]

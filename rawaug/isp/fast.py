@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from importlib import import_module
 from itertools import pairwise
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -113,7 +114,7 @@ class BakedISP(nn.Module):
             table.new_empty(0),
         )
         for stage in self.stages:
-            dials = stage.adjust(dials, params, place, (height, width))
+            dials = cast(Stage, stage).adjust(dials, params, place, (height, width))
         matrix, floor, frame, shading = dials
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]

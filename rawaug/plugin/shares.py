@@ -34,7 +34,9 @@ def own_share(loader: Any, seed: int) -> Any:
         return loader
     shuffle = isinstance(loader.sampler, RandomSampler)
     dataset: Any = loader.dataset
-    sampler = DistributedSampler(dataset, shuffle=shuffle, seed=seed, drop_last=loader.drop_last)
+    sampler: DistributedSampler[Any] = DistributedSampler(
+        dataset, shuffle=shuffle, seed=seed, drop_last=loader.drop_last
+    )
     share = copy.copy(loader)
     batches = BatchSampler(sampler, loader.batch_size, loader.drop_last) if loader.batch_size is not None else None
     # A DataLoader refuses another sampler once it is made; a copy that has no iterator yet may have one.

@@ -111,7 +111,11 @@ def train(
             score = validate(estimator.corrected(trained), validation, fabric.device)
             if score > best["psnr"] or not choose:
                 best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
-            row = {"loss": float(losses[0] / losses[1]), "psnr": score, "learning_rate": learning_rate}
+            row: dict[str, float] = {
+                "loss": float(losses[0] / losses[1]),
+                "psnr": score,
+                "learning_rate": float(learning_rate),
+            }
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             losses = torch.zeros_like(losses)
             if journal is not None:

@@ -178,7 +178,7 @@ def test_the_published_sizes() -> None:
 def test_pmrid_s_signals_keep_their_size_whatever_the_picture_s() -> None:
     model = PMRID(variance_map=True)
     seen: list[Tensor] = []
-    for stage in (model.enc4, model.out0):
+    for stage in (model.get_submodule("enc4"), model.get_submodule("out0")):
         stage.register_forward_hook(lambda module, inputs, output: seen.append(output))
     for side in (64, 256):  # packed pixels: a training crop's, and the first on which deep layers see no border
         noise = torch.randn(1, 8, side, side, generator=torch.Generator().manual_seed(0))

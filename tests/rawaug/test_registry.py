@@ -37,7 +37,7 @@ def test_unknown_names_settings_and_types_are_refused_with_the_nearest() -> None
         ({"nmae": "r2r"}, "expected a name or {name: ..., settings"),
     ):
         with pytest.raises(ValueError, match=message):
-            ArmConfig(estimator=spec)  # type: ignore[arg-type]
+            ArmConfig(estimator=spec)
     with pytest.raises(ValueError, match="noise EldNoise needs the setting 'camera'"):
         noise_model("EldNoise")
     with pytest.raises(KeyError, match="unknown"):

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -130,7 +131,7 @@ def test_the_dngs_have_the_right_metadata(tmp_path: Path) -> None:
 
 def test_lens_shading_comes_as_a_gain_map() -> None:
     isp = DictionaryISP(ISPConfig(attention=False))
-    isp.stages["shading"].mask.set(torch.tensor([0.1, -0.2]), torch.eye(2))
+    cast(Any, isp.stages["shading"]).mask.set(torch.tensor([0.1, -0.2]), torch.eye(2))
     augment = RawAugment(isp, noise=(0.0, 0.0))
     srgb = torch.full((3, 64, 96), 0.5)
     pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))

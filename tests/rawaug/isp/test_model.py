@@ -7,7 +7,7 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -82,7 +82,7 @@ def test_a_few_raw_samples_give_the_gains(srgb: torch.Tensor) -> None:
 
 def test_shading_depends_on_the_place_in_the_frame(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
-    isp.stages["shading"].mask.set(torch.zeros(2), torch.eye(2))
+    cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
     centre = isp.reverse(srgb, place=place_in_frame(32, 48, (1000, 1500), (2032, 3048))).raw
     corner = isp.reverse(srgb, place=place_in_frame(32, 48, (0, 0), (2032, 3048))).raw
     assert 0.55 < (corner.mean() / centre.mean()).item() < 0.65  # exp(-1/2) at the corner

@@ -18,7 +18,8 @@ OTHER: dict[str, Any] = {
 @pytest.mark.parametrize("key", [field.name for field in fields(TrainConfig)])
 def test_a_key_counts_unless_it_leaves_the_weights_as_they_are(key: str) -> None:
     config = TrainConfig()
-    changed = replace(config, **{key: OTHER.get(key, getattr(config, key) + 2 if key not in OTHER else None)})
+    other: dict[str, Any] = {key: OTHER.get(key, getattr(config, key) + 2 if key not in OTHER else None)}
+    changed = replace(config, **other)
     before, after = (weights_key(DenoiserConfig(), c, "samples", "validation") for c in (config, changed))
     assert (before == after) == (key in {"workers", "compile", "checkpoint_every"}) == (key in SAME_WEIGHTS)
 
