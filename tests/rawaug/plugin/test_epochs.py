@@ -6,6 +6,7 @@ import copy
 import pickle
 from collections.abc import Iterator
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -192,3 +193,49 @@ def test_another_number_of_workers_repeats_no_pass() -> None:
     assert begun == [[0] * 4, [1] * 2, [2], [3] * 4]
     with pytest.raises(ValueError, match=f"at most {MAX_WORKERS} workers"):
         passes.begin(MAX_WORKERS + 1, 0)
+
+
+@pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator")
+@pytest.mark.filterwarnings("ignore:.*does not have many workers")
+def test_lightning_resumes_without_a_warning(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], tmp_path: Path
+) -> None:
+    lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
+
+    class Pictures(lightning.LightningDataModule):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.pairs = RawPairs(pictures, augment, crop=8, seed=3)
+
+        def train_dataloader(self) -> DataLoader[Any]:
+            return DataLoader(self.pairs, 3, num_workers=1, persistent_workers=True, pin_memory=True)
+
+        def state_dict(self) -> dict[str, Any]:
+            return self.pairs.state_dict()
+
+        def load_state_dict(self, state: dict[str, Any]) -> None:
+            self.pairs.load_state_dict(state)
+
+    class Seeing(lightning.LightningModule):  # type: ignore[misc, name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight, self.seen = torch.nn.Parameter(torch.ones(1)), list[Tensor]()
+
+        def training_step(self, pair: Any, index: int) -> Tensor:
+            self.seen.append(pair.noisy)
+            return (self.weight * pair.noisy - pair.clean).abs().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.1)
+
+    def train(until: int, checkpoint: Path | None = None) -> tuple[Tensor, Any]:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = lightning.Trainer(max_epochs=until, accelerator="cpu", enable_model_summary=False, **quiet)
+        seeing = Seeing()
+        trainer.fit(seeing, Pictures(), ckpt_path=checkpoint)
+        return torch.cat(seeing.seen), trainer
+
+    begun, trainer = train(2)
+    trainer.save_checkpoint(tmp_path / "two.ckpt")
+    rest, _ = train(3, tmp_path / "two.ckpt")
+    assert torch.equal(torch.cat([begun, rest]), torch.cat(epochs))
