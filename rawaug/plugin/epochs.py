@@ -8,8 +8,8 @@ are counted where they are made:
 - of a stream, ``epoch = number of earlier passes``, of which each worker counts its own beginnings (:class:`Passes`).
 
 The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
-by the one worker that has the picture, so no lock is needed, which no two start methods would share. ``pin`` replaces the count by a fixed epoch: a draw
-is then a pure function of (seed, epoch, index).
+by the one worker that has the picture, so no lock is needed, which no two start methods would share. ``pin`` replaces
+the count by a fixed epoch: a draw is then a pure function of (seed, epoch, index).
 """
 
 from __future__ import annotations

@@ -202,7 +202,7 @@ def test_lightning_resumes_without_a_warning(
 ) -> None:
     lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
 
-    class Pictures(lightning.LightningDataModule):  # type: ignore[misc, name-defined]
+    class Pictures(lightning.LightningDataModule):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.pairs = RawPairs(pictures, augment, crop=8, seed=3)
@@ -216,7 +216,7 @@ def test_lightning_resumes_without_a_warning(
         def load_state_dict(self, state: dict[str, Any]) -> None:
             self.pairs.load_state_dict(state)
 
-    class Seeing(lightning.LightningModule):  # type: ignore[misc, name-defined]
+    class Seeing(lightning.LightningModule):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.weight, self.seen = torch.nn.Parameter(torch.ones(1)), list[Tensor]()

@@ -229,7 +229,7 @@ def test_a_loader_that_resumes_itself_passes_nothing_over(augment: RawAugment, s
 def test_lightning_resumes_in_the_middle_of_an_epoch(augment: RawAugment, srgb: Tensor, tmp_path: Path) -> None:
     lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
 
-    class Denoiser(lightning.LightningModule):  # type: ignore[misc, name-defined]
+    class Denoiser(lightning.LightningModule):  # type: ignore[name-defined]
         def __init__(self) -> None:
             super().__init__()
             self.network, self.seen = torch.nn.Conv2d(4, 4, 1), list[float]()
