@@ -51,7 +51,8 @@ def _describe_isp(path: Path) -> str:
     lines.append("  gain atoms (digital, red, blue; constant weight):")
     for atom, weight in zip(isp.gain.atoms().tolist(), weights.tolist(), strict=True):
         lines.append("    " + "  ".join(f"{value:6.3f}" for value in atom) + f"   {weight:.3f}")
-    lines.append("  colour atoms (sRGB to camera, rows l1-normalised):")
+    rows = "sum 1" if config.cameras else "l1 norm 1"
+    lines.append(f"  colour atoms (sRGB to camera, rows of {rows}):")
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
     lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]

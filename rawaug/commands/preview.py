@@ -1,7 +1,8 @@
 """``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and the atoms of the dictionaries.
 
 Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
-sensor sees.
+sensor sees. The drawn RAWs are clean, and all developed alike, by the ISP's forward pass under the setting that it
+chooses for the picture: what differs between them is camera, light, tone and exposure.
 """
 
 from __future__ import annotations
@@ -23,13 +24,12 @@ from rawaug.plugin.pictures import even_sided
 from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
-_STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}
 _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
 @COMMANDS.register("preview")
-def run(picture: str, *, out: str, isp: str = "universal", count: int = 4, seed: int = 0) -> None:
+def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0) -> None:
     """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
     Args:
@@ -43,7 +43,7 @@ def run(picture: str, *, out: str, isp: str = "universal", count: int = 4, seed:
         print(path)
 
 
-def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 4, seed: int = 0) -> list[Path]:
+def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 8, seed: int = 0) -> list[Path]:
     """Draw both figures.
 
     Args:
@@ -83,19 +83,20 @@ def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> An
     top, left, height, width = _centre(whole)
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
     reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
-    panels = {"sRGB x": srgb[0] / 255.0}
+    panels, titles = {"sRGB x": srgb[0] / 255.0}, {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
     for name, image in reverse.intermediates.items():
         shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
-        panels[f"{name}: {_STAGE_TITLES[name]}"] = shown.clamp(0, 1)
+        panels[f"{name}: {titles[name]}"] = shown.clamp(0, 1)
     panels["RAW y"] = encode_srgb(bayer.demosaic(reverse.raw, isp.cfa)[0].clamp(0, 1))
     augment = RawAugment(isp)
     generator = keyed_generator(seed, "preview")
     for k in range(count):
         pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
-        title = f"noisy RAW {k + 1}\nshot {pair.params.noise['shot_var'].item():.1e}"
-        panels[title] = encode_srgb(bayer.demosaic(bayer.unpack(pair.noisy, isp.cfa), isp.cfa)[0].clamp(0, 1))
-    columns = len(panels) - count
-    rows = 1 + -(-count // columns)
+        gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
+        developed = isp.forward(bayer.unpack(pair.clean, isp.cfa), reverse.params)
+        panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed.srgb[0]
+    columns = max(len(panels) - count, 4)
+    rows = -(-len(panels) // columns)
     figure = Figure(figsize=(2.6 * columns, 2.6 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes:
@@ -121,13 +122,22 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
     figure.colorbar(image, ax=shading, shrink=0.6)
     shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)
     shading.set(xticks=[], yticks=[])
-    grey = torch.linspace(0, 1, 256)
-    curve = isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0]
-    for line, name in zip(curve, ("tab:red", "tab:green", "tab:blue"), strict=True):
-        tone.plot(grey.numpy(), line.numpy(), color=name)
-    tone.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
-    tone.set_title("inverse tone curve and gamma", fontsize=9)
+    _tone_curves(tone, isp)
     return figure
+
+
+def _tone_curves(axis: Any, isp: DictionaryISP) -> None:
+    """What grey becomes: every tone atom in grey, the learned or typical curve in colour."""
+    grey = torch.linspace(0, 1, 256)
+    if isp.tone is not None:
+        axis.plot(grey.numpy(), isp.tone.curves[:, ::8].T.numpy(), color="0.75", linewidth=0.8)
+    for line, name in zip(isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0], ("red", "green", "blue"), strict=True):
+        axis.plot(grey.numpy(), line.numpy(), color=f"tab:{name}")
+    axis.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
+    atoms = (
+        "inverse tone curve and gamma" if isp.tone is None else f"{isp.config.tone_atoms} tone atoms, the typical one"
+    )
+    axis.set_title(atoms, fontsize=9)
 
 
 def _swatches(axis: Any, isp: DictionaryISP) -> None:

@@ -9,14 +9,12 @@ from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
-from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
-from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
-from rawaug.training.camera_crops import CameraCrops
 from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
@@ -63,7 +61,7 @@ def training_stream(
             frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
             real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
         if arm.augmented:
-            augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
+            augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
             frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
             synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
     else:
@@ -75,18 +73,9 @@ def training_stream(
 
 
 def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: DictionaryISP, noise: NoiseModel) -> Source:
-    """Crops of the sRGB pictures as RAW of the ISP's cameras, or of published ones."""
-    crop = recipe.train.crop
-    if arm.sampling == "published":
-        return CameraCrops(pictures, CameraSampler(exposure=arm.exposure), noise, crop, isp.cfa, arm.zoom)
-    augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
-    return PictureCrops(RawPairs(pictures, augment, crop))
-
-
-def _of_atoms(arm: ArmConfig) -> Sampling:
-    if arm.sampling == "published":
-        raise ValueError("arms: sampling published requires a supervised arm; use convex, perturb or chosen")
-    return arm.sampling
+    """Crops of the sRGB pictures as RAW of the ISP's cameras."""
+    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
+    return PictureCrops(RawPairs(pictures, augment, recipe.train.crop, zoom=arm.zoom))
 
 
 def validation_samples(

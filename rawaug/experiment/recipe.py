@@ -44,21 +44,21 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`; or published, cameras, lights and tone
-            curves from the tables of the package, see :mod:`rawaug.isp.camera_sampling`.
-        zoom: of published: pictures are enlarged up to this factor, half of the time; 1 for none.
+        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
+            :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
-        exposure: lowest and highest exposure of the RAW in stops.
+        exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen", "published"] = "convex"
+    sampling: Literal["convex", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
-    exposure: tuple[float, float] = (0.0, 0.0)
+    exposure: tuple[float, float] | None = None
     estimator: str | dict[str, Any] = "supervised"
     alpha: float | None = None
     correct: bool | None = None

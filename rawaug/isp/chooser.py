@@ -30,10 +30,13 @@ class Chooser(nn.Module):
         isp: the fitted ISP; its encoders look at the picture if they do so now.
     """
 
+    tone_weights: Tensor
+
     def __init__(self, isp: DictionaryISP) -> None:
         super().__init__()
         self.knee = isp.config.knee
         self.colour, self.gain = deepcopy(isp.colour), deepcopy(isp.gain)
+        self.register_buffer("tone_weights", isp.typical_tones().clone())
         encoders = isp.reverse_encoders
         with torch.no_grad():
             self.colour_encoder = _folded(encoders.colour, [isp.colour.atoms()])
@@ -56,7 +59,8 @@ class Chooser(nn.Module):
             m = ((x3.mean(dim=1, keepdim=True) - self.knee) / (1.0 - self.knee)).clamp(0.0, 1.0).square()
             images = torch.stack([x3, m * x3], dim=1)
         gain_weights = self.gain_encoder(images)
-        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights))
+        tone_weights = self.tone_weights.expand(len(srgb), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights), tone_weights)
 
 
 def small(srgb: Tensor, table: Tensor) -> Tensor:

@@ -21,10 +21,13 @@ class ISPConfig:
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
         stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered
-            (:func:`rawaug.isp.stage.register`).
+            (:func:`rawaug.isp.stage.register`); ``curve`` stands in place of ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights.
+        tone_atoms: K, inverse tone curves in the dictionary of the stage ``curve``; 0 without it.
+        cameras: P, published cameras that are mixtures of the colour atoms, whose gains follow from the light; 0 where
+            the atoms are fitted.
     """
 
     colour_atoms: int = 16
@@ -35,6 +38,8 @@ class ISPConfig:
     encoders: bool = False
     attention: bool = True
     knee: float = HIGHLIGHT_KNEE
+    tone_atoms: int = 0
+    cameras: int = 0
 
     def __post_init__(self) -> None:
         CFA(self.cfa)
@@ -45,6 +50,8 @@ class ISPConfig:
             raise ValueError(f"stages: {wrong or 'none'}; choose one or more, each at most once")
         if len(self.encoder_widths) != 3 or min(self.colour_atoms, self.gain_atoms, *self.encoder_widths) < 1:
             raise ValueError("encoder_widths must be three numbers; they and the numbers of atoms must be at least 1")
+        if (self.tone_atoms > 0) != ("curve" in self.stages):
+            raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
         if not 0.0 <= self.knee < 1.0:
             raise ValueError(f"knee must be in [0, 1), got {self.knee}")
 

@@ -27,6 +27,7 @@ from rawaug.isp.chooser import Chooser
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.stage import Dials, Stage, Tables, node_colours
+from rawaug.isp.tone_curves import STEPS
 from rawaug.kernels import compiled, fallback, raw_torch
 from rawaug.kernels.threads import one_thread
 
@@ -111,14 +112,19 @@ class BakedISP(nn.Module):
             torch.eye(3).to(table).expand(batch, 3, 3),
             torch.ones(batch, 1, 3).to(table),
             table.new_zeros(batch, 6),
+            table.new_empty(batch, 0),
             table.new_empty(0),
         )
         for stage in self.stages:
             dials = cast(Stage, stage).adjust(dials, params, place, (height, width))
-        matrix, floor, frame, shading = dials
+        matrix, floor, frame, curves, shading = dials
+        if curves.numel():
+            table = table[:0]
+            curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
-        return raw_torch.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
+        knee, where = self.config.knee, torch.tensor(sites)
+        return raw_torch.Camera(table, curves, self.attention, colour, knee, frame, shading, where)
 
 
 def bakeable(order: Sequence[Stage]) -> bool:

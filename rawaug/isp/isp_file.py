@@ -77,6 +77,10 @@ def misfit(path: Path, key: str) -> ValueError:
 def _sizes(config: ISPConfig) -> dict[str, int]:
     """Leading sizes of the tensors that grow with the configuration: a damaged one must not ask for endless memory."""
     sizes = {"colour.matrices": config.colour_atoms, "gain.log_gains": config.gain_atoms}
+    if config.cameras:
+        sizes["colour.known"] = config.cameras
+    if config.tone_atoms:
+        sizes["stages.curve.dictionary.curves"] = config.tone_atoms
     if config.encoders:
         for k, width in enumerate(config.encoder_widths):
             sizes[f"reverse_encoders.colour.layers.{2 * k}.weight"] = width

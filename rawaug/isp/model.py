@@ -23,8 +23,16 @@ from rawaug.isp import (
     paper_stages,  # noqa: F401 - registers the stages
     stages,
 )
+from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import ColourDictionary, GainDictionary, convex_weights
+from rawaug.isp.curve_stage import ToneCurve
+from rawaug.isp.dictionary import (
+    CameraDictionary,
+    ColourDictionary,
+    GainDictionary,
+    ToneDictionary,
+    convex_weights,
+)
 from rawaug.isp.encoder import Encoder, Encoders, thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
 from rawaug.isp.reverse import ReverseISP
@@ -56,6 +64,8 @@ class DictionaryISP(ReverseISP):
         self._config = config or ISPConfig()
         with initialised_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
+            if self.config.cameras:
+                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
             self.gain = GainDictionary(self.config.gain_atoms)
             made = [stage_class(name)(self.config) for name in self.config.stages]
             self.stages = nn.ModuleDict({stage.name: stage for stage in made})
@@ -124,10 +134,36 @@ class DictionaryISP(ReverseISP):
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
-    def params_from_weights(self, colour_weights: Tensor, gain_weights: Tensor) -> ISPParams:
-        """Parameters from given weights ``(B, N)`` and ``(B, M)``."""
+    def params_from_weights(
+        self, colour_weights: Tensor, gain_weights: Tensor, tone_weights: Tensor | None = None
+    ) -> ISPParams:
+        """Parameters from given weights ``(B, N)``, ``(B, M)`` and ``(B, K)``; of the typical tone by default."""
         matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
-        return ISPParams(colour_weights, gain_weights, matrix, gains)
+        if tone_weights is None:
+            tone_weights = self.typical_tones().expand(len(matrix), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
+
+    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
+        """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
+
+        A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
+        atoms with uniform weights.
+        """
+        if isinstance(self.colour, CameraDictionary):
+            return CameraSampler(self.colour, self.config.tone_atoms).sample(batch, generator)
+        config, device = self.config, self.colour.matrices.device
+        atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
+        return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
+
+    @property
+    def tone(self) -> ToneDictionary | None:
+        """The dictionary of tone curves; None where the curve is learned."""
+        stage = self.find(ToneCurve)
+        return stage.dictionary if stage else None
+
+    def typical_tones(self) -> Tensor:
+        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
+        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
@@ -237,10 +273,7 @@ class DictionaryISP(ReverseISP):
         return self.reverse(srgb, setting, place=place).raw
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        """The mosaic under settings uniform in the hull of the dictionaries, ``srgb`` taken for full frames."""
-        counts = (self.config.colour_atoms, self.config.gain_atoms)
-        colour, gain = (convex_weights(len(srgb), n, generator).to(srgb.device) for n in counts)
-        return self.make(srgb, self.params_from_weights(colour, gain))
+        return self.make(srgb, self.draw_setting(len(srgb), generator))
 
     def cycle(self, srgb: Tensor) -> Tensor:
         """Through the mosaic, within [0, 1], and back."""

@@ -1,6 +1,7 @@
 r"""Online augmentation: sRGB pictures to noisy/clean RAW pairs.
 
-``y = isp^-1(x; C, g)`` with the camera setting (C, g) drawn from the hull of the dictionaries' atoms, then
+``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
+atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.camera_sampling`), then
 ``noisy ~ N(y, shot_var y + read_var)``, clipped at white, never at black (Conde et al., AAAI 2022, "Dictionary
 Augmentations").
 
@@ -20,10 +21,12 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.isp.dictionary import convex_weights, perturb
+from rawaug.isp.camera_sampling import EXPOSURE
+from rawaug.isp.dictionary import perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
+from rawaug.isp.universal import of_cameras
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
@@ -41,14 +44,16 @@ class RawAugment(nn.Module):
         isp: the fitted camera; a frozen copy is taken, later changes do not reach it.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
-        sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
-            ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
+        sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
+            ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
+            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
+            ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
-        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly; ``(0, 0)`` is that of the
-            ISP's camera. Cameras differ in the headroom above their JPEG's white: to train for other cameras, use
-            (-1.5, 0).
+        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
+            default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
+            above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -66,13 +71,15 @@ class RawAugment(nn.Module):
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
-        exposure: tuple[float, float] = (0.0, 0.0),
+        exposure: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
             raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
+        if exposure is None:
+            exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
         self.isp = frozen(isp)
@@ -86,9 +93,28 @@ class RawAugment(nn.Module):
         self._calls = 0
 
     @classmethod
-    def from_pretrained(cls, isp: str | Path | DictionaryISP, **settings: Any) -> RawAugment:
-        """From the name of a shipped ISP, a path, or an ISP; ``settings`` as in the constructor."""
-        return cls(isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp), **settings)
+    def from_pretrained(
+        cls, isp: str | Path | DictionaryISP, camera: str | Sequence[str] | None = None, **settings: Any
+    ) -> RawAugment:
+        """From the name of a shipped ISP, a path, or an ISP.
+
+        Args:
+            isp: the name, path or ISP.
+            camera: maker and model of a published camera, or several, in place of the ISP's colour atoms; for an ISP of
+                published cameras, such as ``universal``.
+            settings: as in the constructor.
+
+        Raises:
+            FileNotFoundError: if there is no such ISP.
+            ValueError: if a camera is not listed, or the ISP was fitted to frames.
+
+        Example:
+            >>> augment = RawAugment.from_pretrained("universal", camera="Nikon D750")
+            >>> augment.isp.info["cameras"]
+            ['Nikon D750']
+        """
+        loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
+        return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
@@ -109,18 +135,13 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        config, device = self.isp.config, srgb.device
         if self.sampling == "convex":
-            colour, gain = (
-                convex_weights(len(srgb), n, generator).to(device) for n in (config.colour_atoms, config.gain_atoms)
-            )
-        else:
-            chosen = self.baked.choose(srgb)
-            if self.sampling == "chosen":
-                return chosen
-            colour = perturb(chosen.colour_weights, self.strength, generator)
-            gain = perturb(chosen.gain_weights, self.strength, generator)
-        return self.isp.params_from_weights(colour, gain)
+            return self.isp.draw_setting(len(srgb), generator)
+        chosen = self.baked.choose(srgb)
+        if self.sampling == "chosen":
+            return chosen
+        weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
+        return self.isp.params_from_weights(*(perturb(w, self.strength, generator) for w in weights))
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""

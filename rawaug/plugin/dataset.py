@@ -11,16 +11,19 @@ after a resume in the middle of an epoch.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
 from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.threads import one_thread
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.epochs import Passes, Visits
 from rawaug.plugin.params import AugmentParams, RawPair, require_keys
@@ -43,10 +46,13 @@ class RawPairs(Dataset[Any]):
         turns: whether to draw flips and quarter turns; what is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
             then a dict of these. In samples that are mappings they stand in place of the picture.
+        zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
+            scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
         TypeError: if ``augment`` is none of these.
-        ValueError: if the crop is odd, or, on access, if a picture is smaller than the crop or none.
+        ValueError: if the crop is odd, the zoom less than 1 or without a crop, or, on access, if a picture is smaller
+            than the crop or none.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -72,9 +78,12 @@ class RawPairs(Dataset[Any]):
         key: str | int | None = None,
         turns: bool = True,
         keys: Sequence[str] | None = None,
+        zoom: float = 1.0,
     ) -> None:
+        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
+            raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
         self.dataset, self.augment = dataset, augmentation(augment)
-        self.crop, self.seed, self.turns = crop_size(crop), seed, turns
+        self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
         self.key, self.keys = key, require_keys(keys)
         self._epochs = self._new_epochs()
 
@@ -141,7 +150,7 @@ class RawPairs(Dataset[Any]):
         where = find_picture(sample, self.key)
         try:
             picture = even_sided(to_rgb_tensor(picked(sample, where)))
-            place = random_place(picture, self.crop, self.turns, generator)
+            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         patch = placed(picture, place, self.crop)[None]
@@ -163,7 +172,7 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
             WebDataset and Hugging Face do, or ``divide`` does.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
-        augment, crop, seed, key, turns, keys: as for :class:`RawPairs`.
+        augment, crop, seed, key, turns, keys, zoom: as for :class:`RawPairs`.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -183,8 +192,9 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         keys: Sequence[str] | None = None,
         identity: str | int | None = None,
         divide: bool = False,
+        zoom: float = 1.0,
     ) -> None:
-        super().__init__(dataset, augment, crop, seed, key, turns, keys)
+        super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
         self.identity, self.divide = identity, divide
 
     def _new_epochs(self) -> Passes:
@@ -249,14 +259,22 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
     return bayer.RandomCrop((height, width)).size
 
 
-def random_place(picture: Tensor, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator) -> Tensor:
+def random_place(
+    picture: Tensor, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+) -> Tensor:
     """Position and turn of a crop of ``(3, H, W)``: ``(5,)`` top, left, height, width (H, W) and view.
+
+    With a zoom ``(6,)``: the last are the rows that are enlarged to the crop.
 
     Raises:
         ValueError: if the picture is smaller than the crop.
     """
     height, width = picture.shape[-2:]
     size = crop or (height, width)
+    if crop and zoom > 1.0:
+        share, drawn = torch.rand(2, generator=generator).tolist()
+        rows = crop[0] if share < 0.5 else math.ceil(crop[0] / 2 * zoom**-drawn) * 2
+        return torch.cat([random_place(picture, _region(crop, rows), turns, generator), torch.tensor([rows])])
     corner = bayer.RandomCrop(size).sample(height, width, generator)
     turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=size[0] == size[1])
     view = turn.sample(generator) if turns else torch.tensor(0)
@@ -269,8 +287,24 @@ def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tens
     Raises:
         ValueError: if the picture does not have the size it was drawn for.
     """
-    top, left, height, width, view = place.tolist()
+    top, left, height, width, view, rows = (*place.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    patch = bayer.crop(picture, top, left, *(crop or (height, width)))
+    patch = bayer.crop(picture, top, left, *(_region(crop, rows) if crop else (height, width)))
+    if crop and patch.shape[-2:] != crop:
+        patch = enlarged(patch, crop)
     return bayer.turn(patch, view).contiguous()
+
+
+def _region(crop: tuple[int, int], rows: int) -> tuple[int, int]:
+    """Even height and width of what is enlarged to the crop, by its rows; 0 for the crop itself."""
+    return (rows, math.ceil(crop[1] * rows / crop[0] / 2) * 2) if rows else crop
+
+
+def enlarged(patch: Tensor, size: tuple[int, int]) -> Tensor:
+    """``(3, h, w)`` to ``(3, *size)`` of the same type, bicubic."""
+    with one_thread():  # the same bits everywhere
+        larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
+    if patch.dtype == torch.uint8:
+        return larger.round_().clamp_(0, 255).to(torch.uint8)
+    return larger.clamp_(0.0, 1.0).to(patch.dtype)

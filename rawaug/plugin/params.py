@@ -21,7 +21,8 @@ class AugmentParams(NamedTuple):
         isp: camera settings.
         noise: levels and seeds of the noise.
         place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
-            turned after the crop (see :func:`rawaug.bayer.turn`).
+            turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
+            enlarged to the crop.
     """
 
     isp: ISPParams

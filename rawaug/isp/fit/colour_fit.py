@@ -45,7 +45,7 @@ class FrameColour:
     def params(self) -> ISPParams:
         """As the ISP takes them (without weights)."""
         none = self.log_scale.new_empty(len(self.log_scale), 0)
-        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale))
+        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale), none)
 
     def pick(self, frames: Tensor | slice) -> FrameColour:
         """The colours of some frames."""
