@@ -6,7 +6,7 @@ Every method makes clean RAW, noisy RAW and the variance map, packed, of photogr
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
 with its own noise. *cycleisp* is its network from sRGB to RAW alone, and *unbaked* the ISP's own reverse pass, each on
 one small crop whose time is scaled by pixels, in the network's favour. *copy* turns bytes into as many floats as are
-made of them, and does nothing else. All are timed in turn, and the fastest run of each counts.
+made of them, and does no more. All are timed in turn, and the fastest run of each counts.
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ def machine(threads: int) -> dict[str, object]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix for 12")
-    parser.add_argument("--json", type=Path, help="write all figures here")
+    parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix instead of 12")
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, help="runs of each method")
     parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)

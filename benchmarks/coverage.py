@@ -1,4 +1,4 @@
-"""What share of published cameras a hull of ten colour atoms reaches, and whether it holds for cameras not looked at.
+"""What share of published cameras a hull of ten colour atoms reaches, and whether this holds for unseen cameras.
 
     python benchmarks/coverage.py photographs/ [--atoms 10] [--halves 5]
 
@@ -34,7 +34,7 @@ def main() -> None:
     options = parser.parse_args()
     files = sorted(options.photographs.glob("*.jpg"))
     if not files:
-        raise SystemExit(f"{options.photographs}: no *.jpg in it")
+        raise SystemExit(f"{options.photographs}: contains no *.jpg")
     moment = torch.stack([_moment(file) for file in files]).mean(dim=0)
     points = colour_coordinates(colour_matrix(published_cameras().distinct()), moment)
     print(f"{len(points)} distinct matrices, {len(files)} photographs, {options.atoms} atoms, {DECIBEL:g} dB")

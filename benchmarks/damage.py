@@ -1,4 +1,4 @@
-"""Small whole files of every kind that rawaug reads, and damage to them; what benchmarks/fuzz.py is made of."""
+"""Small whole files of every kind that rawaug reads, and damage to them; the inputs of benchmarks/fuzz.py."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF,
 
 
 def make_originals(folder: Path) -> dict[str, list[Path]]:
-    """Whole files by kind; a kind of which there is none at hand has an empty list."""
+    """Whole files by kind; the list of an unavailable kind is empty."""
     shared = Path(os.environ.get("RAWAUG_SHARED", Path(__file__).parents[1].parent / "shared" / "data"))
     return {
         "raw": sorted(shared.glob("raw/canon/*.crw"))[:3],
@@ -30,7 +30,7 @@ def make_originals(folder: Path) -> dict[str, list[Path]]:
 
 
 def _make_dngs(folder: Path, real: list[Path]) -> list[Path]:
-    """One with gain maps, and one with all that a real one tells."""
+    """One with gain maps, and one with all the tags of a real file."""
     import torch
 
     from rawaug.bayer import CFA

@@ -59,7 +59,7 @@ def make_folder(folder: Path, files: int, damaged: float) -> set[str]:
 
 
 def own_megabytes(processes: list[int]) -> list[float]:
-    """Memory that each process shares with no other, where the system tells."""
+    """Memory private to each process, where the system reports it."""
     sizes = []
     for process in processes:
         try:
@@ -92,7 +92,7 @@ def main() -> int:
     parser.add_argument("--files", type=int, default=20_000)
     parser.add_argument("--damaged", type=float, default=0.01, help="share of them")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--quick", action="store_true", help="2,000 files")
     args = parser.parse_args()
     args.files = min(args.files, 2000) if args.quick else args.files

@@ -27,8 +27,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", help="folder of RAW files, or kind:path")
     parser.add_argument("--subsets", type=int, default=5, help="random subsets of each size")
-    parser.add_argument("--patches", type=int, default=8, help="patches scored of each left-out frame")
-    parser.add_argument("--json", type=Path, default=None, help="also write every figure to this file")
+    parser.add_argument("--patches", type=int, default=8, help="patches scored per held-out frame")
+    parser.add_argument("--json", type=Path, default=None, help="write every figure to this file")
     options = parser.parse_args()
     pairs = list(open_pairs(options.data, split="train"))
     table: dict[int, list[dict[str, float]]] = {}

@@ -1,10 +1,10 @@
-"""What the readers make of damaged files: each is read, or refused in one line that names it; nothing else.
+"""How the readers handle damaged files: each must be read, or refused in one line that names it.
 
     python -m benchmarks.fuzz [--count 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
 repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
-repeats pieces, as (seed, kind, number) tells. A worker process reads one after the other, and is started anew when a
+repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is started anew when a
 decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
 line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
 more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
@@ -162,7 +162,7 @@ class Worker:
         ready = select.select([process.stdout], [], [], START_SECONDS)[0] and process.stdout.readline()
         if not ready:
             process.kill()
-            raise OSError(f"the reading process does not start: {self.log.read_text()[-500:]}")
+            raise OSError(f"the reader process failed to start: {self.log.read_text()[-500:]}")
         self.process = process
         return process
 
@@ -194,7 +194,7 @@ def _forget_peak(process: int) -> None:
 
 
 def _peak_mebibytes(process: int) -> float:
-    """Peak of resident memory since :func:`_forget_peak`; 0 where the system does not tell."""
+    """Peak of resident memory since :func:`_forget_peak`; 0 where unavailable."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except OSError:
@@ -203,9 +203,9 @@ def _peak_mebibytes(process: int) -> float:
 
 
 def _innermost(log: Path) -> str:
-    """Where Python was when a decoder crashed, as faulthandler tells it."""
+    """Where Python was when a decoder crashed, from faulthandler's log."""
     lines = (line.strip() for line in log.read_text(errors="replace").splitlines())
-    return next((line for line in lines if line.startswith("File ")), "no place known")
+    return next((line for line in lines if line.startswith("File ")), "unknown location")
 
 
 # -- the run ----------------------------------------------------------------------------------------------------------
@@ -234,8 +234,8 @@ def _fuzz_kind(
     for original in originals:
         copy = folder / f"{original.stem.split('.')[0]}-whole{original.suffix}"
         copy.write_bytes(original.read_bytes())
-        if (told := worker.read(kind, copy))[0] != "read":
-            raise ValueError(f"{original}: is {told[0]} although it is whole ({told[1]})")
+        if (result := worker.read(kind, copy))[0] != "read":
+            raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
     outcomes, reasons, slowest = Counter[str](), [], 0.0
     for number in range(count):
         rng = np.random.default_rng(derived_seed(seed, kind, number))
@@ -272,8 +272,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=DECODERS, default=list(DECODERS))
     parser.add_argument("--quick", action="store_true", help="100 files")
-    parser.add_argument("--keep", type=Path, help="keep the files that did not end as they should in this folder")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -284,7 +284,7 @@ def main() -> int:
     print_table(results)
     absent = [kind for kind in args.kinds if kind not in results]
     print(
-        f"{time.perf_counter() - start:.0f} s" + (f"; no files of kind {', '.join(absent)} at hand" if absent else "")
+        f"{time.perf_counter() - start:.0f} s" + (f"; no files of kind {', '.join(absent)} available" if absent else "")
     )
     if args.json:
         args.json.write_text(json.dumps({"seed": args.seed, "kinds": results}, indent=1) + "\n", encoding="utf-8")

@@ -138,10 +138,10 @@ def measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", type=Path, nargs="?", help="a folder; the built-in pictures by default")
-    parser.add_argument("--memory", action="store_true", help="resident memory over epochs instead of times")
+    parser.add_argument("pictures", type=Path, nargs="?", help="folder of pictures; by default the built-in ones")
+    parser.add_argument("--memory", action="store_true", help="measure resident memory over epochs instead of times")
     parser.add_argument("--epochs", type=int, default=10, help="of --memory")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--workers", type=int, default=4)
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--crop", type=int, default=128)

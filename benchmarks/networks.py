@@ -4,8 +4,8 @@
     python -m benchmarks.networks --device cuda --width 128 --networks DHDN --crop 256     (bf16)
 
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
-with it, RawAugment makes it of sRGB first. Each network has a process of its own, whose peak memory is told; steps are
-timed in turn, and the fastest counts.
+with it, RawAugment makes it of sRGB first. Each network runs in its own process, whose peak memory is reported; steps
+are timed in turn, and the fastest counts.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--quick", action="store_true", help="one repeat, batches of 4")
     args = parser.parse_args()
     if args.quick:

@@ -75,7 +75,7 @@ def measure(shape: tuple[int, ...], repeats: int, device: torch.device) -> dict[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the ratios here")
+    parser.add_argument("--json", type=Path, help="write the ratios to this file")
     parser.add_argument("--threads", type=int, default=1, help="as in a DataLoader's worker")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))

@@ -76,12 +76,12 @@ def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dic
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", type=Path, nargs="?", help="a folder; the built-in pictures by default")
+    parser.add_argument("pictures", type=Path, nargs="?", help="folder of pictures; by default the built-in ones")
     parser.add_argument("--formats", nargs="+", choices=("dng", "npz", "tiff"), default=["npz", "dng"])
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--quick", action="store_true", help="one repeat, the built-in pictures once")
-    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as written:
         if args.pictures is None:

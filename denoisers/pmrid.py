@@ -4,8 +4,8 @@ Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwi
 half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
 convolution 2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
 
-ReLUs and sums work in place: on a CPU fresh memory costs more than they do. Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the
-published weights.
+Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the
+published weights. ReLUs and sums work in place: on a CPU fresh memory costs more than they do.
 """
 
 from __future__ import annotations

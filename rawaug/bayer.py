@@ -84,12 +84,12 @@ class CFA(str, Enum):
 
 def _require_even(height: int, width: int) -> None:
     if height % 2 or width % 2:
-        raise ValueError(f"a Bayer mosaic has even sides, got {height} x {width}; crop the last row or column")
+        raise ValueError(f"a Bayer mosaic must have even sides, got {height} x {width}; crop the last row or column")
 
 
 def _require_channels(image: Tensor, channels: int, what: str) -> None:
     if image.ndim < 3 or image.shape[-3] != channels:
-        raise ValueError(f"{what} has shape (..., {channels}, H, W), got {tuple(image.shape)}")
+        raise ValueError(f"{what} must have shape (..., {channels}, H, W), got {tuple(image.shape)}")
 
 
 def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
@@ -145,7 +145,7 @@ def turn(image: Tensor, view: int) -> Tensor:
     ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity.
     """
     if not 0 <= view < N_VIEWS:
-        raise ValueError(f"view is in [0, {N_VIEWS}), got {view}")
+        raise ValueError(f"view must be in [0, {N_VIEWS}), got {view}")
     if view & 4:
         image = image.transpose(-2, -1)
     axes = [axis for bit, axis in ((2, -2), (1, -1)) if view & bit]
@@ -172,7 +172,7 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     turned = turn(raw, view)
     height, width = turned.shape[-2:]
     if height <= 2 * rows or width <= 2 * columns:
-        raise ValueError(f"a mosaic of {height} x {width} has no lines to spare for a turn that keeps its CFA")
+        raise ValueError(f"a mosaic of {height} x {width} is too small to turn while keeping its CFA")
     return turned[..., rows : height - rows, columns : width - columns]
 
 
@@ -201,7 +201,9 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     if top % 2 or left % 2 or height % 2 or width % 2:
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
     if min(top, left) < 0 or min(height, width) < 1 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
-        raise ValueError(f"crop {height} x {width} at ({top}, {left}) leaves the mosaic {tuple(raw.shape[-2:])}")
+        raise ValueError(
+            f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {tuple(raw.shape[-2:])}"
+        )
     return raw[..., top : top + height, left : left + width]
 
 
@@ -263,13 +265,13 @@ class RandomCrop(_Transform):
         super().__init__(seed)
         self.size = (size, size) if isinstance(size, int) else size
         if any(side % 2 or side < 2 for side in self.size):
-            raise ValueError(f"a crop is even and at least 2, got {size}")
+            raise ValueError(f"crop must be even and at least 2, got {size}")
 
     def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
         """``(2,)``: top and left of a crop of a mosaic of ``height`` x ``width``."""
         rows, columns = self.size
         if height < rows or width < columns:
-            raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller one")
+            raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
         free = ((height - rows) // 2 + 1, (width - columns) // 2 + 1)
         return 2 * torch.stack([torch.randint(n, (), generator=generator) for n in free])
 

@@ -1,4 +1,4 @@
-"""Names of cameras, as published tables spell them: maker and model. Case and blanks do not matter in a look-up."""
+"""Names of cameras, as published tables spell them: maker and model. Look-up ignores case and spaces."""
 
 from __future__ import annotations
 

@@ -74,10 +74,10 @@ def read_tensors(path: str | Path, advice: str) -> tuple[dict[str, str], dict[st
 
 
 def read_header(path: str | Path) -> dict[str, str]:
-    """The header of a file of rawaug's, without its tensors.
+    """The header of a rawaug file, without its tensors.
 
     Raises:
-        ValueError: if it is not a safetensors file, or not rawaug's.
+        ValueError: if it is not a safetensors file written by rawaug.
     """
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -85,7 +85,7 @@ def read_header(path: str | Path) -> dict[str, str]:
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a readable safetensors file ({error}); fit or train it again") from error
     if header.get("format") != "rawaug":
-        raise ValueError(f"{path}: a safetensors file, but not rawaug's; give one written by rawaug fit or rawaug run")
+        raise ValueError(f"{path}: not a rawaug file; give one written by rawaug fit or rawaug run")
     return header
 
 

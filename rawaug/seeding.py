@@ -1,4 +1,4 @@
-"""Keyed randomness: a generator from (seed, key, ...), so that any draw can be had again without the draws before it.
+"""Keyed randomness: a generator from (seed, key, ...), so that any draw can be repeated without the draws before it.
 
 The keys are hashed with BLAKE2b; nearby keys give unrelated streams, and nothing depends on the global state, on the
 number of workers or on the order in which samples are asked for.
@@ -30,7 +30,7 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
 
 
 def rank_key() -> tuple[int, ...]:
-    """What tells the draws of a distributed run's processes apart; the first, and a process alone, have no key.
+    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single process.
 
     Example:
         >>> rank_key()

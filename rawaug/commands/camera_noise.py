@@ -1,4 +1,4 @@
-"""A camera's own noise levels, from the RAW files that its ISP is fitted on: photon transfer, dark frames if there are.
+"""A camera's own noise levels, from the RAW files that its ISP is fitted on: photon transfer, and dark frames if given.
 
 The captured noisy mosaic of a pair is measured where it has one, else the RAW file itself.
 """
@@ -17,18 +17,18 @@ from rawaug.io import read_raw
 from rawaug.noise import NoiseEstimate, estimate_noise, from_dark_frames
 
 WORST_FIT = 0.5
-"""R^2 below which the points are no line."""
+"""R^2 below which the points do not follow a line."""
 MOST_FRAMES = 16
-"""Frames that are measured at most: they are in memory together."""
+"""Largest number of frames measured, since all are in memory."""
 
 
 def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> NoiseEstimate:
     """(shot_var, read_var) of the camera at the ISO of its files, with the measured points.
 
     Args:
-        pairs: frames of one camera at one ISO (others blur the line, which its R^2 shows); of more than
-            :data:`MOST_FRAMES`, so many, evenly spaced.
-        dark: folder of dark frames, which then tell the read variance.
+        pairs: frames of one camera at one ISO (others blur the line, which its R^2 shows); at most
+            :data:`MOST_FRAMES` are used, evenly spaced.
+        dark: folder of dark frames to measure the read variance.
 
     Raises:
         ValueError: if the frames have too few flat regions, or a dark frame is clipped at black.
@@ -41,7 +41,7 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
     estimate = estimate_noise(mosaics, cfa, read_var=read_var)
     if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
         raise ValueError(
-            f"noise: the frames do not lie on one line (R^2 {estimate.r2:.2f}); measure one camera at one ISO at a time"
+            f"noise: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); use one camera at one ISO"
         )
     return estimate
 
@@ -63,5 +63,5 @@ def _mosaics(pairs: Sequence[Pair]) -> tuple[list[Tensor], CFA]:
 
 
 def as_info(estimate: NoiseEstimate) -> dict[str, float]:
-    """What stands in the ISP's file under ``noise``."""
+    """The entry ``noise`` of the ISP's file."""
     return {"shot_var": estimate.shot_var, "read_var": estimate.read_var, "r2": estimate.r2}

@@ -1,4 +1,4 @@
-"""``rawaug data check``: which dataset is in a folder, and what of it is damaged."""
+"""``rawaug data check``: identify the dataset and list damaged files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rawaug.data import check
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("path", type=str, help="a folder, a RAW file, or a submission to SIDD")
-    parser.add_argument("--first", type=int | None, default=None, help="read only so many of each kind")
+    parser.add_argument("--first", type=int | None, default=None, help="read at most this many items of each kind")
 
 
 def run(arguments: Any) -> None:
@@ -22,4 +22,4 @@ def run(arguments: Any) -> None:
     report = check(arguments.path, arguments.first)
     print(report)
     if report.broken:
-        raise ValueError(f"{arguments.path}: {len(report.broken)} broken, listed above")
+        raise ValueError(f"{arguments.path}: {len(report.broken)} damaged, listed above")

@@ -28,20 +28,22 @@ def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("weights", type=str, help="a .safetensors file of rawaug fit or rawaug run, or a shipped name")
     parser.add_argument("--data", type=str, required=True, help="folder of RAW files, one file, or kind:path")
-    parser.add_argument("--self-ensemble", action="store_true", help="average a denoiser over eight views, besides")
-    noise_help = "for frames without a noisy capture: a preset, a measured camera, or [shot_var, read_var]"
+    parser.add_argument(
+        "--self-ensemble", action="store_true", help="also score the average over eight views (denoisers)"
+    )
+    noise_help = "noise added to frames without a noisy capture: a preset, a measured camera, or [shot_var, read_var]"
     parser.add_argument("--noise", type=tuple[float, float] | str | None, default=None, help=noise_help)
     parser.add_argument("--seed", type=int, default=0, help="of that noise")
-    classical = "also score NonLocalMeans, Wavelet, TotalVariation or BM3D on the same noise"
+    classical = "classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D"
     parser.add_argument("--classical", type=list[str], default=[], help=classical)
-    parser.add_argument("--device", type=str, default="cpu", help="where a denoiser runs: cpu, cuda, ...")
-    page_help = "also write a page with the scores and with crops of the frames of a denoiser to this HTML file"
+    parser.add_argument("--device", type=str, default="cpu", help="device for a denoiser: cpu, cuda, ...")
+    page_help = "write an HTML page with a denoiser's scores and crops to this file"
     parser.add_argument("--report", type=str | None, default=None, help=page_help)
-    parser.add_argument("--json", type=str | None, default=None, help="also write the result to this file")
+    parser.add_argument("--json", type=str | None, default=None, help="write the result as JSON to this file")
 
 
 def run(arguments: Any) -> None:
-    """Print the scores, and write what is asked for."""
+    """Print the scores and write the requested files."""
     settings = vars(arguments)
     json_path = settings.pop("json")
     result = evaluate(**settings)
@@ -67,7 +69,7 @@ def evaluate(
     Args:
         weights: an ISP's or a denoiser's; the file says which.
         data: a folder of RAW files, or ``kind:path``.
-        self_ensemble: average a denoiser over eight views; its scores without stand under ``plain``.
+        self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
         seed: of that noise.
@@ -85,7 +87,9 @@ def evaluate(
     pairs = open_pairs(data, split="test")
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
-            raise ValueError(f"{weights}: is an ISP; self-ensemble, noise, classical and report are for denoisers")
+            raise ValueError(
+                f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
+            )
         isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
         result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
     else:

@@ -20,20 +20,24 @@ WATCHED_PATCHES = 4
 
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
-    parser.add_argument("data", type=str, nargs="+", help="folders of RAW files, files, or one kind:path")
-    jpeg_help = "take the camera's JPEG of the same stem for the sRGB; false takes LibRaw's rendering always"
+    parser.add_argument("data", type=str, nargs="+", help="RAW files, folders of them, or one kind:path")
+    jpeg_help = "use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering"
     parser.add_argument("--camera-jpeg", type=bool, default=True, help=jpeg_help)
-    held_out_help = "frames that the fit does not see: their PSNR_r is shown while it runs"
+    held_out_help = "frames excluded from the fit; their PSNR_r is shown during the fit"
     parser.add_argument("--held-out", type=str | None, default=None, help=held_out_help)
-    parser.add_argument("--out", type=str, required=True, help="the .safetensors file to write")
-    noise_help = "also measure the camera's noise, for noise: camera; auto goes on where the frames do not show it"
+    parser.add_argument("--out", type=str, required=True, help="output .safetensors file")
+    noise_help = (
+        "measure the camera's noise, for noise: camera; auto continues without it where the frames do not allow it"
+    )
     parser.add_argument("--noise", type=Literal["auto", "on", "off"], default="auto", help=noise_help)
-    parser.add_argument("--dark", type=str | None, default=None, help="folder of dark frames, for the read variance")
+    parser.add_argument(
+        "--dark", type=str | None, default=None, help="folder of dark frames to measure the read variance"
+    )
     parser.add_class_arguments(FitConfig)
 
 
 def run(arguments: Any) -> None:
-    """Fit, write the file and say how it went."""
+    """Fit, write the file and print a summary."""
     settings = vars(arguments)
     data, out = settings.pop("data"), settings.pop("out")
     if Path(out).suffix != ".safetensors":
@@ -65,19 +69,19 @@ def fit(
     state: str | Path | None = None,
     **settings: Any,
 ) -> DictionaryISP:
-    """Fit a camera of one's own.
+    """Fit an ISP to your own camera.
 
     Args:
         source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
         progress: show progress bars.
-        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto" goes on
-            without where the frames do not show them, and says why in ``isp.info["noise_not_measured"]``.
-        dark: folder of dark frames, which then tell the read variance.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto"
+            continues without them where they cannot be measured; the reason is in ``isp.info["noise_not_measured"]``.
+        dark: folder of dark frames to measure the read variance.
         noise_figure: where to draw the measured points and the line.
-        camera_jpeg: take the camera's JPEG of the same stem for the sRGB; False takes LibRaw's rendering always.
-        held_out: frames that the fit does not see; their PSNR_r while it runs goes to the progress bar and into
+        camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
+        held_out: frames excluded from the fit; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
-        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        state: file with the state of the fit, to resume it; removed at the end.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Raises:
@@ -89,7 +93,7 @@ def fit(
         'train_00_astronaut'
     """
     if noise not in ("auto", "on", "off"):
-        raise ValueError(f"noise is auto, on or off, got {noise!r}")
+        raise ValueError(f"noise must be auto, on or off, got {noise!r}")
     start = time.perf_counter()
     pairs = _pairs(source, camera_jpeg)
     watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
@@ -109,7 +113,7 @@ def fit(
 
 
 def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> NoiseEstimate | str | None:
-    """The levels, or why they are not known."""
+    """The levels, or why they could not be measured."""
     if noise == "off":
         return None
     try:
@@ -121,7 +125,7 @@ def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) 
 
 
 class _Watch:
-    """PSNR_r of frames that the fit does not see, on a few patches of each."""
+    """PSNR_r of held-out frames, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
@@ -134,14 +138,14 @@ class _Watch:
             for white_balance in (False, True)
         )
         self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
-        return f"held out {blind:.2f} dB, {given:.2f} with its gains"
+        return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
 
 
 def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
-        raise ValueError("a fit takes files, folders or pairs, in a sequence of one or more")
+        raise ValueError("nothing to fit; give one or more files, folders or pairs")
     if isinstance(source[0], Pair):
         return source  # type: ignore[return-value]
     if not isinstance(source[0], (str, Path)):
@@ -154,6 +158,6 @@ def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jp
     files: list[Path] = []
     for item, pairs in zip(source, opened, strict=True):
         if not isinstance(pairs, RawFolder):
-            raise ValueError(f"{item}: a known dataset is fitted alone; name it without other files")
+            raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
         files += pairs.files
     return RawFolder(files, camera_jpeg=camera_jpeg)

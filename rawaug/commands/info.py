@@ -1,4 +1,4 @@
-"""``rawaug info``: what is in a file of weights, for people to read."""
+"""``rawaug info``: a readable description of a weights file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _millions(model: DictionaryISP | denoisers.Denoiser) -> str:
 def _describe_isp(path: Path) -> str:
     isp = DictionaryISP.from_pretrained(path)
     config = isp.config
-    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, makes {isp.cfa} RAW"]
+    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, {isp.cfa} output"]
     lines.append(f"  stages: {' '.join(config.stages)} mosaic; encoders {'on' if config.encoders else 'off'}")
     lines.append(
         f"  gamma: {isp.reverse_networks.gamma.item():.3f} reverse, {isp.forward_networks.gamma.item():.3f} forward"

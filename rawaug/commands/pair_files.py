@@ -1,4 +1,4 @@
-r"""A RAW pair on disk, in one of three formats, and what replays it.
+r"""A RAW pair on disk, in one of three formats, and the parameters that replay it.
 
 ======  =====================================  ====================================================================
 format  files                                  content
@@ -71,16 +71,16 @@ def params_file(stem: Path) -> Path:
 
 
 def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
-    """The pair ``(4, h, w)`` that a file of parameters tells, bit for bit what was written.
+    """The pair ``(4, h, w)`` described by a parameter file, bit for bit as written.
 
     Args:
         params: ``NAME.safetensors`` of a pair.
-        picture: the sRGB picture, where it is no longer in the place that the file tells.
-        isp: the ISP's file, likewise.
+        picture: the sRGB picture, if it has moved since.
+        isp: the ISP's file, if it has moved since.
 
     Raises:
         FileNotFoundError: if picture or ISP are not there.
-        ValueError: if they have changed since, or the file is no pair's.
+        ValueError: if they have changed since, or the file does not belong to a pair.
 
     Example:
         >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
@@ -88,12 +88,12 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     drawn = load_params(params)
     header = read_header(params)
     if "origin" not in header:
-        raise ValueError(f"{params}: parameters of a pair that rawaug synth did not write; use RawAugment.apply")
+        raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
     origin = Origin(**json.loads(header["origin"]))
     augment = augmentation(str(isp or origin.isp), origin.noise)
     found = Path(picture or origin.picture)
     if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
-        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one that made this pair")
+        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one this pair was made with")
     srgb = even_sided(read_picture(found))
     if sha256(found) != origin.picture_sha256:
         raise ValueError(f"{params}: the picture {found} has changed since this pair was made")
@@ -102,7 +102,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
 
 def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
-    """The augmentation of these names, as a file can tell them."""
+    """The augmentation with these settings."""
     return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)
 
 
@@ -133,9 +133,9 @@ def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFrame, float]:
-    """A pair ``(4, h, w)`` as a camera would hand it over: clean, noisy, and the stops that it is underexposed by."""
+    """A pair ``(4, h, w)`` as camera frames: clean, noisy, and the stops of underexposure."""
     white_balance, color_matrix, stops = _color(pair, augment)
-    told: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "cfa": augment.isp.cfa,
         "black": (_black(float(pair.noisy.min())),) * 4,
         "white": float(_WHITE),
@@ -152,8 +152,8 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
     levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
     clean, noisy = (bayer.unpack(raw, augment.isp.cfa) for raw in (pair.clean, pair.noisy))
     return (
-        RawFrame(mosaic=clean, noise_profile=None, **told),
-        RawFrame(mosaic=noisy, noise_profile=levels, **told),
+        RawFrame(mosaic=clean, noise_profile=None, **metadata),
+        RawFrame(mosaic=noisy, noise_profile=levels, **metadata),
         stops,
     )
 
@@ -169,7 +169,7 @@ def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, floa
     grey = matrix.sum(1)
     balance = (isp.gains if "gains" in stages else torch.ones(3)) / grey
     if not balance.min() > 0:
-        raise ValueError(f"this camera setting has no positive grey, {balance.tolist()}; a DNG cannot tell it")
+        raise ValueError(f"a DNG cannot store the white balance {balance.tolist()} of this pair; it must be positive")
     red, green, blue = balance.tolist()
     return (red / green, 1.0, blue / green), torch.linalg.inv(matrix / grey[:, None]), math.log2(green)
 

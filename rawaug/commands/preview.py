@@ -1,4 +1,4 @@
-"""``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and what the dictionaries hold.
+"""``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and the atoms of the dictionaries.
 
 Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
 sensor sees.
@@ -28,9 +28,9 @@ _MAXIMUM = 768
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("picture", type=str, help="an sRGB picture")
-    parser.add_argument("--out", type=str, required=True, help="the PNG to write; the atoms go to NAME-atoms.png")
-    parser.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
-    parser.add_argument("--count", type=int, default=4, help="augmented RAWs to draw")
+    parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
+    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
+    parser.add_argument("--count", type=int, default=4, help="number of augmented RAWs to plot")
     parser.add_argument("--seed", type=int, default=0, help="of these")
 
 
@@ -47,14 +47,14 @@ def preview(picture: str | Path, weights: str | Path, out: str | Path, count: in
         picture: an sRGB picture.
         weights: an ISP, shipped or a path.
         out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
-        count: augmented RAWs to draw.
+        count: number of augmented RAWs to plot.
         seed: of these.
 
     Returns:
         The two paths.
     """
     if count < 0:
-        raise ValueError(f"count is at least 0, got {count}")
+        raise ValueError(f"count must be at least 0, got {count}")
     isp = DictionaryISP.from_pretrained(weights)
     whole = even_sided(read_picture(picture))
     out = Path(out) if Path(out).suffix else Path(f"{out}.png")

@@ -1,4 +1,4 @@
-"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, many processes at work.
+"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, in parallel.
 
 What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
 run is stopped and started again, and with however many workers, the same files come out, each made once.
@@ -45,15 +45,15 @@ __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
 def add_arguments(parser: Any) -> None:
     """The command's arguments."""
     parser.add_argument("pictures", type=str, help="folder of sRGB pictures")
-    parser.add_argument("out", type=str, help="folder to write")
+    parser.add_argument("out", type=str, help="output folder")
     parser.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
-    parser.add_argument("--per-image", type=int, default=1, help="pairs a picture")
-    parser.add_argument("--isp", type=str, default="universal", help="an ISP's file, or the name of a shipped one")
-    noise_help = "a preset, a measured camera, camera (as fitted), or [shot_var, read_var]"
+    parser.add_argument("--per-image", type=int, default=1, help="pairs per picture")
+    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
+    noise_help = "a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var]"
     parser.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
     parser.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws")
-    parser.add_argument("--workers", type=int | None, default=None, help="processes; as many as cores by default")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--workers", type=int | None, default=None, help="number of processes; by default one per core")
 
 
 def run(arguments: Any) -> None:
@@ -64,7 +64,7 @@ def run(arguments: Any) -> None:
 
 @dataclass(frozen=True)
 class _Settings:
-    """What the files depend on, besides the pictures; stands in ``synth.json`` beside them."""
+    """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
 
     format: Format
     isp: str
@@ -106,23 +106,23 @@ def synth(
     seed: int = 0,
     workers: int | None = None,
 ) -> Synthesis:
-    """Make ``per_image`` pairs of every picture of a folder and its subfolders; pairs that are there stay as they are.
+    """Make ``per_image`` pairs of every picture of a folder and its subfolders; existing pairs are kept.
 
     Args:
         source: the folder of sRGB pictures.
         out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.commands.pair_files`.
         format: dng, npz or tiff.
-        per_image: pairs a picture; may grow from run to run.
+        per_image: pairs per picture; may grow from run to run.
         isp: name of a shipped ISP, or an ISP's file.
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
         sampling: of camera settings, as in :class:`rawaug.RawAugment`.
-        seed: of all draws.
-        workers: processes; as many as cores by default, 0 for none but this one. They start by forkserver or spawn: a
-            script guards its main part by ``if __name__ == "__main__":``.
+        seed: random seed.
+        workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
+            spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
-        ValueError: if the folder holds no picture or none that can be read, or ``out`` holds pairs of other settings.
+        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings.
         OSError: if a worker dies.
     """
     start = time.perf_counter()
@@ -132,10 +132,10 @@ def synth(
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
     if format not in ("dng", "npz", "tiff") or per_image < 1:
-        raise ValueError(f"format is dng, npz or tiff, and per_image at least 1; got {format} and {per_image}")
+        raise ValueError(f"format must be dng, npz or tiff and per_image at least 1, got {format} and {per_image}")
     if workers is not None and workers < 0:
-        raise ValueError(f"workers is at least 0, got {workers}")
-    augmentation(weights, levels, sampling)  # a wrong name is told here, not by a worker
+        raise ValueError(f"workers must be at least 0, got {workers}")
+    augmentation(weights, levels, sampling)  # raises for a wrong name here, not in a worker
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
     tasks = list(_tasks(pictures, source, out, per_image))
@@ -157,10 +157,10 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     if not source.is_dir():
         raise FileNotFoundError(f"{source}: no such folder of pictures")
     if out.resolve().is_relative_to(source):
-        raise ValueError(f"{out}: the pairs would lie among the pictures of {source}; choose a folder outside")
+        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     pictures = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
     if not pictures:
-        raise ValueError(f"{source}: holds no picture; known are {', '.join(EXTENSIONS)}")
+        raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
     return pictures
 
 
@@ -172,7 +172,9 @@ def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Ite
         bare = picture.with_suffix("")
         own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
         if taken.setdefault(own, picture) != picture:
-            raise ValueError(f"{picture}: its pairs would have the names of those of {taken[own].name}; rename one")
+            raise ValueError(
+                f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
+            )
         stem = out / own.relative_to(source)
         missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
         yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
@@ -183,10 +185,10 @@ def _numbered(stem: Path, number: int) -> Path:
 
 
 def require_same_settings(path: Path, settings: dict[str, object]) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with what is there.
+    """Write the settings of a folder's files to ``path``, or compare them with those in it.
 
     Raises:
-        ValueError: if the files that are there were made with others.
+        ValueError: if the existing files were made with other settings.
     """
     if path.is_file():
         try:
@@ -207,7 +209,7 @@ _settings: _Settings
 
 
 def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Iterator[tuple[_Task, str | None]]:
-    """Every task as it is finished, with why it could not be, if so."""
+    """Each task as it finishes, with the reason if it failed."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
     if workers < 1:
         _prepare(settings)
@@ -221,13 +223,13 @@ def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Itera
         for future in as_completed(futures):
             yield futures[future], future.result()
     except BrokenProcessPool:
-        raise OSError("a worker died, for lack of memory?; the same command goes on; try fewer --workers") from None
+        raise OSError("a worker died, perhaps out of memory; run it again to resume, with fewer --workers") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def _start_worker(settings: _Settings) -> None:
-    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent is no more."""
+    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent has died."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -248,7 +250,7 @@ def _prepare(settings: _Settings) -> None:
 
 
 def _make(task: _Task) -> str | None:
-    """Make the missing pairs of a picture; why it cannot be read, if so."""
+    """Make the missing pairs of a picture; the reason if it cannot be read."""
     try:
         srgb = even_sided(read_picture(task.picture))
     except (OSError, ValueError) as error:

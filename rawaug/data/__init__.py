@@ -1,7 +1,7 @@
 """What is read: pictures, RAW files, published datasets and the built-in demo data.
 
 They come as datasets of sRGB pictures (:func:`open_pictures`) or as RAW-sRGB pairs (:func:`open_pairs`); what has no
-clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for what is to be handed in.
+clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writer for submissions.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ def open_pairs(spec: str, split: str = "test") -> Sequence[Pair]:
         return RawFolder(path)
     if kind not in _PAIR_KINDS:
         known = ", ".join(f"{name}:" for name in _PAIR_KINDS)
-        raise ValueError(f"{spec}: no such kind of data; there are {known} or the path of a RAW file or folder")
+        raise ValueError(f"{spec}: unknown kind of data; use {known} or the path of a RAW file or folder")
     if kind != "demo" and not path:
-        raise ValueError(f"{spec}: say where the data are, {kind}:PATH")
+        raise ValueError(f"{spec}: has no path; write {kind}:PATH")
     path, named = _path_and_split(path)
     return _PAIR_KINDS[kind](path, named or split)
 
@@ -100,7 +100,7 @@ def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
 
     Args:
         spec: ``"demo:"`` or the path of a folder.
-        min_side: smaller pictures of a folder are skipped and told; give the side of your crops.
+        min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
@@ -109,7 +109,7 @@ def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
     if kind is None:
         return PictureFolder(path, min_side)
     if kind != "demo" or path:
-        raise ValueError(f"{spec}: no such kind of pictures; there are demo: or the path of a folder")
+        raise ValueError(f"{spec}: unknown kind of pictures; use demo: or the path of a folder")
     return demo_pictures()
 
 
@@ -131,12 +131,10 @@ def _sidd(path: str, split: str) -> Sequence[Pair]:
     if split == "test":
         return SiddBlocks(path)
     raise ValueError(
-        f"sidd:{path}: has no split {split}: train are the full frames, test the validation blocks; "
-        "validate on a folder of other frames, or on none"
+        f"sidd:{path}: no split {split}; use train (full frames) or test (validation blocks), "
+        "and another folder, or null, for validation"
     )
 
 
 def _no_clean_frames(path: str) -> Sequence[Pair]:
-    raise ValueError(
-        f"dnd:{path}: the clean frames of DND are not public; read it as rawaug.data.Dnd and hand in results"
-    )
+    raise ValueError(f"dnd:{path}: the clean frames of DND are not public; use rawaug.data.Dnd and submit the results")

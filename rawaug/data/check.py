@@ -1,8 +1,8 @@
-"""What is in a folder: which dataset, how much of it, of which sizes, patterns and levels, and what is broken.
+"""Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
-Everything is read once, as training would read it. A folder is recognised by the names that its publishers gave to the
-files; what has none of these is a folder of RAW files, of pictures, or both. Reading takes place in a process of its
-own: where a damaged file crashes the library that decodes it, the file is named, and another process goes on. (RAW
+Everything is read once, as training would read it. A folder is recognised by its publisher's file
+names; anything else is a folder of RAW files, of pictures, or both. Reading takes place in a separate process: where a
+damaged file crashes its decoder, the file is named and a new process continues. (RAW
 files are read in this one: LibRaw's threads do not survive a fork.)
 """
 
@@ -43,11 +43,11 @@ class PartReport:
     """One kind of data in a folder.
 
     Attributes:
-        what: it was recognised as.
+        what: the kind of data.
         items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
         sizes, cfas, cameras, levels: how often each occurs among those that could be read.
         signal: least and greatest value of RAW.
-        broken: one line each, naming the file.
+        broken: one line per damaged file, with its name.
     """
 
     what: str
@@ -61,7 +61,7 @@ class PartReport:
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: PartReport) -> None:
-        """Count what another report tells; one damaged file of many blocks is one line."""
+        """Add another report's counts; a damaged file of many blocks is one line."""
         for name in ("sizes", "cfas", "cameras", "levels"):
             getattr(self, name).update(getattr(other, name))
         if other.signal is not None:
@@ -70,17 +70,17 @@ class PartReport:
         self.broken += [line for line in other.broken if line not in self.broken]
 
     def __str__(self) -> str:
-        examined = "" if self.examined == self.items else f", {self.examined} of them examined"
+        examined = "" if self.examined == self.items else f", {self.examined} examined"
         lines = [f"{self.what}: {self.items}{examined}"]
         for name in ("sizes", "cfas", "cameras", "levels"):
             counts: Counter[str] = getattr(self, name)
             if counts:
-                more = f", {len(counts) - _SHOWN} others" if len(counts) > _SHOWN else ""
+                more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
                 shown = ", ".join(f"{value} ({count})" for value, count in counts.most_common(_SHOWN))
                 lines.append(f"  {name}: {shown}{more}")
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
-        lines.append(f"  broken: {len(self.broken) or 'none'}")
+        lines.append(f"  damaged: {len(self.broken) or 'none'}")
         return "\n".join([*lines, *(f"    {line}" for line in self.broken)])
 
 
@@ -100,29 +100,29 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None) -> DataReport:
-    """Recognise what is in a folder (or a file to be handed in to SIDD) and read it.
+    """Identify the data in a folder (or a SIDD submission) and read it.
 
     Args:
         path: a folder, a RAW file, or a SIDD submission.
-        first: read only so many of each kind.
+        first: read at most this many items of each kind.
 
     Raises:
         FileNotFoundError: if there is no such path.
-        ValueError: if nothing in it is known.
+        ValueError: if it contains no known data.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file() and path.suffix in (".csv", ".mat"):
-        return DataReport(path, [_part("submission to SIDD", lambda: list(check_submission(path)), first)])
+        return DataReport(path, [_part("SIDD submission", lambda: list(check_submission(path)), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
-        raise ValueError(f"{path}: holds no dataset, RAW file or picture that is known; see the page on datasets")
+        raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
     return DataReport(path, [_part(what, open_part, first) for what, open_part in known])
 
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The published datasets that the names in a folder tell of, and how to open each."""
+    """The published datasets recognised by file names, and how to open each."""
     files = {name for _, _, names in os.walk(path) for name in names}
     scenes = {Path(parent) for parent, _, names in os.walk(path) if is_scene(Path(parent).name) and names}
     if any("GT_RAW" in file.name.upper() for scene in scenes for file in scene.iterdir()):
@@ -130,11 +130,11 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
         yield "SIDD, validation blocks", lambda: SiddBlocks(path)
     if "BenchmarkNoisyBlocksRaw.mat" in files:
-        yield "SIDD, benchmark blocks (noisy alone)", lambda: SiddBenchmark(path)
+        yield "SIDD, benchmark blocks (noisy only)", lambda: SiddBenchmark(path)
     if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
         yield "SIDD+, validation blocks", lambda: SiddPlusBlocks(path)
     if (path / "info.mat").is_file():
-        yield "DND, boxes (noisy alone)", lambda: Dnd(path)
+        yield "DND, boxes (noisy only)", lambda: Dnd(path)
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
@@ -194,13 +194,13 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
     for facts in found:
         part.add(facts)
     if len(found) < part.examined:
-        part.broken.append(f"nothing is read after {_CRASHES} crashes; replace these files first")
+        part.broken.append(f"stopped after {_CRASHES} crashes; replace these files first")
         part.examined = len(found)
     return part
 
 
 class _Facts(Dataset[PartReport]):
-    """What a report tells of each item by itself."""
+    """One report per item."""
 
     def __init__(self, items: Any) -> None:
         self.items = items
@@ -232,7 +232,7 @@ def _facts(items: Any, count: int) -> list[PartReport]:
             if not (crash := re.search(r"DataLoader worker.*(killed by signal.*|exited.*)", str(error))):
                 raise
             crashes += 1
-            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes its decoder ({crash[1]})"]))
+            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes the decoder ({crash[1]})"]))
     return found
 
 

@@ -1,4 +1,4 @@
-r"""Colour of frames whose files tell it as a DNG does, and their plain development.
+r"""Colour from DNG-style metadata, and a plain development.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
@@ -28,7 +28,7 @@ def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
     """
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ _XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
-        raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is no matrix from XYZ to a camera")
+        raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is not a valid XYZ-to-camera matrix")
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
 
 

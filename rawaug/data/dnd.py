@@ -68,7 +68,7 @@ class Dnd(Sequence[DndCrop]):
         info = self.path / "info.mat"
         frames = read_value(info, "info")
         if not isinstance(frames, list):
-            raise ValueError(f"{info}: info is no struct array over the frames")
+            raise ValueError(f"{info}: info is not a struct array over the frames")
         self.frames = [_Frame.of(frame, info, k) for k, frame in enumerate(frames)]
         missing = [file for file in map(self.file, range(len(frames))) if not file.is_file()]
         if missing:
@@ -94,7 +94,7 @@ class Dnd(Sequence[DndCrop]):
         frame, noisy = self.frames[k], self._noisy(k)
         top, left, bottom, right = frame.boxes[box]
         if not (0 <= top < bottom <= noisy.shape[0] and 0 <= left < right <= noisy.shape[1]):
-            raise ValueError(f"{self.file(k)}: box {box + 1} of info.mat leaves the frame of {noisy.shape}")
+            raise ValueError(f"{self.file(k)}: box {box + 1} of info.mat extends beyond the frame {noisy.shape}")
         return DndCrop(
             name=f"{k + 1:04d}_{box + 1:02d}",
             noisy=torch.from_numpy(np.ascontiguousarray(noisy[top:bottom, left:right]))[None],
@@ -110,7 +110,9 @@ class Dnd(Sequence[DndCrop]):
             frame = read_array(self.file(k), "Inoisy")
             low, high = float(frame.min()), float(frame.max())
             if frame.ndim != 2 or not (low > -1 and high <= 1):
-                raise ValueError(f"{self.file(k)}: Inoisy {frame.shape} runs from {low:.4g} to {high:.4g}, not to 1")
+                raise ValueError(
+                    f"{self.file(k)}: Inoisy {frame.shape} has values from {low:.4g} to {high:.4g}, expected at most 1"
+                )
             self._last = k, frame.astype(np.float32)
         return self._last[1]
 
@@ -159,14 +161,16 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
     cells, count = np.empty(BOXES, object), 0
     for mosaic in denoised:
         if mosaic.ndim != 3 or mosaic.shape[0] != 1 or not mosaic.isfinite().all():
-            raise ValueError(f"box {count}: a denoised box is finite, of shape (1, H, W), got {tuple(mosaic.shape)}")
+            raise ValueError(
+                f"box {count}: a denoised box must be finite with shape (1, H, W), got {tuple(mosaic.shape)}"
+            )
         cells[count % BOXES] = mosaic[0].detach().cpu().float().numpy()
         count += 1
         if count % BOXES == 0 and count <= FRAMES * BOXES:
             content = {"Idenoised": cells, "israw": True, "eval_version": _EVALUATION}
             savemat(folder / f"{count // BOXES:04d}.mat", content)
     if count != FRAMES * BOXES:
-        raise ValueError(f"{folder}: a submission has {FRAMES * BOXES} boxes, got {count}")
+        raise ValueError(f"{folder}: a submission must have {FRAMES * BOXES} boxes, got {count}")
 
 
 def check_dnd_submission(folder: str | Path, dnd: Dnd) -> None:
@@ -180,12 +184,12 @@ def check_dnd_submission(folder: str | Path, dnd: Dnd) -> None:
         file = Path(folder) / f"{k + 1:04d}.mat"
         boxes = list(np.atleast_1d(np.asarray(read_value(file, "Idenoised"))))
         if len(boxes) != len(frame.boxes) or not int(read_value(file, "israw")):
-            raise ValueError(f"{file}: holds {len(boxes)} RAW boxes, not {len(frame.boxes)}")
+            raise ValueError(f"{file}: contains {len(boxes)} RAW boxes, expected {len(frame.boxes)}")
         for number, (box, (top, left, bottom, right)) in enumerate(zip(boxes, frame.boxes, strict=True), 1):
             if box.shape != (bottom - top, right - left) or box.dtype != np.float32:
                 expected = (bottom - top, right - left)
-                raise ValueError(f"{file}: box {number} is float32 {expected}, got {box.dtype} {box.shape}")
+                raise ValueError(f"{file}: box {number} must be float32 {expected}, got {box.dtype} {box.shape}")
             if not (np.isfinite(box).all() and box.min() >= 0 and box.max() <= 1):
                 raise ValueError(
-                    f"{file}: box {number} runs from {box.min():.4g} to {box.max():.4g}; clip it to [0, 1]"
+                    f"{file}: box {number} has values from {box.min():.4g} to {box.max():.4g}; clip it to [0, 1]"
                 )

@@ -70,9 +70,9 @@ def fivek_numbers(camera: str, split: str) -> list[str]:
     """
     splits = _splits()
     if camera not in CAMERAS:
-        raise ValueError(f"fivek: no camera {camera}; there are {', '.join(CAMERAS)}")
+        raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")
     if split not in splits[camera]:
-        raise ValueError(f"fivek: no split {split}; InvISP's are {', '.join(splits[camera])}")
+        raise ValueError(f"fivek: no split {split}; use one of InvISP's: {', '.join(splits[camera])}")
     return splits[camera][split].split()
 
 

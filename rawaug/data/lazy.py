@@ -13,7 +13,7 @@ class LazyPairs(Sequence[Pair], ABC):
     """A sequence of pairs that reads one at a time; the last one stays in memory.
 
     Args:
-        names: of the pairs, told without reading any.
+        names: of the pairs, known without reading any.
     """
 
     def __init__(self, names: Sequence[str]) -> None:

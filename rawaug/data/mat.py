@@ -1,4 +1,4 @@
-"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, told apart by their header.
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header.
 
 A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
 naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
@@ -38,7 +38,7 @@ def mat_version(path: str | Path) -> str:
         return "7.3"
     if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
         return "5"
-    raise ValueError(f"{path}: is no MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
+    raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
@@ -54,7 +54,7 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
     """
     value = _read(Path(path), name, plain=False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: {name} is no numeric array, but {type(value).__name__}")
+        raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
     return value
 
 
@@ -71,7 +71,7 @@ def read_value(path: str | Path, name: str) -> Any:
 def _read(path: Path, name: str, plain: bool) -> Any:
     if mat_version(path) == "5":
         return _read_5(path, name, plain)
-    with _damage_told(path):
+    with _as_os_error(path):
         import h5py
 
         with h5py.File(path, "r") as file:
@@ -83,7 +83,7 @@ def _read(path: Path, name: str, plain: bool) -> Any:
 def _read_5(path: Path, name: str, plain: bool) -> Any:
     from scipy.io import loadmat, whosmat
 
-    with _damage_told(path):
+    with _as_os_error(path):
         variables = loadmat(path, variable_names=[name], simplify_cells=plain)
         if name not in variables:
             raise _missing(path, name, [found for found, *_ in whosmat(path)])
@@ -91,7 +91,7 @@ def _read_5(path: Path, name: str, plain: bool) -> Any:
 
 
 @contextmanager
-def _damage_told(path: Path) -> Iterator[None]:
+def _as_os_error(path: Path) -> Iterator[None]:
     """The many ways in which the libraries fail on a damaged file as one OSError that names it."""
     import zlib
 
@@ -111,7 +111,7 @@ class _Missing(ValueError):
 
 
 def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
-    return _Missing(f"{path}: holds no variable {name}, but {', '.join(existing) or 'none'}")
+    return _Missing(f"{path}: has no variable {name}; its variables are: {', '.join(existing) or 'none'}")
 
 
 def _plain(node: Any, file: Any) -> Any:

@@ -51,11 +51,11 @@ class Pair:
         if self.noisy is not None:
             self._require_shape("noisy", self.noisy, 1, torch.float32)
         if any(side % 2 or side == 0 for side in self.raw.shape[-2:]):
-            raise ValueError(f"pair {self.name}: a mosaic has even sides, got {tuple(self.raw.shape)}")
+            raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {tuple(self.raw.shape)}")
         if self.color_matrix.shape != (3, 3):
-            raise ValueError(f"pair {self.name}: color_matrix is (3, 3), got {tuple(self.color_matrix.shape)}")
+            raise ValueError(f"pair {self.name}: color_matrix must be (3, 3), got {tuple(self.color_matrix.shape)}")
         if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
-            raise ValueError(f"pair {self.name}: shot_var and read_var come together, and with a noisy mosaic")
+            raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
 
     def with_levels(self) -> Pair:
         """This pair; the levels of a noisy capture that came without are measured against ``raw``."""
@@ -74,4 +74,6 @@ class Pair:
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])
         if tuple(image.shape) != expected or image.dtype != dtype:
-            raise ValueError(f"pair {self.name}: {field} is {dtype} {expected}, got {image.dtype} {tuple(image.shape)}")
+            raise ValueError(
+                f"pair {self.name}: {field} must be {dtype} {expected}, got {image.dtype} {tuple(image.shape)}"
+            )

@@ -2,8 +2,8 @@
 
 Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
 cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
-whatever order, with any number of workers. What was found lies in memory that all workers share, so that the process
-which made the dataset can tell it, and so that nobody opens a bad file twice.
+whatever order, with any number of workers. Damaged files are marked in memory shared by all workers, so that
+the main process can report them and no worker opens one twice.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
     After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
-    a warning; :attr:`skipped` and :meth:`report` tell them at any time.
+    a warning; :attr:`skipped` and :meth:`report` list them at any time.
 
     Args:
         path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
-        min_side: smaller pictures are skipped; give the side of your crops. A mosaic has sides of 2 at least.
+        min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
         max_pixels: larger pictures are skipped.
         allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
 
@@ -48,7 +48,7 @@ class PictureFolder(Dataset[Tensor]):
         >>> pictures[0].shape  # doctest: +SKIP
         torch.Size([3, 375, 500])
         >>> print(pictures.report())  # doctest: +SKIP
-        photographs: all of its 25000 pictures that were read are fine
+        photographs: none of 25000 pictures skipped so far
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class PictureFolder(Dataset[Tensor]):
         self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
         self.names = _Names(sorted(_listed(self.path)))
         if not len(self.names):
-            raise ValueError(f"{path}: holds no picture; known are {', '.join(EXTENSIONS)}")
+            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
         self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
         self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
-        self._epochs_told = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._reasons: dict[int, str] = {}
 
     def __len__(self) -> int:
@@ -90,7 +90,7 @@ class PictureFolder(Dataset[Tensor]):
         picture = read_picture(file, self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
-            raise ValueError(f"{file}: is {size}, a side below {self.min_side}; leave it out")
+            raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
         return picture
 
     @property
@@ -99,14 +99,16 @@ class PictureFolder(Dataset[Tensor]):
         bad = self._bad.nonzero()[:, 0].tolist()
         for index in bad:
             if index not in self._reasons:  # met by a worker: ask the file again
-                self._reasons[index] = self._fault(index) or f"{self.path / self.names[index]}: can be read by now"
+                self._reasons[index] = (
+                    self._fault(index) or f"{self.path / self.names[index]}: was damaged, but is readable now"
+                )
         return {self.path / self.names[index]: self._reasons[index] for index in bad}
 
     def report(self) -> str:
         """What was skipped so far, one line a file."""
         skipped = self.skipped
         if not skipped:
-            return f"{self.path}: all of its {len(self)} pictures that were read are fine"
+            return f"{self.path}: none of {len(self)} pictures skipped so far"
         return "\n".join([f"{self.path}: {len(skipped)} of {len(self)} pictures skipped", *skipped.values()])
 
     def _judged(self, index: int) -> Tensor | None:
@@ -121,8 +123,8 @@ class PictureFolder(Dataset[Tensor]):
             names = [f"{self.path / self.names[i]}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
             more = f" and {count - _NAMED} more" if count > _NAMED else ""
             raise ValueError(
-                f"{self.path}: {count} of {len(self)} pictures cannot be used, above the allowed share of "
-                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; the last because {self._reasons[index]}"
+                f"{self.path}: {count} of {len(self)} pictures are unusable, more than allowed_share "
+                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
             )
         return None
 
@@ -134,12 +136,12 @@ class PictureFolder(Dataset[Tensor]):
         return None
 
     def _count(self) -> None:
-        """Count a reading; whoever completes an epoch tells what was skipped (two may, if they do so at once)."""
+        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
         worker = get_worker_info()
         self._read[(0 if worker is None else 1 + worker.id) % _COUNTERS] += 1
         epoch = int(self._read.sum()) // len(self)
-        if epoch > self._epochs_told[0]:
-            self._epochs_told[0] = epoch
+        if epoch > self._epochs_logged[0]:
+            self._epochs_logged[0] = epoch
             if self._bad.any():
                 _log.warning("%s", self.report())
 

@@ -35,7 +35,7 @@ class RawFolder(LazyPairs):
 
     Args:
         path: where the RAW files are.
-        camera_jpeg: False takes LibRaw's rendering always.
+        camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
 
     Raises:
@@ -56,7 +56,7 @@ class RawFolder(LazyPairs):
         if missing:
             raise FileNotFoundError(f"{missing[0]}: no such RAW file")
         if not self.files:
-            raise ValueError(f"{path}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
+            raise ValueError(f"{path}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}")
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr = adjust_maximum_thr
         super().__init__(_names(self.files))
@@ -73,8 +73,8 @@ class RawFolder(LazyPairs):
             if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
                 frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
                 return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
-            told = "{} x {} beside a RAW file of {} x {}".format(*sides)
-            warnings.warn(f"{jpeg}: {told}; LibRaw's rendering is taken instead of it", stacklevel=2)
+            sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
+            warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
         return _pair(self.names[index], *read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
 
 
@@ -85,7 +85,7 @@ def _centre(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """Stems, with as much of the path before them as tells equal ones apart."""
+    """File stems, or paths where two stems are equal."""
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         above = os.path.commonpath([file.resolve().parent for file in files])

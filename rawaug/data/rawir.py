@@ -2,8 +2,8 @@
 
 A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
 be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
-Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). No file tells white balance or colour
-matrix in a way that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). There is no white balance or colour
+matrix in a form that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
 
 The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
 "Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
@@ -49,7 +49,7 @@ class Rawir(LazyPairs):
     def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
         folder, self.white = Path(path), white
         if split not in _SPLITS:
-            raise ValueError(f"rawir: no split {split}; there are {', '.join(_SPLITS)}")
+            raise ValueError(f"rawir: no split {split}; use one of {', '.join(_SPLITS)}")
         if not folder.is_dir():
             raise FileNotFoundError(f"{path}: no such folder of RAWIR")
         if any((folder / name).is_dir() for name in _SPLITS.values()):
@@ -58,7 +58,7 @@ class Rawir(LazyPairs):
             Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(".npy")
         )
         if not self.files:
-            raise ValueError(f"{folder}: holds no .npy file of RAWIR")
+            raise ValueError(f"{folder}: contains no .npy file of RAWIR")
         self.pictures = [picture_beside(file) for file in self.files]
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
 
@@ -69,10 +69,10 @@ class Rawir(LazyPairs):
         except (OSError, ValueError, EOFError) as error:
             raise OSError(f"{file}: cannot be read as an array ({error}); copy it again") from error
         if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u":
-            raise ValueError(f"{file}: packed RAW is unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
+            raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
         white = self.white or WHITE[picture.suffix.lower()]
         if numbers.max() > white:
-            raise ValueError(f"{file}: holds {numbers.max()}, above white at {white:g}; give white=")
+            raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
         packed = torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
         return Pair(
             name=self.names[index],
@@ -89,12 +89,12 @@ def picture_beside(file: Path) -> Path:
     """The picture of the same stem.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such picture.
     """
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
             return file.with_suffix(suffix)
-    raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; get both")
+    raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; download it too")
 
 
 def _is_p20(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures that stay in memory after they were first decoded: what a training on a few hundred photographs wants."""
+"""Pictures kept in memory once decoded, for training on a few hundred photographs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch.utils.data import Dataset
 
 
 class Remembered(Dataset[Tensor]):
-    """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read anew each time.
+    """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read again each time.
 
-    Every worker process remembers on its own. All else (``skipped``, ``report``, ...) is the dataset's.
+    Each worker process has its own cache. All else (``skipped``, ``report``, ...) is the dataset's.
 
     Example:
         >>> import torch

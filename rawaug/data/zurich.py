@@ -4,7 +4,7 @@ r"""Zurich RAW to RGB: crops of a Huawei P20's RAW, and of the same scenes by a 
 
 for the numbers d of ``SPLIT/huawei_raw/0.png``, a PNG of 16 bits with 10 of them used, RGGB, 448 x 448; the picture is
 ``SPLIT/canon/0.jpg``. It was taken by another camera from another place: the pairs are not registered, and no camera's
-ISP leads from one to the other. The files tell no white balance: gains are 1, the colour matrix is the identity.
+ISP leads from one to the other. The files have no white balance: gains are 1, the colour matrix is the identity.
 
 Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing mobile camera ISP with a single deep learning model", CVPR
 workshops 2020, whose loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning
@@ -47,18 +47,18 @@ class Zurich(LazyPairs):
 
     def __init__(self, path: str | Path, split: str = "train", black: float = BLACK, white: float = WHITE) -> None:
         if split not in ("train", "test"):
-            raise ValueError(f"zurich: no split {split}; there are train and test")
+            raise ValueError(f"zurich: no split {split}; use train or test")
         folder = Path(path) / split
         if not (folder / "huawei_raw").is_dir():
             raise FileNotFoundError(f"{folder / 'huawei_raw'}: no such folder of Zurich RAW to RGB")
         self.files = sorted((folder / "huawei_raw").glob("*.png"), key=lambda file: (len(file.stem), file.stem))
         if not self.files:
-            raise ValueError(f"{folder / 'huawei_raw'}: holds no PNG")
+            raise ValueError(f"{folder / 'huawei_raw'}: contains no PNG")
         existing = {file.name for file in (folder / "canon").glob("*.jpg")}
         missing = [file for file in self.files if f"{file.stem}.jpg" not in existing]
         if missing:
             raise FileNotFoundError(
-                f"{folder / 'canon' / missing[0].stem}.jpg: is missing, with {len(missing) - 1} others"
+                f"{folder / 'canon' / missing[0].stem}.jpg: is missing, and {len(missing) - 1} others"
             )
         self.folder, self.black, self.white = folder, black, white
         super().__init__([f"{split}_{file.stem}" for file in self.files])
@@ -68,7 +68,9 @@ class Zurich(LazyPairs):
         numbers = read_plane(file)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
-            raise ValueError(f"{file}: holds {numbers.max()}, more than {_BITS} bits; it is no RAW of this dataset")
+            raise ValueError(
+                f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is not a RAW of this dataset"
+            )
         light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
         return Pair(
             name=self.names[index],

@@ -1,7 +1,7 @@
-"""The page of a run: one HTML file that needs nothing beside it, with curves, tables and pictures.
+"""The page of a run: one self-contained HTML file with curves, tables and pictures.
 
-RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Of each frame the whole clean picture
-stands there once, and the window with most detail of it at twice its size: noisy, of every arm, clean.
+RAW is shown by the same fixed development as in :mod:`rawaug.evaluation.tables`. Each frame is shown
+whole and clean, with its most detailed window at twice the size: noisy, from every arm, and clean.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import html
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ WHOLE = 640
 """Largest width of a whole frame on the page, in pixels."""
 
 ON_PAGE = 12
-"""Frames on the page at most."""
+"""Largest number of frames on the page."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
@@ -63,7 +64,7 @@ class Page:
 
     def add_curves(self, png: bytes) -> None:
         """A figure as :func:`draw_curves` makes it."""
-        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'curves of training')}</p>", "<h2>Pictures</h2>"]
+        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'training curves')}</p>", "<h2>Pictures</h2>"]
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
@@ -80,7 +81,7 @@ class Page:
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"<figcaption>whole frame, clean; the window is at row {2 * top}, column {2 * left}</figcaption>"
+        caption = f"<figcaption>whole frame, clean; window at row {2 * top}, column {2 * left}</figcaption>"
         figures.append(f"<figure>{_picture(encode_png(whole), 'whole frame')}{caption}</figure>")
         self.parts.append(f'<h3>{html.escape(row.pair.name)}</h3><div class="frame">{"".join(figures)}</div>')
 
@@ -122,20 +123,28 @@ def encode_png(srgb: Tensor) -> bytes:
 
 
 def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
-    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm."""
+    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm.
+
+    Thin lines are the thirds of the validation frames with least (dotted), middling and most noise (dash-dotted).
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    axes = dict(zip(("loss", "psnr"), figure.subplots(1, 2), strict=True))
+    lines = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
+    figure = Figure(figsize=(15, 3.6), layout="constrained")
+    axes = dict(zip(("loss", "psnr", "psnr_srgb"), figure.subplots(1, 3), strict=True))
     for colour, (arm, paths) in enumerate(logs.items()):
         for k, path in enumerate(paths):
             with path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
-            for key, axis in axes.items():
-                points = ([int(row["step"]) for row in rows], [float(row[key]) for row in rows])
-                axis.plot(*points, color=f"C{colour % 10}", linewidth=1.2, label=None if k else arm)
+            for key, part in product(axes, lines):
+                points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
+                width, label = (0.7, None) if part else (1.4, None if k else arm)
+                style = {"color": f"C{colour % 10}", "linestyle": lines[part], "linewidth": width, "label": label}
+                if points:
+                    axes[key].plot(*zip(*points, strict=True), **style)
     axes["loss"].set(xlabel="step", ylabel="loss", yscale="log")
-    axes["psnr"].set(xlabel="step", ylabel="validation PSNR (dB)")
+    axes["psnr"].set(xlabel="step", ylabel="validation PSNR, RAW (dB)")
+    axes["psnr_srgb"].set(xlabel="step", ylabel="validation PSNR, sRGB (dB)")
     axes["psnr"].legend(fontsize=8)
     file_like = io.BytesIO()
     figure.savefig(file_like, dpi=110)

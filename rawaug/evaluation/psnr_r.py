@@ -1,4 +1,4 @@
-"""PSNR_r of an ISP: how well it makes the RAW of frames from their sRGB."""
+"""PSNR_r of an ISP: how well it reconstructs RAW frames from their sRGB."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches:
     Args:
         isp: the ISP.
         pair: the frame.
-        white_balance: give the frame's as-shot white balance.
-        patches: score so many patches of a registered frame (:func:`windows_of`); None scores all.
+        white_balance: use the frame's as-shot white balance.
+        patches: score this many patches of a registered frame (:func:`windows_of`); None scores all.
     """
     given = pair.white_balance if white_balance else None
     if pair.registered:

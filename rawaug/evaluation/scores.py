@@ -33,7 +33,7 @@ TILE, OVERLAP = 1536, 96
 """Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
-"""Denoises the packed RAW of a sample; what it may know of the pair are the levels of the noise."""
+"""Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
 
 @torch.inference_mode()
 def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, maybe as a mean of views.
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
 
     Returns:
         The same shape, on the CPU.
@@ -129,14 +129,14 @@ CLASSICAL: dict[str, Callable[[], Classical]] = {
 
 
 def require_classical(names: Sequence[str]) -> None:
-    """Refuse a name that is no classical denoiser's.
+    """Check the name of a classical denoiser.
 
     Raises:
-        ValueError: naming those there are.
+        ValueError: if it is unknown.
     """
     for name in names:
         if name not in CLASSICAL:
-            raise ValueError(f"classical: {name} is unknown; there are {', '.join(CLASSICAL)}")
+            raise ValueError(f"classical: {name} is unknown; use one of {', '.join(CLASSICAL)}")
 
 
 def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:

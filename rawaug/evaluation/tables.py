@@ -1,4 +1,4 @@
-"""What an experiment ends with: a table, and a picture of noisy, denoised and clean side by side.
+"""The results of an experiment: a table, and a figure of noisy, denoised and clean side by side.
 
 RAW is developed for the eye by one fixed pipeline, the same for every panel of a row: bilinear demosaic, the frame's
 white balance and colour matrix, one exposure taken from the clean frame, the sRGB curve of IEC 61966-2-1.
@@ -75,7 +75,7 @@ COLUMNS = {
     "PSNR, sRGB": ("plain", "psnr_srgb"),
     "SSIM, sRGB": ("plain", "ssim_srgb"),
 }
-"""Of the table: which summary and which figure stand in each column."""
+"""Columns of the table: which summary and which figure."""
 
 QUARTERS = {
     f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")

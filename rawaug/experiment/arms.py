@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
+from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.camera_sampling import CameraSampler
@@ -19,6 +21,7 @@ from rawaug.training.camera_crops import CameraCrops
 from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
+from rawaug.training.validation import Watched, watched
 
 WATCHED = 16
 """Samples made from pictures on which a training without validation pairs is watched."""
@@ -40,6 +43,15 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     if arm.estimator == "neighbor2neighbor":
         return Neighbor2Neighbor(arm.gamma)
     return Supervised()
+
+
+def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """The ISP of the same camera behind another CFA; its tensors are shared."""
+    if isp.cfa == cfa:
+        return isp
+    other = copy.copy(isp)
+    other.config = replace(isp.config, cfa=str(cfa))
+    return other
 
 
 def training_stream(
@@ -97,7 +109,7 @@ def _of_atoms(arm: ArmConfig) -> Sampling:
 
 def validation_samples(
     recipe: Recipe, pairs: Sequence[Pair], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-) -> list[Sample]:
+) -> list[Watched]:
     """The frozen samples by which weights are chosen, the same in every arm and run.
 
     Args:
@@ -106,10 +118,12 @@ def validation_samples(
     augment = RawAugment(isp, noise)
     if recipe.self_supervised:
         frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
-        return held_out(frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED], isp.cfa)
+        frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
+        return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
     if pairs:
         side = recipe.data.validation_crop
-        return [frozen_sample(pair.middle(side) if side else pair, noise, isp.cfa, seed=0) for pair in pairs]
+        middles = (pair.middle(side) if side else pair for pair in pairs)
+        return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in middles]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
-    return [Sample(*(x[None] for x in sample)) for sample in drawn]
+    return [Watched(*(x[None] for x in sample)) for sample in drawn]

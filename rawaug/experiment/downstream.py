@@ -29,6 +29,7 @@ from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched
 
 WATCHED = 16
 """Samples made from the pictures on which training is watched."""
@@ -72,7 +73,7 @@ def psnr_d(
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
     crops = _crops(model, pictures, noise, config)
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
-    watched = [Sample(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
+    watched = [Watched(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
     net = train(
         stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
     )

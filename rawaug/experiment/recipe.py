@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rawaug.isp.fit import FitConfig
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -53,6 +53,8 @@ class ArmConfig:
         alpha: of noisier and r2r: strength of the extra noise.
         correct: of noisier: extrapolate the result, which takes its bias away.
         gamma: of neighbor2neighbor: weight of its second term.
+        denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
+        learning_rate: in place of ``train.learning_rate``; null takes that one.
     """
 
     augmented: float = 0.0
@@ -64,6 +66,8 @@ class ArmConfig:
     alpha: float = 1.0
     correct: bool = False
     gamma: float = 1.0
+    denoiser: DenoiserConfig | None = None
+    learning_rate: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
@@ -85,7 +89,9 @@ class Recipe:
         denoiser: the network.
         train: the loop.
         arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
-        classical: classical denoisers to compare with, such as Wavelet; see :mod:`denoisers.classical`.
+        classical: classical denoisers to compare with, such as Wavelet; see :mod:`denoisers.classical`. BM3D is left
+            out, with a line that says so, where its wheel is not installed.
+        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
         seeds: how many runs, with seeds ``seed``, ``seed + 1``, ...; more than one gives mean and spread.
@@ -103,6 +109,7 @@ class Recipe:
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str] = field(default_factory=list)
+    untouched: list[str] = field(default_factory=list)
     steps: int | None = None
     seed: int = 0
     seeds: int = 1
@@ -125,6 +132,15 @@ class Recipe:
         if any(supervised) and not all(supervised):
             raise ValueError("arms: supervised and self-supervised do not mix, since these must see no clean frame")
 
+    def network_of(self, arm: str) -> DenoiserConfig:
+        """The arm's network, else the recipe's."""
+        return self.arms[arm].denoiser or self.denoiser
+
+    def loop_of(self, arm: str) -> TrainConfig:
+        """How the arm is trained."""
+        rate = self.arms[arm].learning_rate
+        return self.train if rate is None else replace(self.train, learning_rate=rate)
+
     @property
     def self_supervised(self) -> bool:
         """Whether noisy frames are all that may be seen."""
@@ -132,8 +148,17 @@ class Recipe:
 
 
 def smoke(recipe: Recipe) -> Recipe:
-    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
-    tiny = {"UNet": {"width": 4, "scales": 2}, "DHDN": {"width": 4}, "DnCNN": {"width": 8, "depth": 3}}
+    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU.
+
+    No trained denoiser is read: what would continue from one starts from nothing.
+    """
+    tiny: dict[str, dict[str, Any]] = {
+        "UNet": {"width": 4, "scales": 2},
+        "DHDN": {"width": 4},
+        "DnCNN": {"width": 8, "depth": 3},
+        "PMRID": {"width": 2},
+        "NAFNet": {"width": 4, "encoder": [1], "middle": 1, "decoder": [1]},
+    }
     name = recipe.denoiser.name
     few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
     return replace(
@@ -147,6 +172,8 @@ def smoke(recipe: Recipe) -> Recipe:
         isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
         denoiser=DenoiserConfig(name, tiny.get(name, {})),
         train=replace(few, loss=recipe.train.loss),
+        arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
+        untouched=[],
         steps=None,
         seeds=1,
         device="cpu",

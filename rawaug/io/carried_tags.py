@@ -1,4 +1,4 @@
-"""What a RAW file rewritten as a DNG keeps of its source: camera, colour, lens corrections, EXIF, GPS, XMP.
+"""Metadata that a rewritten DNG keeps from its source: camera, colour, lens corrections, EXIF, GPS, XMP.
 
 Left out is what describes the old pixels (their layout, levels, digests, previews, noise profile) and what points into
 the old file (maker notes). The EXIF and GPS directories are copied value by value in their binary form.
@@ -21,7 +21,7 @@ _POINTERS = (37500, 40965)  # maker note, interoperability directory
 _SIZES = (0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8)
 """Bytes of a value of the TIFF types 0 to 12."""
 _VALUE = 8
-"""Where in an entry its value stands, or points."""
+"""Offset within an entry of its value, or of the pointer to it."""
 
 _OF_ANY_TIFF = (270, 271, 272, 306, 315, 700, 33432)
 _LAYOUT = (
@@ -117,7 +117,7 @@ def _fills_active_area(mosaic: Any, size: tuple[int, int]) -> bool:
 
 
 def _read(file: BinaryIO, order: str, pointer: int) -> list[Entry]:
-    """The directory whose offset stands at ``pointer``."""
+    """The directory whose offset is stored at ``pointer``."""
     (start,) = _unpack(file, order + "I", pointer)
     (count,) = _unpack(file, order + "H", start)
     entries = []
@@ -156,7 +156,7 @@ def append_directory(path: Path, name: str, entries: list[Entry]) -> None:
 
 
 def _pointer(file: BinaryIO, order: str, code: int) -> int:
-    """Where in the first directory the value of tag ``code`` stands."""
+    """Offset of the value of tag ``code`` in the first directory."""
     (first,) = _unpack(file, order + "I", 4)
     (count,) = _unpack(file, order + "H", first)
     places = range(first + 2, first + 2 + 12 * count, 12)

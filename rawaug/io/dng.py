@@ -44,10 +44,10 @@ def write_dng(
     Args:
         path: the file, in a folder that exists.
         frame: its mosaic is rounded to digital numbers by its own levels; orientation, colour, noise profile, exposure
-            and gain maps are told by tags. ``iso`` and ``exposure`` are written where there is no source with EXIF.
-        source: the RAW file that the frame was read from: what it tells besides (a DNG's profiles, opcodes and crop;
+            and gain maps are written as tags; ``iso`` and ``exposure`` too, unless the source has EXIF.
+        source: the RAW file that the frame was read from: its other metadata (a DNG's profiles, opcodes and crop;
             EXIF, GPS and XMP of any TIFF) is kept.
-        baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own is kept in its place.
+        baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own value takes precedence.
 
     Raises:
         ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain,
@@ -64,7 +64,7 @@ def write_dng(
     numbers = digital_numbers(frame, path)
     size = numbers.shape[0], numbers.shape[1]
     carried = read_carried_tags(Path(source), size) if source is not None else CarriedTags("<", {}, {})
-    # an Exif directory of our own where none is carried
+    # write an Exif directory if the source has none
     directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
     directories = {name: entries for name, entries in directories.items() if entries}
     own = _camera(frame) if _DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
@@ -95,11 +95,11 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
 def _require_colour(frame: RawFrame, path: Path) -> None:
     gains = (*frame.white_balance, *frame.daylight)
     if not all(math.isfinite(gain) and gain > 0 for gain in gains):
-        raise ValueError(f"{path}: white balance and daylight gains are positive, got {gains}")
+        raise ValueError(f"{path}: white balance and daylight gains must be positive, got {gains}")
     if not abs(float(torch.linalg.det(frame.color_matrix.double()))) > 1e-6:
-        raise ValueError(f"{path}: the colour matrix has no inverse, which a DNG needs")
+        raise ValueError(f"{path}: the colour matrix is singular; a DNG needs its inverse")
     if frame.orientation not in _EXIF_ORIENTATIONS:
-        raise ValueError(f"{path}: orientation is LibRaw's flip, one of 0 to 7, got {frame.orientation}")
+        raise ValueError(f"{path}: orientation must be a LibRaw flip from 0 to 7, got {frame.orientation}")
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
@@ -110,9 +110,11 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     """
     height, width = frame.mosaic.shape[-2:]
     if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
-        raise ValueError(f"{path}: a mosaic to write is (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
+        raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
-        raise ValueError(f"{path}: levels are 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
+        raise ValueError(
+            f"{path}: levels must satisfy 0 <= black < white <= 65535, got {frame.black} and {frame.white}"
+        )
     numbers = np.empty((height, width), np.uint16)
     for (i, j), black in zip(CFA(frame.cfa).sites, frame.black, strict=True):
         plane = frame.mosaic[0, i::2, j::2].double().mul_(frame.white - black).add_(black).round_()
@@ -132,7 +134,7 @@ def _camera(frame: RawFrame) -> dict[int, Tag]:
 
 
 def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
-    """What a DNG source tells by itself, or does not tell."""
+    """Tags that a DNG source has itself, or lacks on purpose."""
     tags: list[Tag] = [
         (_DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
         (50707, BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0)), True),
@@ -203,7 +205,7 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
     numbers = []
     for value in values:
         if not abs(value) <= _LARGEST:
-            raise ValueError(f"{value:g} does not fit a DNG; check the frame's gains, matrix and exposure")
+            raise ValueError(f"{value:g} does not fit a DNG rational; check the frame's gains, matrix and exposure")
         fits = min(denominator, int(_LARGEST / max(abs(value), 1)))
         numbers += [round(value * fits), fits]
     return tuple(numbers)

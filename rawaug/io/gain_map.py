@@ -1,4 +1,4 @@
-r"""Lens shading as a DNG tells it: the GainMap opcodes of its OpcodeList2 and OpcodeList3.
+r"""Lens shading in DNG: the GainMap opcodes of its OpcodeList2 and OpcodeList3.
 
     corrected(i, j) = gain((i + 1/2) / H, (j + 1/2) / W) y(i, j)
 
@@ -33,7 +33,7 @@ class GainMap:
 
     Attributes:
         area: top, left, bottom, right in pixels of the visible frame.
-        pitch: every so many rows and columns of ``area``, from its first on.
+        pitch: step in rows and columns within ``area``.
         planes: first colour plane, and how many.
         origin, spacing: of the grid, (vertical, horizontal), in parts of the frame's height and width.
         gains: float32 ``(P, V, H)``; further planes than P take the last one.
@@ -50,10 +50,10 @@ class GainMap:
 
 
 def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
-    """The gain maps of an opcode list; its other opcodes are passed over.
+    """The gain maps of an opcode list; its other opcodes are skipped.
 
     Raises:
-        ValueError: if the list ends in the middle of an opcode, or a grid is empty or makes no sense.
+        ValueError: if the list ends in the middle of an opcode, or a grid is empty or invalid.
     """
     maps = []
     try:
@@ -65,7 +65,7 @@ def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
                 maps.append(_parse(opcodes[place : place + size], on_mosaic))
             place += size
     except struct.error as error:
-        raise ValueError(f"the opcode list is cut short ({error})") from None
+        raise ValueError(f"the opcode list is truncated ({error})") from None
     return tuple(maps)
 
 
@@ -74,11 +74,13 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     rows, columns, points_v, points_h, *grid, map_planes = rest
     size = points_v * points_h * map_planes
     if size == 0 or min(rows, columns) == 0 or len(body) < _GRID.size + 4 * size:
-        raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is not whole")
+        raise ValueError(f"a gain map of {points_v} x {points_h} points and pitch {rows} x {columns} is incomplete")
     gains = np.frombuffer(body, ">f4", size, _GRID.size).reshape(points_v, points_h, map_planes)
     spaced = all(spacing > 0 for spacing, points in zip(grid[:2], (points_v, points_h), strict=True) if points > 1)
     if not (spaced and np.isfinite(grid).all() and np.isfinite(gains).all() and gains.min() > 0):
-        raise ValueError(f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and least gain {gains.min():g} is no map")
+        raise ValueError(
+            f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and smallest gain {gains.min():g} is invalid"
+        )
     return GainMap(
         area=(top, left, bottom, right),
         pitch=(rows, columns),

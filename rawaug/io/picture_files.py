@@ -25,7 +25,7 @@ from rawaug.bayer import turn
 from rawaug.io.icc import to_srgb
 
 MAX_PIXELS = 2**28
-"""Larger pictures (16384 x 16384) are refused unless told otherwise: a few bytes of header can claim any size."""
+"""Larger pictures (16384 x 16384) are refused by default, since a few header bytes can claim any size."""
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
@@ -60,8 +60,8 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        OSError: if the file is no picture, or is cut short.
-        ValueError: if its header tells more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
+        OSError: if the file is not a picture, or is truncated.
+        ValueError: if its header declares more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
             CIELAB, more than four channels, a damaged profile), or leave [0, 1].
 
     Example:
@@ -84,7 +84,7 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
-        raise ValueError(f"{path}: holds {pixels.dtype} in channels {names}; a mosaic is one channel of 8 or 16 bits")
+        raise ValueError(f"{path}: has {pixels.dtype} channels {names}; a mosaic must have one channel of 8 or 16 bits")
     return pixels[..., 0]
 
 
@@ -98,13 +98,13 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     import OpenImageIO as oiio
 
     if srgb.ndim != 3 or srgb.shape[0] != 3:
-        raise ValueError(f"{path}: a picture to write has shape (3, H, W), got {tuple(srgb.shape)}")
+        raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
     pixels = srgb.detach().cpu().permute(1, 2, 0).numpy()
     if pixels.dtype != np.uint8:
         pixels = _round_to_8_bits(pixels, Path(path))
     output = oiio.ImageOutput.create(str(path))
     if output is None:
-        raise ValueError(f"{path}: no picture format has this extension; use .png, .tif or .jpg ({oiio.geterror()})")
+        raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
     if not (output.close() and written):
@@ -113,7 +113,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 @contextmanager
 def _text_damage_told(path: Path) -> Iterator[None]:
-    """Texts of a damaged header that are no UTF-8 fail in OpenImageIO's binding."""
+    """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -143,8 +143,8 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
-    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python holds bytes that are no UTF-8
-        raise OSError(f"{os.fsencode(path)!r}: cannot be opened, its name is not UTF-8; rename it")
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
@@ -152,12 +152,12 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
     spec.attribute(_FORMAT, source.format_name())
     _require_size(spec, path, max_pixels)
     pixels = source.read_image(kind(spec))
-    error = source.geterror()  # set also where a decoder filled up a file that is cut short
-    # a GIF tells of its movement only where its frames have a duration
+    error = source.geterror()  # also set where a decoder padded a truncated file
+    # a GIF is marked as animated only if its frames have a duration
     moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
     source.close()
     if moves:
-        raise ValueError(f"{path}: is an animation; save one frame of it as a picture")
+        raise ValueError(f"{path}: is an animation; save a single frame")
     if pixels is None or error:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(error)})")
     return pixels, spec
@@ -173,8 +173,8 @@ def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
     """Refuse what would fill the memory before anything is decoded."""
     if spec.width * spec.height * spec.depth > max_pixels:
         raise ValueError(
-            f"{path}: its header tells {spec.height} x {spec.width} pixels, above the limit of {max_pixels}; "
-            "cut it up, or raise max_pixels"
+            f"{path}: declares {spec.height} x {spec.width} pixels, above the limit of {max_pixels}; "
+            "split it, or raise max_pixels"
         )
 
 
@@ -182,18 +182,20 @@ def _require_srgb(spec: Any, path: Path) -> None:
     """Refuse what would need a profile, or a choice of channels, to become sRGB."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
-        raise ValueError(f"{path}: holds {stored} colours; convert it to sRGB first")
+        raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
     names = tuple(spec.channelnames)
     extra = names[1:] if len(names) < 3 else names[3:]
     if extra not in ((), ("A",)):
-        raise ValueError(f"{path}: holds channels {', '.join(names)}; a picture has grey or R, G, B, and at most alpha")
+        raise ValueError(f"{path}: has channels {', '.join(names)}; expected grey or R, G, B, with optional alpha")
 
 
 def _round_to_8_bits(pixels: np.ndarray, path: Path, linear: bool = False) -> np.ndarray:
     """Floating point in [0, 1] to the nearest 8-bit level, through the sRGB transfer where the values are linear."""
     low, high = float(pixels.min()), float(pixels.max())
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
-        raise ValueError(f"{path}: values run from {low:.4g} to {high:.4g}, not in [0, 1]; scale or tone-map it first")
+        raise ValueError(
+            f"{path}: has values from {low:.4g} to {high:.4g}, expected [0, 1]; scale or tone-map it first"
+        )
     values = np.clip(pixels, 0, 1)
     if linear:
         values = encode_srgb(torch.from_numpy(values)).numpy()

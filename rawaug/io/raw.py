@@ -43,20 +43,20 @@ class RawFrame:
     Attributes:
         mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
         cfa: the pattern of ``mosaic``.
-        black: levels of the sites R, Gr, Gb, B, in digital numbers; with the fractions that a DNG tells.
+        black: levels of the sites R, Gr, Gb, B, in digital numbers, with a DNG's fractions.
         white: the saturated level, in digital numbers.
         white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
         daylight: the multipliers for the white of sRGB (D65), green being 1.
         color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1: the one that
-            LibRaw renders with, or a typical camera's where the file and LibRaw tell nothing.
-        camera: make and model, ``"unknown"`` where the file does not tell.
-        iso: None where the file does not tell.
+            LibRaw renders with, or a typical camera's if neither the file nor LibRaw has one.
+        camera: make and model, or ``"unknown"``.
+        iso: None if unknown.
         noise_profile: (shot_var, read_var) of a DNG's NoiseProfile tag, the mean over planes; None without one.
         orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
         name: the file's name without extension.
         color_known: false where ``color_matrix`` is the typical one.
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
-        exposure: seconds, f-number, focal length in mm and EXIF date, each None where the file does not tell.
+        exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
     """
 
     mosaic: Tensor
@@ -94,8 +94,8 @@ def read_raw(path: str | Path) -> RawFrame:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        OSError: if LibRaw cannot read it, or it is cut short.
-        ValueError: if it holds no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
+        OSError: if LibRaw cannot read it, or it is truncated.
+        ValueError: if it has no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
 
     Example:
         >>> frame = read_raw("shot.dng")  # doctest: +SKIP
@@ -116,7 +116,7 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
 
     The rendering has the camera's white balance, no automatic brightness, and LibRaw's default tone curve (that of
     BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum where that exceeds this part of
-    white (its default is 0.75): a digital gain that the file does not tell.
+    white (its default is 0.75): a digital gain that is not recorded in the file.
 
     LibRaw renders with OpenMP, whose threads do not survive a fork: render in the main process, or start DataLoader
     workers with ``multiprocessing_context="forkserver"``.
@@ -139,7 +139,9 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
         )
     height, width = frame.mosaic.shape[-2:]
     if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
-        raise ValueError(f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}; no pair")
+        raise ValueError(
+            f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}, so they do not match"
+        )
     return frame, torch.from_numpy(pixels[:height, :width]).permute(2, 0, 1).contiguous()
 
 
@@ -156,17 +158,17 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
             size = path.stat().st_size
             if tags.mosaic_end is not None and tags.mosaic_end > size:  # LibRaw would not say what is wrong
                 raise OSError(
-                    f"{path}: cannot be read as RAW: it is cut short, {size} bytes of {tags.mosaic_end}; copy it again"
+                    f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic_end} bytes; copy it again"
                 )
             raw.unpack()
             yield raw, tags
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         raise OSError(
-            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and of a known camera"
+            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and from a supported camera"
         ) from error
     except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
-        raise ValueError(f"{path}: holds no Bayer mosaic ({error}); only Bayer RAW can be used") from error
+        raise ValueError(f"{path}: has no Bayer mosaic ({error}); only Bayer RAW is supported") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
 
@@ -180,7 +182,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     with np.errstate(all="raise"):
         matrix, color_known = _color_matrix(raw)
     white_balance = _white_balance(raw)
-    other = getattr(raw, "other", None)  # rawpy tells since 0.27
+    other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     return RawFrame(
         mosaic=_normalised(raw.raw_image_visible, black, white),
         cfa=cfa,
@@ -201,11 +203,11 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with the fractions that a DNG tells."""
+    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
     levels = raw.black_level_per_channel
     black = np.array([[levels[k] for k in row] for row in cell], np.float32)
-    told = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
-    return told if np.abs(told - black).max() < 1 else black
+    exact = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
+    return exact if np.abs(exact - black).max() < 1 else black
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
@@ -222,7 +224,7 @@ def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
     """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(2, 2)``: 0 to 3 are R, G, B, G."""
     pattern = raw.raw_pattern
     if pattern is None or pattern.shape != (2, 2) or raw.color_desc != b"RGBG" or set(pattern.flat) != {0, 1, 2, 3}:
-        raise ValueError(f"{path}: holds no Bayer mosaic but {_kind(raw)}; only Bayer RAW can be used")
+        raise ValueError(f"{path}: has no Bayer mosaic but {_kind(raw)}; only Bayer RAW is supported")
     return np.asarray(raw.raw_colors_visible[:2, :2])
 
 

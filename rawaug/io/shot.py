@@ -1,4 +1,4 @@
-"""Which camera took a RAW file, and how, as far as LibRaw, the file's tags or its thumbnail tell."""
+"""Camera and exposure of a RAW file, from LibRaw, the file's tags or its thumbnail."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SENSE = 1e6
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a shot was taken; None where the file does not tell."""
+    """How a shot was taken; None where the file does not say."""
 
     seconds: float | None = None
     f_number: float | None = None
@@ -27,8 +27,8 @@ UNKNOWN = Exposure()
 
 
 def exposure_of(raw: Any) -> Exposure:
-    """LibRaw says 0 where it does not know, and 1970 of a date; numbers beyond all sense are not known either."""
-    other = getattr(raw, "other", None)  # rawpy tells since 0.27
+    """LibRaw says 0 where it does not know, and 1970 of a date; absurd values count as unknown too."""
+    other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     numbers = [float(getattr(other, name, 0)) for name in ("shutter_speed", "aperture", "focal_length")]
     seconds, f_number, focal_length = (number if 0 < number < _SENSE else None for number in numbers)
     taken = getattr(other, "timestamp", None)

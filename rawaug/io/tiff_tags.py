@@ -1,4 +1,4 @@
-"""What LibRaw does not pass on of a RAW file built on TIFF (DNG, NEF, CR2, ...), read by tifffile.
+"""Tags of TIFF-based RAW files (DNG, NEF, CR2, ...) that LibRaw does not expose, read by tifffile.
 
 A DNG's NoiseProfile (tag 51041, DNG specification 1.3 and later) holds pairs (S, O), one for all colour planes or one a
 plane, with noise variance S y + O for a signal y whose black is 0 and white 1: our ``shot_var`` and ``read_var``.
@@ -30,12 +30,12 @@ _DAMAGE = (
 
 @dataclass(frozen=True)
 class TiffTags:
-    """Each field is None where the file does not tell, or is no TIFF.
+    """Each field is None where the tag is missing or the file is not a TIFF.
 
     Attributes:
         make, model: of the camera.
         noise_profile: (shot_var, read_var), the mean over colour planes.
-        mosaic_end: the byte after a DNG's mosaic; a smaller file is cut short.
+        mosaic_end: the byte after a DNG's mosaic; a smaller file is truncated.
         black: a DNG's black levels, row by row of the cell at the top left of the visible mosaic, fractions kept; None
             also where they differ from row to row or repeat over more than two.
         gain_maps: a DNG's lens shading, empty without.

@@ -1,7 +1,7 @@
-"""Whether Triton's kernels run on this machine's GPU, and what is done where they do not.
+"""Whether Triton kernels run on this machine's GPU, and the fallback where they do not.
 
-PyTorch's builds for CUDA bring Triton along. Where it is missing, or a kernel cannot be compiled, the callers take the
-same pass in PyTorch: slower, and told once. With ``TRITON_INTERPRET=1`` in the environment the kernels run on tensors
+PyTorch's CUDA builds include Triton. Where it is missing, or a kernel cannot be compiled, callers use the same pass in
+PyTorch, which is slower, after one warning. With ``TRITON_INTERPRET=1`` in the environment the kernels run on tensors
 of the CPU, step by step: for tests.
 """
 
@@ -35,7 +35,7 @@ def usable(image: Tensor) -> bool:
 
 
 def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> Result:
-    """What ``kernel`` returns, or, from its first failure on, what ``fallback`` does; the failure is told.
+    """The result of ``kernel`` or, from its first failure on, of ``fallback``; the failure is reported as a warning.
 
     Example:
         >>> kernel_or(lambda: 1, lambda: 2)
@@ -48,5 +48,7 @@ def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> R
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
         _refused.append(type(error).__name__)
         reason = (str(error).splitlines() or [""])[-1]
-        warnings.warn(f"rawaug's GPU kernel cannot be used, PyTorch is: {type(error).__name__}: {reason}", stacklevel=3)
+        warnings.warn(
+            f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
+        )
         return fallback()

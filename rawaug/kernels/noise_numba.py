@@ -40,7 +40,7 @@ def shot_read(
     Args:
         clean: float32 ``(B, 4, h, w)`` on the CPU.
         levels: ``(B, 2)`` shot_var and read_var.
-        keys: one a picture, below 2^64.
+        keys: one per picture, below 2^64.
         white: where the noisy signal is clipped; infinity for nowhere.
         with_variance: without it, the second result is empty.
     """

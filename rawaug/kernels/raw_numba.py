@@ -38,7 +38,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
         return raw
     picture, out = srgb.detach().contiguous().numpy(), raw.numpy()
     scale = np.float32((len(camera.table) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0))
-    # What is not there is None: then no code is compiled for it.
+    # Absent parts are None, so that no code is compiled for them.
     table, attention, colour, frame, shading, sites = (
         value.contiguous().numpy() if value.numel() else None for value in camera if isinstance(value, Tensor)
     )
@@ -115,7 +115,7 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
 
 @part
 def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
-    """The node below a value, at most ``last``, and the share of the way to the next; values are held to the table."""
+    """The node below a value, at most ``last``, and the share of the way to the next; values are clamped."""
     x = np.float32(value) * scale
     x = x if x > _ZERO else _ZERO
     top = np.float32(last + 1)

@@ -47,7 +47,7 @@ def _levels(like: Tensor, shot_var: float | Tensor, read_var: float | Tensor) ->
     shape = (len(like), *(1,) * (like.ndim - 1))
     shot, read = (torch.as_tensor(v).to(like).expand(len(like)).reshape(shape) for v in (shot_var, read_var))
     if not (shot > 0).all() or not (read >= 0).all():
-        raise ValueError(f"stabilisation needs shot_var > 0 and read_var >= 0, got {shot_var} and {read_var}")
+        raise ValueError(f"variance stabilisation needs shot_var > 0 and read_var >= 0, got {shot_var} and {read_var}")
     return shot, read
 
 

@@ -53,12 +53,12 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
     if iso is not None:
         raise ValueError(
-            f"noise {spec!r} has no law by ISO; leave iso out, or name a camera: {', '.join(camera_names())}"
+            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
         )
     if isinstance(spec, str):
         return Preset(spec)
     if not isinstance(spec, Sequence) or len(spec) != 2:
-        raise ValueError(f"fixed noise is a pair (shot_var, read_var), got {spec}")
+        raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
     return FixedLevels(*(float(value) for value in spec))
 
 
@@ -78,7 +78,7 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
 def noise_model(
     spec: str | Sequence[float] | Sequence[str] | NoiseModel, *, iso: Iso = None, poisson: bool = False
 ) -> NoiseModel:
-    """The shot and read noise of a name or of (shot_var, read_var); a model is handed back as it is.
+    """The shot and read noise of a name or of (shot_var, read_var); a model is returned as it is.
 
     Args:
         spec: one of :func:`noise_names`, a list of them (each picture draws one), a pair of variances on the scale
@@ -97,7 +97,7 @@ def noise_model(
     """
     if isinstance(spec, NoiseModel):
         if iso is not None or poisson:
-            raise ValueError("iso and poisson are for noise given by name; this noise is a model already")
+            raise ValueError("iso and poisson apply to noise given by name, not to a noise model")
         return spec
     levels = noise_levels(spec, iso=iso)
     return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)

@@ -41,7 +41,7 @@ class Compose(NoiseModel):
     def __init__(self, models: Sequence[NoiseModel]) -> None:
         streams = [model.stream for model in models]
         if not models or len(set(streams)) < len(streams):
-            raise ValueError(f"composed noise models are of different kinds, at least one; got {streams}")
+            raise ValueError(f"Compose needs one or more noise models of different kinds, got {streams}")
         self.models = list(models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:

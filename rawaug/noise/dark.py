@@ -21,7 +21,7 @@ _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can
 
 @dataclass(frozen=True)
 class DarkNoise:
-    """``read_var`` of pixels, ``row_var`` of banding (0 where there is none to see), and the black level's error in
+    """``read_var`` of pixels, ``row_var`` of banding (0 if not measurable), and the black level's error in
     R, Gr, Gb, B. Fixed pattern noise is part of ``read_var``."""
 
     read_var: float
@@ -52,7 +52,7 @@ def _measure(planes: Tensor) -> Tensor:
     """(read_var, row_var, offsets of R, Gr, Gb, B) of packed ``(4, h, w)``."""
     lowest = planes == planes.min()
     if float(lowest.double().mean()) > _PILED_UP:
-        raise ValueError("a dark frame piles up at its lowest value: clipped at black, it does not show the noise")
+        raise ValueError("a dark frame is clipped at black, so its noise cannot be measured")
     difference = planes.diff(dim=-1)
     scale = 1.4826 * difference.abs().median()
     regular = difference.abs() <= _OUTLIER * scale if scale > 0 else torch.ones_like(difference, dtype=torch.bool)

@@ -61,7 +61,7 @@ class NoisePoints:
 class NoiseEstimate:
     """What was fitted: the line, its standard errors, R^2 over the used points, and the points themselves.
 
-    ``read_var`` is 0 where the files cannot tell it from none: the best line would have been negative at black.
+    ``read_var`` is 0 where it is not measurable: the best line would have been negative at black.
     """
 
     shot_var: float
@@ -95,7 +95,7 @@ def estimate_noise(
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
             left out, and those near another level of clipping, where the file's lowest or highest value piles up.
         cfa: the pattern, of all of them.
-        read_var: where dark frames tell it (:func:`from_dark_frames`); else it is fitted too.
+        read_var: known from dark frames (:func:`from_dark_frames`); fitted too if omitted.
 
     Raises:
         ValueError: if there are too few flat regions, or they do not span a range of signals.
@@ -107,7 +107,7 @@ def estimate_noise(
     frames = [mosaics] if isinstance(mosaics, Tensor) else list(mosaics)
     measured = [_measure(frame, cfa) for frame in frames]
     if not measured:
-        raise ValueError("there is no frame to measure the noise of")
+        raise ValueError("no frames given to measure the noise of")
     blocks = _Blocks(*(torch.cat([getattr(m, f.name) for m in measured]) for f in fields(_Blocks)))
     levels = _split_levels(blocks)
     points = _start(levels)
@@ -120,9 +120,9 @@ def estimate_noise(
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
     if frame.shape[:-3].numel() != 1 or frame.ndim < 3 or frame.shape[-3] != 1:
-        raise ValueError(f"a mosaic has shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
+        raise ValueError(f"a mosaic must have shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
     if min(frame.shape[-2:]) < 2 * BLOCK:
-        raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise on")
+        raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise from")
     floor, ceiling = _clipping_levels(frame)
     planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
     tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
@@ -198,7 +198,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
         chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
     if not chosen:
         raise ValueError(
-            "no flat regions found to estimate noise on; give frames with even areas, such as sky or a chart"
+            "no flat regions found to estimate noise from; give frames with uniform areas, such as sky or a chart"
         )
     return _gather(chosen)
 
@@ -222,7 +222,9 @@ def _fit(
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
     if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
-        raise ValueError("too few flat regions, or all of one brightness, to fit noise; give more frames, or charts")
+        raise ValueError(
+            "too few flat regions, or all of the same brightness, to fit noise; give more frames, or charts"
+        )
     variance, trust = y, used
     for _ in range(_ROUNDS):
         weight = trust * n / variance.square()

@@ -34,7 +34,7 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
         return measured
     low, high = (iso, iso) if isinstance(iso, (int, float)) else (iso[0], iso[1])
     if not measured[0] <= low <= high <= measured[1]:
-        raise ValueError(f"ISO {iso} is outside what was measured for {camera}: {measured[0]:g} to {measured[1]:g}")
+        raise ValueError(f"ISO {iso} is outside the measured range of {camera}, {measured[0]:g} to {measured[1]:g}")
     return float(low), float(high)
 
 

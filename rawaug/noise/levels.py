@@ -56,7 +56,7 @@ class FixedLevels:
     def __init__(self, shot_var: float, read_var: float) -> None:
         if not (0 <= shot_var < math.inf and 0 <= read_var < math.inf):
             raise ValueError(
-                f"noise variances are finite and not negative, got shot_var={shot_var}, read_var={read_var}"
+                f"noise variances must be finite and not negative, got shot_var={shot_var}, read_var={read_var}"
             )
         self.shot_var, self.read_var = float(shot_var), float(read_var)
 
@@ -78,7 +78,7 @@ class MixedLevels:
 
     def __init__(self, laws: Sequence[NoiseLevels]) -> None:
         if not laws:
-            raise ValueError("a mixture of noise levels has at least one law")
+            raise ValueError("a mixture of noise levels needs at least one law")
         self.laws = laws
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -92,7 +92,7 @@ class Preset:
     """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``.
 
     Raises:
-        ValueError: if there is none of this name.
+        ValueError: if the name is unknown.
     """
 
     def __init__(self, name: str) -> None:

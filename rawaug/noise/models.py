@@ -34,7 +34,7 @@ from rawaug.seeding import derived_seed, keyed_generator
 Params = dict[str, Tensor]
 
 _NO_SHOT = 1e-30
-"""Stands for a shot_var of 0, so that it can be divided by: too small for any effect on the picture."""
+"""Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
 """Values whose photons are counted together: many small pictures, or one large."""
 
@@ -55,7 +55,7 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        """The noisy RAW before the clip at white: what composed models hand on to one another.
+        """The noisy RAW before the clip at white: what composed models pass on to one another.
 
         Args:
             clean: packed RAW ``(B, 4, h, w)``.
@@ -67,7 +67,7 @@ class NoiseModel(ABC):
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         """The variance map ``(B, 4, h, w)`` of the noise on signal ``clean``, before the clip at white.
 
-        It evaluates the law at whatever signal it is handed. In training that may be the clean signal; at test time
+        It evaluates the law at whatever signal it is given. In training that may be the clean signal; at test time
         only the noisy one is known, and it is what UPI's networks are given (Brooks et al. 2019).
         """
 
@@ -85,7 +85,7 @@ class NoiseModel(ABC):
         return self.disturb(clean, params).clamp_(max=1.0)
 
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
-        """Noisy RAW as of :meth:`apply`, and its variance map as the noisy signal tells it, at once."""
+        """Noisy RAW as in :meth:`apply` and its variance map computed from the noisy signal, in one pass."""
         noisy = self.apply(clean, params)
         return noisy, self.variance(noisy, params)
 
@@ -98,11 +98,11 @@ class NoiseModel(ABC):
 def require_batch(clean: Tensor, params: Params) -> None:
     """Raise ValueError unless ``clean`` is ``(B, 4, h, w)`` in float32 or float64 and every parameter has length B."""
     if clean.ndim != 4 or clean.shape[1] != 4 or clean.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"noise is made on packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
+        raise ValueError(f"noise needs packed float32 RAW (B, 4, h, w), got {tuple(clean.shape)} {clean.dtype}")
     for name, value in params.items():
         if value.shape[:1] != clean.shape[:1]:
             raise ValueError(
-                f"noise parameter {name!r} has shape {tuple(value.shape)}, the batch has {len(clean)} pictures"
+                f"noise parameter {name!r} has shape {tuple(value.shape)}, but the batch has {len(clean)} pictures"
             )
 
 

@@ -124,7 +124,7 @@ class ProfileLevels:
             limits[index] = torch.tensor(iso_limits(profiles.names[index], iso, (low, high)), dtype=torch.float64).log()
             self.cameras = torch.tensor([index])
         if not len(self.cameras):
-            raise ValueError(f"ISO {iso} is within no camera's profile; widen it")
+            raise ValueError(f"no camera has a profile within ISO {iso}; widen the range")
         self.limits = limits[self.cameras]
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ def _require_not_negative(**values: Range) -> None:
     for name, value in values.items():
         low = value[0] if isinstance(value, tuple) else value
         if low < 0 or (isinstance(value, tuple) and not 0 < low <= value[1]):
-            raise ValueError(f"{name} is not negative, or a range (low, high) with 0 < low <= high; got {value}")
+            raise ValueError(f"{name} must be at least 0, or a range (low, high) with 0 < low <= high, got {value}")
 
 
 def _draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
@@ -44,7 +44,7 @@ def tukey_lambda_variance(shape: float) -> float:
         ValueError: for a shape of -1/2 or less, where it is infinite.
     """
     if shape <= -0.5:
-        raise ValueError(f"a Tukey lambda has finite variance for shapes above -0.5, got {shape}")
+        raise ValueError(f"a Tukey lambda shape must be above -0.5 (finite variance), got {shape}")
     if abs(shape) < 1e-4:
         return math.pi**2 / 3
     beta = math.exp(2 * math.lgamma(shape + 1) - math.lgamma(2 * shape + 2))
@@ -163,7 +163,7 @@ class DefectPixels(_FixedPattern):
     def __init__(self, dead: float = 0.0, hot: float = 0.0) -> None:
         _require_not_negative(dead=dead, hot=hot)
         if dead + hot > 1:
-            raise ValueError(f"shares of dead and hot pixels add up to at most 1, got {dead} and {hot}")
+            raise ValueError(f"shares of dead and hot pixels must add up to at most 1, got {dead} and {hot}")
         self.dead, self.hot = dead, hot
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -194,7 +194,7 @@ class Quantisation(NoiseModel):
 
     def __init__(self, bits: int, black_level: int = 0) -> None:
         if not 1 <= bits <= 16 or not 0 <= black_level < 2**bits - 1:
-            raise ValueError(f"bits are 1 to 16 and the black level lies below white, got {bits} and {black_level}")
+            raise ValueError(f"bits must be 1 to 16 and the black level below white, got {bits} and {black_level}")
         self.quantum = 1 / (2**bits - 1 - black_level)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:

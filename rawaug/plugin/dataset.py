@@ -1,6 +1,6 @@
 """A Dataset of sRGB pictures as a Dataset of RAW pairs, every draw keyed.
 
-Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) and from nothing else: first its
+Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone: first its
 crop, then one of eight flips and turns, then camera and noise. So the pairs are the same with any number of workers,
 any start method, any batch size, and after a resume in the middle of an epoch.
 """
@@ -26,7 +26,7 @@ class RawPairs(Dataset[Any]):
 
     Args:
         dataset: yields pictures (tensor, NumPy array or PIL picture, HWC or CHW, grey or RGBA too: see
-            :mod:`rawaug.plugin.pictures`), or tuples or mappings that have one. What else a sample holds passes.
+            :mod:`rawaug.plugin.pictures`), or tuples or mappings that have one. All other fields pass through.
         augment: makes the pair; on the CPU where workers are to run it.
         crop: side of the square crop in pixels, even; None keeps whole pictures (made even by dropping a line).
         seed: of all draws.
@@ -60,23 +60,25 @@ class RawPairs(Dataset[Any]):
         self.dataset, self.augment, self.crop, self.seed, self.key = dataset, augment, crop, seed, key
         self.turns = turns
         if crop is not None:
-            bayer.RandomCrop(int(crop))  # an odd one is told here, not in a worker
+            bayer.RandomCrop(int(crop))  # raises for an odd crop here, not in a worker
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # persistent workers see it change
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw anew: call before each epoch. A dataset that has a ``set_epoch`` itself is told too."""
+        """Select the epoch's draws; call before each epoch. Forwarded to the dataset's own ``set_epoch``, if any."""
         self._epoch[0] = epoch
         if hasattr(self.dataset, "set_epoch"):
             self.dataset.set_epoch(epoch)
 
     def __len__(self) -> int:
         if not isinstance(self.dataset, Sized):
-            raise TypeError(f"{type(self.dataset).__name__} has no length, so its RAW pairs have none")
+            raise TypeError(f"{type(self.dataset).__name__} has no length, so neither have its RAW pairs")
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Any:
         if not isinstance(index, SupportsIndex):
-            raise TypeError(f"a pair has a number, got {type(index).__name__}; take parts with torch.utils.data.Subset")
+            raise TypeError(
+                f"the index must be an integer, got {type(index).__name__}; for slices use torch.utils.data.Subset"
+            )
         index = range(len(self))[index]  # IndexError ends iteration
         return self.draw(index, self._generator(index))
 
@@ -116,8 +118,7 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
     Args:
         dataset: an iterable of samples, as for :class:`RawPairs`. It divides itself between workers, as those of
             WebDataset and Hugging Face do, or ``divide`` does.
-        identity: name or index of the field that tells a sample from all others, such as ``"__key__"``; its draws are
-            keyed by this.
+        identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
         augment, crop, seed, key, turns: as for :class:`RawPairs`.
 
@@ -153,18 +154,18 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
             yield self._paired(sample, name, self._generator(name))
 
     def __getitem__(self, index: int) -> Any:
-        raise TypeError("a stream of RAW pairs has no index; iterate over it")
+        raise TypeError("a stream of RAW pairs cannot be indexed; iterate over it")
 
     def _identity(self, sample: Any) -> int | str:
         try:
             value = sample[self.identity]
         except (KeyError, IndexError, TypeError) as error:
-            raise ValueError(f"identity={self.identity!r}: a sample has no such field; name one that it has") from error
+            raise ValueError(f"identity={self.identity!r}: the samples have no such field") from error
         return value if isinstance(value, int) else str(value)
 
 
 def random_place(picture: Tensor, crop: int | None, turns: bool, generator: torch.Generator) -> Tensor:
-    """Where a crop of ``(3, H, W)`` stands and how it is turned: ``(5,)`` top, left, height, width (H, W) and view.
+    """Position and turn of a crop of ``(3, H, W)``: ``(5,)`` top, left, height, width (H, W) and view.
 
     Raises:
         ValueError: if the picture is smaller than the crop.
@@ -178,13 +179,13 @@ def random_place(picture: Tensor, crop: int | None, turns: bool, generator: torc
 
 
 def placed(picture: Tensor, place: Tensor, crop: int | None) -> Tensor:
-    """The patch of a whole picture ``(3, H, W)`` that ``place`` tells.
+    """The patch of a whole picture ``(3, H, W)`` at ``place``.
 
     Raises:
-        ValueError: if the picture is not of the size that it was drawn for.
+        ValueError: if the picture does not have the size it was drawn for.
     """
     top, left, height, width, view = place.tolist()
     if picture.shape[-2:] != (height, width):
-        raise ValueError(f"the place is one in a picture of {height} x {width}, not {tuple(picture.shape[-2:])}")
+        raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
     patch = bayer.crop(picture, top, left, crop or height, crop or width)
     return bayer.turn(patch, view).contiguous()

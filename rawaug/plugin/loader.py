@@ -51,7 +51,7 @@ class WrappedLoader:
         return len(self.loader)  # type: ignore[arg-type]
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
-        """The next pass is ``epoch``, its first batch number ``start``; a wrapped loader with a ``set_epoch`` is told.
+        """Set the next pass's epoch and first batch number; forwarded to the wrapped loader's ``set_epoch``, if any.
 
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
         data, to meet the same noise again, and with ``start`` where a loader goes on in the middle of an epoch.
@@ -104,12 +104,12 @@ def wrap(
     key: str | int | None = None,
     crop: int | None = None,
 ) -> WrappedLoader:
-    """Any loader of sRGB batches as a loader of RAW pairs; nothing else of the training script changes.
+    """Any loader of sRGB batches as a loader of RAW pairs; the rest of the training script stays as it is.
 
     Args:
         loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that
-            :mod:`rawaug.plugin.pictures` tells of, lists of pictures, or tuples or mappings that have these. The
-            :class:`RawPair` takes their place, all else passes.
+            :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
+            :class:`RawPair` takes their place, all else passes through.
         augment: moves to ``device``.
         device: where the pairs are made, by default where ``augment`` is. Pictures travel there as uint8, if they are.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
@@ -126,5 +126,5 @@ def wrap(
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
     if crop is not None:
-        RandomCrop(crop)  # an odd one is told here
+        RandomCrop(crop)  # raises for an odd crop here
     return WrappedLoader(loader, augment, device, key, crop)

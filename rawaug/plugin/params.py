@@ -20,7 +20,7 @@ class AugmentParams(NamedTuple):
     Args:
         isp: camera settings.
         noise: levels and seeds of the noise.
-        place: ``(B, 5)`` top, left, height, width, view: where in which full frame the picture stands, and how it was
+        place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
             turned after the crop (see :func:`rawaug.bayer.turn`).
     """
 
@@ -29,7 +29,7 @@ class AugmentParams(NamedTuple):
     place: Tensor
 
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
-        """Every tensor changed alike: ``params.map(lambda t: t[0])`` are those of the first picture."""
+        """The same function applied to every tensor: ``params.map(lambda t: t[0])`` are those of the first picture."""
         noise = {name: change(value) for name, value in self.noise.items()}
         return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place))
 
@@ -47,7 +47,7 @@ class AugmentParams(NamedTuple):
         """
         missing = {"place", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
         if missing:
-            raise ValueError(f"these are no parameters of an augmentation: {', '.join(sorted(missing))} missing")
+            raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
         isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
         noise = {name.removeprefix("noise."): value for name, value in tensors.items() if name.startswith("noise.")}
         return cls(isp, noise, tensors["place"])
@@ -57,9 +57,9 @@ class RawPair(NamedTuple):
     """A training pair, packed R, Gr, Gb, B; without the leading B where it comes from a Dataset.
 
     Args:
-        noisy: ``(B, 4, H/2, W/2)``, at most 1, below 0 where the noise goes there.
+        noisy: ``(B, 4, H/2, W/2)``, at most 1, not clipped at 0.
         clean: ``(B, 4, H/2, W/2)``, at most 1: the sensor saturates there.
-        variance: ``(B, 4, H/2, W/2)`` noise variance as the noisy signal tells it: what a network is given.
+        variance: ``(B, 4, H/2, W/2)`` noise variance computed from the noisy signal, as a network sees it.
         params: replays the pair.
     """
 
@@ -69,7 +69,7 @@ class RawPair(NamedTuple):
     params: AugmentParams
 
     def map(self, change: Callable[[Tensor], Tensor]) -> RawPair:
-        """Every tensor changed alike: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
+        """The same function applied to every tensor: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
         return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
 
 

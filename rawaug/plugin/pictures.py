@@ -1,9 +1,9 @@
-"""Pictures as people have them, brought to one form: RGB, channels first, 8 bits or float32 in [0, 1].
+"""Pictures in any common form, converted to one: RGB, channels first, 8 bits or float32 in [0, 1].
 
-A *picture* is a tensor, a NumPy array or a PIL picture, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
+A *picture* is a tensor, a NumPy array or a PIL image, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
 in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out. A
-*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is such a thing
-itself, or a tuple or mapping that has it among other fields.
+*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is one of
+these, or a tuple or mapping with one among its fields.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
 
 Where = str | int | None
-"""Where in a sample the picture stands: a key, an index, or None where the sample is the picture."""
+"""Where the picture is in a sample: a key, an index, or None if the sample is the picture."""
 
 
 def to_rgb_tensor(picture: Any) -> Tensor:
@@ -40,7 +40,7 @@ def to_rgb_tensor(picture: Any) -> Tensor:
     if image.ndim == 2:
         image = image[None]
     if image.ndim != 3:
-        raise ValueError(f"a picture is (3, H, W), (H, W, 3), grey or RGBA, got {_described(picture)}")
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_described(picture)}")
     return _rgb(image, picture)
 
 
@@ -56,7 +56,9 @@ def to_rgb_batch(pictures: Any) -> Tensor:
         return stacked([to_rgb_tensor(picture) for picture in pictures])
     image = _as_tensor(pictures)
     if image.ndim != 4:
-        raise ValueError(f"a batch is (B, 3, H, W), (B, H, W, 3) or a list of pictures, got {_described(pictures)}")
+        raise ValueError(
+            f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list of pictures, got {_described(pictures)}"
+        )
     return _rgb(image, pictures)
 
 
@@ -64,12 +66,14 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
     """Pictures ``(3, H, W)`` to ``(B, 3, H, W)``; where only some are 8 bits, all become float32.
 
     Raises:
-        ValueError: if their sizes differ, or there is none.
+        ValueError: if their sizes differ, or the list is empty.
     """
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
         named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
-        raise ValueError(f"a batch has one size, got {named}; crop the pictures, as wrap(..., crop=256) does")
+        raise ValueError(
+            f"all pictures of a batch must have one size, got {named}; crop them, for example with wrap(..., crop=256)"
+        )
     if len({image.dtype for image in images}) > 1:
         images = [as_float(image) for image in images]
     return torch.stack(list(images))
@@ -83,17 +87,17 @@ def even_sided(image: Tensor) -> Tensor:
     """
     height, width = image.shape[-2:]
     if min(image.shape[0], height // 2, width // 2) < 1:
-        raise ValueError(f"a picture is 2 x 2 or larger, and a batch has one or more; got {tuple(image.shape)}")
+        raise ValueError(f"a picture must be at least 2 x 2 and a batch must not be empty, got {tuple(image.shape)}")
     return image[..., : height - height % 2, : width - width % 2]
 
 
 def is_picture(value: Any) -> bool:
-    """Whether ``value`` is one picture: a PIL picture, or a tensor or array with two or three axes."""
+    """Whether ``value`` is one picture: a PIL image, or a tensor or array with two or three axes."""
     return value.ndim in (2, 3) if isinstance(value, (Tensor, np.ndarray)) else hasattr(value, "getbands")
 
 
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
-    """Where the picture (``batched``: the pictures) of a sample stands.
+    """Where the picture (``batched``: the pictures) of a sample is.
 
     Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first. A batch that is a list of
     pictures is not taken apart.
@@ -104,7 +108,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
     if isinstance(sample, Mapping):
         if key not in sample:
             names = ", ".join(map(str, sample))
-            raise ValueError(f"samples are mappings with the keys {names}; name the picture's with key=, got {key!r}")
+            raise ValueError(f"samples are mappings with the keys {names}; give the picture's as key=, got {key!r}")
         return key
     if isinstance(sample, (tuple, list)) and sample:
         if batched and key is None and is_picture(sample[0]):
@@ -114,14 +118,12 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
         return where % len(sample)
     if key is not None:
-        raise ValueError(
-            f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; leave key out"
-        )
+        raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; omit key")
     return None
 
 
 def picked(sample: Any, where: Where) -> Any:
-    """What stands there."""
+    """The value at ``place``."""
     return sample if where is None else sample[where]
 
 
@@ -143,11 +145,11 @@ def _as_tensor(picture: Any) -> Tensor:
         return picture.as_subclass(Tensor)
     if hasattr(picture, "getbands"):
         if picture.mode not in _PIL_AS_RGB + _PIL_AS_IS:
-            raise ValueError(f"a PIL picture of mode {picture.mode!r} is not sRGB; convert it to RGB first")
+            raise ValueError(f"a PIL image of mode {picture.mode!r} is not sRGB; convert it to RGB first")
         picture = picture.convert("RGB") if picture.mode in _PIL_AS_RGB else picture
     array = np.array(picture)
     if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
-        raise ValueError(f"a picture is a tensor, a NumPy array or a PIL picture of numbers, got {_described(picture)}")
+        raise ValueError(f"a picture must be a tensor, a NumPy array or a PIL image, got {_described(picture)}")
     return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), copy=False))
 
 
@@ -155,7 +157,7 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     """``(..., C, H, W)`` or ``(..., H, W, C)`` to ``(..., 3, H, W)``, uint8 or float32."""
     first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
     if not (first or last):
-        raise ValueError(f"a picture is (3, H, W), (H, W, 3), grey or RGBA, got {_described(original)}")
+        raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_described(original)}")
     if last and not (first and isinstance(original, Tensor)):
         image = image.movedim(-1, -3)
     image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
@@ -164,7 +166,7 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     if image.dtype == torch.uint16:
         return image.float() / 65535.0
     if not image.is_floating_point():
-        raise ValueError(f"a picture is uint8, uint16 or float in [0, 1], got {image.dtype}; convert it first")
+        raise ValueError(f"a picture must be uint8, uint16 or float in [0, 1], got {image.dtype}; convert it first")
     require_display_range(image)
     return image.float()
 

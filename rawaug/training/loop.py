@@ -21,21 +21,19 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
-import denoisers
 from denoisers.network import Denoiser
-from rawaug.data.sample import Sample
 from rawaug.files import replacing
-from rawaug.metrics import psnr
-from rawaug.seeding import derived_seed
 from rawaug.training.criteria import LOSSES, weighed
 from rawaug.training.estimators import Supervised
+from rawaug.training.start import first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched, validate
 
 
 def train(
     stream: TrainingStream,
-    validation: Sequence[Sample],
+    validation: Sequence[Watched],
     network: DenoiserConfig,
     config: TrainConfig,
     folder: Path,
@@ -53,7 +51,7 @@ def train(
         validation: frozen crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
         network, config: what is trained, and how.
         folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
-        seed: of the network's start.
+        seed: of the initial weights.
         device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
         label: heads the progress bar.
         estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
@@ -68,7 +66,7 @@ def train(
     estimator = estimator or Supervised()
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
-    net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
+    net = first_network(network, seed)
     average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
@@ -99,12 +97,12 @@ def train(
 
         rate = (step - start) * stream.batch / (time.perf_counter() - began)
         if step % config.validate_every == 0 or step == config.steps:
-            score = validate(estimator.corrected(trained), validation, fabric.device)
-            if score > best["psnr"] or not choose:
-                best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
+            scores = validate(estimator.corrected(trained), validation, fabric.device)
+            if scores["psnr"] > best["psnr"] or not choose:
+                best = {"psnr": scores["psnr"], "step": step, "net": copy.deepcopy(trained.state_dict())}
             mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
             if journal is not None:
-                journal.log(step, loss=mean_loss, psnr=score, samples_per_second=rate)
+                journal.log(step, loss=mean_loss, **scores, samples_per_second=rate)
         if journal is not None and (step % config.checkpoint_every == 0 or step == config.steps):
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
@@ -139,7 +137,7 @@ def launched(device: str, devices: int, precision: str) -> Any:
 
 
 def running_average(decay: float) -> Any:
-    """``average <- d average + (1 - d) weights`` with d = ``decay``, less at first: (1 + n) / (10 + n) after n steps."""
+    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
 
     @torch.no_grad()
     def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
@@ -157,15 +155,6 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
         return float(0.5 ** (step // config.halve_every))
     progress = (step - config.warmup) / max(1, config.steps - config.warmup)
     return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
-
-
-@torch.no_grad()
-def validate(net: nn.Module, samples: Sequence[Sample], device: torch.device) -> float:
-    """Mean PSNR in dB over frozen samples."""
-    net.eval()
-    scores = [psnr(net(*(x.to(device) for x in (s.noisy, s.variance))), s.clean.to(device)) for s in samples]
-    net.train()
-    return torch.cat(scores).mean().item()
 
 
 def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> tuple[int, dict[str, Any]]:
@@ -199,11 +188,14 @@ class Journal:
 
     def log(self, step: int, **values: float) -> None:
         """One row in the CSV file and one point in each TensorBoard curve."""
-        new = not self.path.is_file() or self.path.stat().st_size == 0
+        head = ["step", *values]
+        known = self.path.read_text().splitlines() if self.path.is_file() else []
+        if known and known[0] != ",".join(head):  # begun by a version with other columns
+            write_rows(self.path, head, list(csv.DictReader(known)))
         with self.path.open("a", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
-            if new:
-                rows.writerow(["step", *values])
+            if not known:
+                rows.writerow(head)
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
@@ -211,3 +203,11 @@ class Journal:
     def close(self) -> None:
         """Write what is left."""
         self.writer.close()
+
+
+def write_rows(path: Path, head: Sequence[str], rows: Sequence[dict[str, str]]) -> None:
+    """A CSV file with the columns ``head``; what a row lacks is empty, what ``head`` lacks is left out."""
+    with replacing(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, head, restval="", extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

@@ -11,12 +11,15 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: UNet, DHDN or DnCNN.
+        name: UNet, DHDN, DnCNN, PMRID or NAFNet.
         settings: its constructor's keys.
+        start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
+            then the file's, unless they are given, and must agree with it. Null starts from nothing.
     """
 
     name: str = "UNet"
     settings: dict[str, Any] = field(default_factory=dict)
+    start: str | None = None
 
 
 @dataclass

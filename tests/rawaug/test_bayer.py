@@ -168,7 +168,7 @@ def test_crop_refuses_to_move_the_pattern() -> None:
     assert bayer.crop(mosaic, 2, 4, 4, 4).shape == (1, 4, 4)
     with pytest.raises(ValueError, match="even"):
         bayer.crop(mosaic, 1, 0, 4, 4)
-    with pytest.raises(ValueError, match="leaves the mosaic"):
+    with pytest.raises(ValueError, match="extends beyond the mosaic"):
         bayer.crop(mosaic, 6, 0, 4, 4)
 
 

@@ -94,7 +94,7 @@ class DemoCamera:
             ValueError: if the picture is not uint8 ``(3, H, W)`` with even sides of at least 4.
         """
         if picture.ndim != 3 or picture.shape[0] != 3 or picture.dtype != torch.uint8 or min(picture.shape[1:]) < 4:
-            raise ValueError(f"{name}: a scene is uint8 (3, H, W) of 4 x 4 or more, got {tuple(picture.shape)}")
+            raise ValueError(f"{name}: a scene must be uint8 (3, H, W), at least 4 x 4, got {tuple(picture.shape)}")
         exposed = self._expose(picture, shot)
         clean = _digitise(exposed)
         shot_var, read_var = NOISE_LEVELS[shot.iso]

@@ -49,7 +49,7 @@ def dead_leaves(
     for source in sources:
         if source.ndim != 3 or source.shape[0] != 3 or source.dtype != torch.uint8 or min(source.shape[1:]) < 32:
             raise ValueError(
-                f"a source is uint8 (3, h, w), sides at least 32, got {source.dtype} {tuple(source.shape)}"
+                f"a source must be uint8 (3, h, w) with sides of at least 32, got {source.dtype} {tuple(source.shape)}"
             )
     if not sources or smallest_radius <= 0.5 or min(height, width) < 8:
         raise ValueError(f"dead leaves need sources ({len(sources)}), r_min > 0.5 and sides >= 8 ({height} x {width})")
@@ -57,7 +57,9 @@ def dead_leaves(
     fits = min(min(photograph.shape[:2]) for photograph in photographs) / 2 - 1
     radii = (_OVERSAMPLING * smallest_radius, min(fits, _OVERSAMPLING * max(height, width) / 3))
     if radii[0] >= radii[1]:
-        raise ValueError(f"smallest_radius {smallest_radius} leaves no room: the sources allow {fits / _OVERSAMPLING}")
+        raise ValueError(
+            f"smallest_radius {smallest_radius} is too large: the sources allow at most {fits / _OVERSAMPLING}"
+        )
     fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
     cells = fine.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3)
     mean = cells.mean(axis=(1, 3), dtype=np.float32)

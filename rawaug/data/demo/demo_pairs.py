@@ -29,7 +29,7 @@ PICTURES_ONLY = ("brick.png", "grass.png", "gravel.png", "hubble_deep_field.jpg"
 """More photographs of the user's sRGB folder, of which the camera has no RAW."""
 
 PAIRS = {"train": 5, "validation": 4, "test": 9}
-"""Number of pairs of a split unless told otherwise."""
+"""Default number of pairs of a split."""
 
 FRAME = (288, 448)
 """Height and width of every frame."""
@@ -67,7 +67,7 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
     _require_split(split)
     count = PAIRS[split] if count is None else count
     if count < 1:
-        raise ValueError(f"demo:{split}: count is at least 1, got {count}")
+        raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
     return [_pair(split, k, seed) for k in range(count)]
 
 
@@ -80,7 +80,7 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
         ValueError: if ``count`` is not positive.
     """
     if count < 1:
-        raise ValueError(f"demo: count is at least 1, got {count}")
+        raise ValueError(f"demo: count must be at least 1, got {count}")
     photographs = [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
     leaves = (
         dead_leaves(*FRAME, photographs, keyed_generator(seed, "demo pictures", k))
@@ -127,4 +127,4 @@ def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
 
 def _require_split(split: str) -> None:
     if split not in PHOTOGRAPHS:
-        raise ValueError(f"demo:{split}: no such split; there are {', '.join(PHOTOGRAPHS)}")
+        raise ValueError(f"demo:{split}: unknown split; use one of {', '.join(PHOTOGRAPHS)}")

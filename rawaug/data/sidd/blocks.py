@@ -2,10 +2,10 @@
 
 ``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
 same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
-:data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, and tells the pattern
+:data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern
 of each frame in a line of ``siddplus_*bayer_patterns.csv``.
 
-The blocks come without colour: it is read from the METADATA files of their scene instances where these lie below the
+The blocks come without colour: it is read from the METADATA files of their scene instances if these are below the
 same folder; else the gains are 1, the colour matrix is the identity, and the picture shows camera colour.
 """
 
@@ -45,7 +45,7 @@ class NoisyBlock(NamedTuple):
 class SiddBlocks(LazyPairs):
     """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB) once the first is read.
 
-    Noise levels are those of a ``noise_level_functions.csv`` where one lies below the folder and has the scene
+    Noise levels are those of a ``noise_level_functions.csv`` if there is one below the folder with the scene
     instance, else measured on the 32 blocks of a frame against the clean ones.
 
     Args:
@@ -93,7 +93,7 @@ class SiddPlusBlocks(LazyPairs):
 
     Raises:
         FileNotFoundError: if one of them is not there.
-        ValueError: if the patterns are no patterns.
+        ValueError: if a pattern is invalid.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -110,7 +110,7 @@ class SiddPlusBlocks(LazyPairs):
             clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
             _require_same_shape(clean, noisy, self.files[1])
             if len(clean) != len(self):
-                raise ValueError(f"{self.files[0]}: holds {len(clean)} blocks, the patterns are for {len(self)}")
+                raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
             self._blocks = clean, noisy
         frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
         clean, noisy = self._blocks
@@ -156,14 +156,16 @@ def find_file(path: Path, pattern: str) -> Path:
     """The one file of this name below ``path``, or ``path`` itself.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such file.
         ValueError: if there are several.
     """
     found = [path] if path.is_file() and path.match(pattern) else sorted(path.rglob(pattern))
     if not found:
-        raise FileNotFoundError(f"{path}: holds no {pattern}; see the page on datasets for where to get it")
+        raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")
     if len(found) > 1:
-        raise ValueError(f"{path}: holds {len(found)} files {pattern}, {found[0]} and {found[1]}; name a folder of one")
+        raise ValueError(
+            f"{path}: contains {len(found)} files {pattern}, such as {found[0]} and {found[1]}; give a folder with one"
+        )
     return found[0]
 
 

@@ -35,7 +35,7 @@ _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\
 
 
 class SiddFrames(LazyPairs):
-    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set too where it lies there.
+    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set if present.
 
     Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
     Where a frame's ``GT_SRGB`` picture is not there, the clean frame is developed as the dataset's makers did.
@@ -64,10 +64,10 @@ class SiddFrames(LazyPairs):
             missing = {"GT_RAW", "METADATA_RAW"} - set(files)
             if missing:
                 raise ValueError(
-                    f"{files['NOISY_RAW']}: {min(missing)}_{number} of {scene.name} is missing; get it too"
+                    f"{files['NOISY_RAW']}: {min(missing)}_{number} of {scene.name} is missing; download it too"
                 )
         if not self.shots:
-            raise ValueError(f"{path}: holds no NOISY_RAW frames of SIDD for training")
+            raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
         self.levels = noise_level_functions(self.path)
         super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
 
@@ -110,15 +110,19 @@ def mosaic_of(file: Path) -> Tensor:
 def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
     """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
     if values.ndim != axes or values.dtype.kind != "f" or not values.size:
-        raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floating point, {axes} axes")
+        raise ValueError(
+            f"{file}: holds {values.dtype} {values.shape}; normalised RAW must be floating point with {axes} axes"
+        )
     low, high = float(values.min()), float(values.max())
     if not (low > -1 and high <= 1):
-        raise ValueError(f"{file}: values run from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
+        raise ValueError(
+            f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0 and white at 1"
+        )
     return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
-    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``; maybe none.
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any.
 
     Raises:
         ValueError: if the file has other columns.
@@ -158,7 +162,7 @@ def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
 
 
 class Colour(NamedTuple):
-    """What a METADATA file tells: gains, colour matrix, and the view that shows the frame upright."""
+    """Gains, colour matrix and upright view from a METADATA file."""
 
     white_balance: tuple[float, float, float]
     matrix: Tensor
@@ -176,7 +180,7 @@ def colour_of(file: Path) -> Colour:
         gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
         return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ValueError(f"{file}: tells no AsShotNeutral and ColorMatrix2 ({error}); get the file again") from error
+        raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
 
 
 def _even(image: Tensor) -> Tensor:

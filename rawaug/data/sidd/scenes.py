@@ -1,4 +1,4 @@
-"""SIDD's scene instances: what their names tell, and which are held back for validation and benchmark.
+"""SIDD's scene instances: the fields of their names, and which are held back for validation and benchmark.
 
 The pattern goes by phone (the dataset's ``bayer_patterns.csv``). The S6's is GRBG; it looks like GBRG to those who read
 the files of version 7.3 without exchanging the axes. Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality
@@ -26,7 +26,7 @@ _NAME = re.compile(r"(\d{4})_(\d{3})_([A-Z0-9]{2})_(\d{5})_(\d{5})_(\d{4})_([LNH
 
 @dataclass(frozen=True)
 class SiddScene:
-    """A scene instance, as its folder's name tells it: number, physical scene, phone, ISO and illuminant (kelvin)."""
+    """A scene instance, parsed from its folder's name: number, physical scene, phone, ISO and illuminant (kelvin)."""
 
     name: str
     instance: int
@@ -48,7 +48,7 @@ class SiddScene:
         """
         found = _NAME.fullmatch(name)
         if found is None or found[3] not in PHONES:
-            raise ValueError(f"{name}: is no scene instance of SIDD, as 0052_002_S6_01600_01000_5500_N is")
+            raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
         return cls(name, int(found[1]), int(found[2]), found[3], int(found[4]), int(found[6]))
 
     @property

@@ -39,10 +39,10 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SID
     """
     path = Path(path)
     if path.suffix not in (".csv", ".mat"):
-        raise ValueError(f"{path}: a submission to SIDD is a .csv or a .mat file")
+        raise ValueError(f"{path}: a SIDD submission must be a .csv or .mat file")
     arrays = [_checked(block, k, side) for k, block in enumerate(blocks)]
     if len(arrays) != COUNT:
-        raise ValueError(f"{path}: a submission has {COUNT} blocks, got {len(arrays)}")
+        raise ValueError(f"{path}: a submission must have {COUNT} blocks, got {len(arrays)}")
     if path.suffix == ".mat":
         from scipy.io import savemat
 
@@ -64,15 +64,15 @@ def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
     path = Path(path)
     blocks = _from_mat(path, side) if path.suffix == ".mat" else _from_csv(path, side)
     if not np.isfinite(blocks).all() or blocks.min() < 0 or blocks.max() > 1:
-        raise ValueError(f"{path}: values run from {blocks.min():.4g} to {blocks.max():.4g}; clip them to [0, 1]")
+        raise ValueError(f"{path}: has values from {blocks.min():.4g} to {blocks.max():.4g}; clip them to [0, 1]")
     return torch.from_numpy(blocks)[:, None]
 
 
 def _checked(block: Tensor, index: int, side: int) -> np.ndarray:
     if tuple(block.shape) != (1, side, side):
-        raise ValueError(f"block {index}: a block has shape (1, {side}, {side}), got {tuple(block.shape)}")
+        raise ValueError(f"block {index}: must have shape (1, {side}, {side}), got {tuple(block.shape)}")
     if not block.isfinite().all():
-        raise ValueError(f"block {index}: holds values that are not finite")
+        raise ValueError(f"block {index}: has values that are not finite")
     return block[0].detach().cpu().numpy().astype("<f4", order="C")
 
 
@@ -80,7 +80,7 @@ def _from_mat(path: Path, side: int) -> np.ndarray:
     array = read_array(path, "SubmitRaw")
     if array.shape != (len(HELD_BACK), BLOCKS, side, side) or array.dtype != np.float32:
         expected = (len(HELD_BACK), BLOCKS, side, side)
-        raise ValueError(f"{path}: SubmitRaw is float32 {expected}, got {array.dtype} {array.shape}")
+        raise ValueError(f"{path}: SubmitRaw must be float32 {expected}, got {array.dtype} {array.shape}")
     return np.ascontiguousarray(array).reshape(COUNT, side, side)
 
 
@@ -89,11 +89,11 @@ def _from_csv(path: Path, side: int) -> np.ndarray:
     with path.open(encoding="ascii", newline="") as file:
         rows = list(csv.reader(file))
     if rows[:1] != [["ID", "BLOCK"]] or [row[0] for row in rows[1:]] != [str(k) for k in range(COUNT)]:
-        raise ValueError(f"{path}: has the columns ID and BLOCK, and the IDs 0 to {COUNT - 1} in order")
+        raise ValueError(f"{path}: must have the columns ID and BLOCK, with IDs 0 to {COUNT - 1} in order")
     blocks = np.empty((COUNT, side, side), np.float32)
     for k, row in enumerate(rows[1:]):
         data = base64.b64decode(row[1])
         if len(data) != 4 * side * side:
-            raise ValueError(f"{path}: block {k} has {len(data)} bytes, not the {4 * side * side} of float32")
+            raise ValueError(f"{path}: block {k} has {len(data)} bytes, expected {4 * side * side} (float32)")
         blocks[k] = np.frombuffer(data, "<f4").reshape(side, side)
     return blocks

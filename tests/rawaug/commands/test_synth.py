@@ -145,7 +145,7 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
 def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder of pictures"):
         synth(tmp_path / "nowhere", tmp_path / "out")
-    with pytest.raises(ValueError, match="would lie among the pictures"):
+    with pytest.raises(ValueError, match="is inside the picture folder"):
         synth(pictures, pictures / "out", workers=0)
     with pytest.raises(ValueError, match="'bogus' is unknown"):
         synth(pictures, tmp_path / "out", noise="bogus", workers=0)
@@ -172,7 +172,7 @@ def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) 
     with pytest.raises(ValueError, match="has changed since"):
         replay(params, picture=pictures / "sub/b.png")
     DictionaryISP().save(tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match="is not the one that made this pair"):
+    with pytest.raises(ValueError, match="is not the one this pair was made with"):
         replay(params, picture=moved, isp=tmp_path / "other.safetensors")
 
 

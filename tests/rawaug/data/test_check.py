@@ -34,7 +34,7 @@ def test_pictures_are_counted_by_size_and_the_broken_ones_named(tmp_path: Path) 
         str(tmp_path),
         "pictures: 5",
         "  sizes: 6 x 8 (3), 6 x 10 (1)",
-        "  broken: 1",
+        "  damaged: 1",
     ]
     (line,) = report.broken
     assert "3.png: cannot be read as a picture" in line
@@ -66,7 +66,7 @@ def test_every_dataset_is_recognised(tmp_path: Path, mat73: Writer) -> None:
     savemat(tmp_path / "sidd" / "ValidationNoisyBlocksRaw.mat", {"ValidationNoisyBlocksRaw": blocks})
     frames, validation, benchmark = check(tmp_path / "sidd", first=40).parts
     assert frames.what == "SIDD, full frames" and dict(frames.cfas) == {"GRBG": 1} and not frames.broken
-    assert validation.items == 0 and "holds no ValidationGtBlocksRaw.mat" in validation.broken[0]
+    assert validation.items == 0 and "contains no ValidationGtBlocksRaw.mat" in validation.broken[0]
     assert benchmark.items == 1280 and dict(benchmark.cfas) == {"GRBG": 32, "BGGR": 8}
 
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 4), np.uint16))
@@ -79,7 +79,7 @@ def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
     blocks = np.full((len(HELD_BACK), 32, 8, 8), 2.0, np.float32)
     savemat(tmp_path / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
     report = check(tmp_path, first=5)
-    assert len(report.broken) == 1 and "values run from 2 to 2" in report.broken[0]
+    assert len(report.broken) == 1 and "has values from 2 to 2" in report.broken[0]
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
@@ -97,7 +97,7 @@ def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(
     monkeypatch.setattr(PictureFolder, "read", read)
     (part,) = check(tmp_path).parts
     assert dict(part.sizes) == {"8 x 8": 2}
-    assert len(part.broken) == 1 and part.broken[0].startswith("1.png: crashes its decoder")
+    assert len(part.broken) == 1 and part.broken[0].startswith("1.png: crashes the decoder")
     monkeypatch.setattr(PictureFolder, "read", lambda folder, index: crash())
     write_pictures(tmp_path, 9)
     (part,) = check(tmp_path).parts
@@ -108,7 +108,7 @@ def test_what_is_unknown_is_told(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
         check(tmp_path / "none")
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(ValueError, match="holds no dataset, RAW file or picture that is known"):
+    with pytest.raises(ValueError, match="contains no known dataset, RAW file or picture"):
         check(tmp_path)
 
 
@@ -119,6 +119,6 @@ def test_the_command_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "1.png").write_bytes(b"")
     assert main(["data", "check", str(tmp_path), "--first", "2"]) == 2
     printed = capsys.readouterr()
-    assert "1.png" in printed.out and printed.err.strip().endswith("1 broken, listed above")
+    assert "1.png" in printed.out and printed.err.strip().endswith("1 damaged, listed above")
     assert main(["data", "check", str(tmp_path / "none")]) == 2
     assert "none: no such file or folder" in capsys.readouterr().err

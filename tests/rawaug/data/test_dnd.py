@@ -77,7 +77,7 @@ def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:
 
 def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
     dnd = Dnd(folder)
-    with pytest.raises(ValueError, match="a submission has 1000 boxes, got 3"):
+    with pytest.raises(ValueError, match="a submission must have 1000 boxes, got 3"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8)] * 3)
     with pytest.raises(ValueError, match="box 1: a denoised box is finite"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), torch.full((1, 6, 8), torch.nan)])
@@ -103,7 +103,7 @@ def test_what_is_missing_or_wrong_is_told(tmp_path: Path, mat73: Writer) -> None
         Dnd(tmp_path)
     mat73(tmp_path / "images_raw" / "0002.mat", {"Inoisy": frame(1)[:5]})
     dnd = Dnd(tmp_path)
-    with pytest.raises(ValueError, match=r"0001\.mat: Inoisy \(20, 34\) runs from"):
+    with pytest.raises(ValueError, match=r"0001\.mat: Inoisy \(20, 34\) has values from"):
         dnd[0]
     with pytest.raises(ValueError, match=r"0002\.mat: box 1 of info\.mat leaves the frame of \(5, 34\)"):
         dnd[20]

@@ -51,7 +51,7 @@ def test_missing_frames_are_told(folder: Path) -> None:
         fivek_pairs(folder, "test")
     with pytest.raises(FileNotFoundError, match="414 of the 414 DNGs of fivek nikon, train"):
         open_pairs(f"fivek_nikon:{folder}:train")
-    with pytest.raises(ValueError, match="fivek: no split validation; InvISP's are train, test"):
+    with pytest.raises(ValueError, match="fivek: no split validation; use one of InvISP's: train, test"):
         open_pairs(f"fivek:{folder}", split="validation")
     with pytest.raises(ValueError, match="fivek: no camera sony; there are canon, nikon"):
         fivek_pairs(folder, "test", ["sony"])

@@ -34,15 +34,18 @@ def test_a_pair_holds_what_it_was_given() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"srgb": torch.zeros(3, 6, 8)}, r"pair shot: srgb is torch.uint8 \(3, 6, 8\), got torch.float32 \(3, 6, 8\)"),
-        ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb is .*got torch.uint8 \(3, 6, 6\)"),
-        ({"raw": torch.zeros(1, 6, 8, dtype=torch.float64)}, r"raw is torch.float32"),
-        ({"raw": torch.zeros(6, 8)}, r"pair shot: raw is torch.float32"),
-        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy is torch.float32 \(1, 6, 8\)"),
+        (
+            {"srgb": torch.zeros(3, 6, 8)},
+            r"pair shot: srgb must be torch.uint8 \(3, 6, 8\), got torch.float32 \(3, 6, 8\)",
+        ),
+        ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb must be .*got torch.uint8 \(3, 6, 6\)"),
+        ({"raw": torch.zeros(1, 6, 8, dtype=torch.float64)}, r"raw must be torch.float32"),
+        ({"raw": torch.zeros(6, 8)}, r"pair shot: raw must be torch.float32"),
+        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy must be torch.float32 \(1, 6, 8\)"),
         ({"srgb": torch.zeros(3, 5, 8, dtype=torch.uint8), "raw": torch.zeros(1, 5, 8)}, "even sides"),
-        ({"color_matrix": torch.eye(4)}, r"color_matrix is \(3, 3\)"),
-        ({"shot_var": 1e-3, "read_var": 1e-6}, "come together, and with a noisy mosaic"),
-        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "come together"),
+        ({"color_matrix": torch.eye(4)}, r"color_matrix must be \(3, 3\)"),
+        ({"shot_var": 1e-3, "read_var": 1e-6}, "must be given together, with a noisy mosaic"),
+        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "must be given together"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:

@@ -63,7 +63,7 @@ def test_a_camera_jpeg_is_turned_into_the_sensors_orientation(tmp_path: Path, ba
 def test_a_jpeg_of_another_size_is_not_taken_and_told(tmp_path: Path, bayer_dng: Dng) -> None:
     path = bayer_dng(tmp_path / "a.dng", NUMBERS)
     write_picture(tmp_path / "a.jpg", torch.zeros(3, 20, 31, dtype=torch.uint8))
-    with pytest.warns(UserWarning, match=r"a.jpg: 20 x 31 beside a RAW file of 40 x 62; LibRaw's rendering is taken"):
+    with pytest.warns(UserWarning, match=r"a.jpg: is 20 x 31 but its RAW file is 40 x 62; using LibRaw's"):
         pair = RawFolder(tmp_path)[0]
     assert pair.registered and torch.equal(pair.srgb, develop(path))
 
@@ -87,7 +87,7 @@ def test_files_of_one_stem_have_names_of_their_own(tmp_path: Path, bayer_dng: Dn
 
 
 def test_nothing_to_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"holds no RAW file; known are \.3fr"):
+    with pytest.raises(ValueError, match=r"contains no RAW file; supported extensions are \.3fr"):
         RawFolder(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
         RawFolder(tmp_path / "none.dng")

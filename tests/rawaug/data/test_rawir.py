@@ -42,13 +42,13 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
     assert [pair.name for pair in open_pairs(f"rawir:{tmp_path / 'data-p20'}", "train")] == ["a"]
     (pair,) = open_pairs(f"rawir:{tmp_path / 'data-p20'}", "validation")
     assert pair.name == "b" and not pair.registered
-    with pytest.raises(ValueError, match=r"test: holds no \.npy file"):
+    with pytest.raises(ValueError, match=r"test: contains no \.npy file"):
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
 
 
 def test_what_is_wrong_is_told(tmp_path: Path) -> None:
     write_pair(tmp_path, "a", "jpg", scale=3)
-    with pytest.raises(ValueError, match=r"a\.npy: holds 1207, above white at 1024; give white="):
+    with pytest.raises(ValueError, match=r"a\.npy: has value 1207, above the white level 1024; pass white="):
         Rawir(tmp_path)[0]
     assert Rawir(tmp_path, white=4095)[0].raw.max().item() == pytest.approx(1207 / 4095)
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 8), np.uint16))

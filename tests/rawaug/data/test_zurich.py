@@ -52,7 +52,7 @@ def test_8_bits_are_a_quarter(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_told(folder: Path) -> None:
     (folder / "train" / "canon" / "2.jpg").unlink()
-    with pytest.raises(FileNotFoundError, match=r"2\.jpg: is missing, with 0 others"):
+    with pytest.raises(FileNotFoundError, match=r"2\.jpg: is missing, and 0 others"):
         Zurich(folder)
     Image.fromarray(np.full((4, 4), 5000, np.uint16)).save(folder / "test" / "huawei_raw" / "0.png")
     with pytest.raises(ValueError, match=r"0\.png: holds 5000, more than 10 bits"):

@@ -88,7 +88,7 @@ def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
         assert len(scores["images"]) == 2
     print_scores(result)
-    with pytest.raises(ValueError, match="classical: Median is unknown; there are NonLocalMeans"):
+    with pytest.raises(ValueError, match="classical: Median is unknown; use one of NonLocalMeans"):
         evaluate(identity, "demo:test", classical=["Median"])
 
 

@@ -72,7 +72,7 @@ def test_opcode_lists_go_there_and_back() -> None:
 
 def test_what_is_cut_short_is_refused() -> None:
     opcodes = opcode_list([a_map()])
-    with pytest.raises(ValueError, match="is not whole"):
+    with pytest.raises(ValueError, match="is incomplete"):
         parse_gain_maps(opcodes[:-4], on_mosaic=True)
     with pytest.raises(ValueError, match="cut short"):
         parse_gain_maps(opcodes[:10], on_mosaic=True)

@@ -59,7 +59,7 @@ def test_a_kernel_that_fails_is_told_once_and_pytorch_goes_on(monkeypatch: pytes
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
-    with pytest.warns(UserWarning, match="cannot be used, PyTorch is: RuntimeError: for this target"):
+    with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
         assert fallback.kernel_or(fails, lambda: 2) == 2
     assert not fallback.usable(torch.zeros(1, device="meta"))
 

@@ -53,7 +53,7 @@ def test_ranges_are_drawn_per_picture() -> None:
     assert row_var.min() >= 1e-6 and row_var.max() <= 1e-4
     assert row_var.log10().mean() == pytest.approx(-5, abs=0.05)
     for wrong in (-1e-6, (0.0, 1e-4), (1e-4, 1e-6)):
-        with pytest.raises(ValueError, match="row_var is not negative"):
+        with pytest.raises(ValueError, match="row_var must be at least 0"):
             RowNoise(wrong)
 
 
@@ -81,5 +81,5 @@ def test_defects_are_as_many_as_asked_for() -> None:
 
 def test_impossible_depths_are_refused() -> None:
     for bits, black in ((0, 0), (17, 0), (8, 255)):
-        with pytest.raises(ValueError, match="bits are 1 to 16"):
+        with pytest.raises(ValueError, match="bits must be 1 to 16"):
             Quantisation(bits, black)

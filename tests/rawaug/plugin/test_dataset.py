@@ -245,7 +245,7 @@ def test_an_iterable_is_a_stream_and_tells_its_dataset_the_epoch(augment: RawAug
     stream = RawPairs(dataset, augment, crop=16)
     stream.set_epoch(4)
     assert dataset.epoch == 4
-    with pytest.raises(TypeError, match="no index"):
+    with pytest.raises(TypeError, match="cannot be indexed"):
         stream[0]
     with pytest.raises(TypeError, match="Counted has no length"):
         len(stream)

@@ -84,7 +84,7 @@ def test_a_narrow_tensor_is_read_channels_first() -> None:
 
 @pytest.mark.parametrize("bad", [np.zeros((5, 6, 7)), np.zeros((2, 3, 4, 5)), "a.png", 3, None, np.zeros((4, 4), bool)])
 def test_what_is_no_picture_is_refused(bad: Any) -> None:
-    with pytest.raises(ValueError, match=r"a picture is .*, got"):
+    with pytest.raises(ValueError, match=r"a picture must be .*, got"):
         to_rgb_tensor(bad)
 
 
@@ -107,7 +107,7 @@ def test_pictures_that_make_no_batch_are_refused() -> None:
         to_rgb_batch([RGB, RGB.transpose(1, 2)])
     with pytest.raises(ValueError, match="no pictures"):
         to_rgb_batch([])
-    with pytest.raises(ValueError, match="a batch is"):
+    with pytest.raises(ValueError, match="a batch must be"):
         to_rgb_batch(torch.zeros(1, 2, 3, 4, 4))
 
 
@@ -119,7 +119,7 @@ def test_odd_sides_lose_a_line(height: int, width: int) -> None:
 
 @pytest.mark.parametrize("shape", [(3, 1, 8), (3, 8, 0), (0, 3, 8, 8)])
 def test_what_holds_no_bayer_cell_is_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="2 x 2 or larger"):
+    with pytest.raises(ValueError, match="at least 2 x 2"):
         even_sided(torch.zeros(shape))
 
 
@@ -157,7 +157,7 @@ def test_a_batch_that_is_a_list_of_pictures_is_not_taken_apart() -> None:
         ({"image": RGB, "id": 1}, "picture", "got 'picture'"),
         ((RGB, 1), 2, "tuples of 2"),
         ((RGB, 1), "image", "index of the picture"),
-        (RGB, "image", "leave key out"),
+        (RGB, "image", "omit key"),
     ],
 )
 def test_a_key_that_fits_nothing_says_what_would(sample: Any, key: Any, message: str) -> None:

@@ -114,7 +114,7 @@ def test_the_tone_curve_keeps_order_and_ends() -> None:
 
 
 def test_a_scene_that_is_no_picture_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"demo: a scene is uint8 \(3, H, W\)"):
+    with pytest.raises(ValueError, match=r"demo: a scene must be uint8 \(3, H, W\)"):
         DemoCamera().capture(torch.rand(3, 8, 8), generator())
     with pytest.raises(ValueError, match="even sides, got 9 x 8"):
         DemoCamera().capture(torch.zeros(3, 9, 8, dtype=torch.uint8), generator())
