@@ -143,7 +143,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
 ) -> None:
     quick = [
         "--train.validate_every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test_count", "1",
-        "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]",
+        "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]", "--untouched", "[]",
     ]  # fmt: skip
     command = ["run", "synthetic", "--seed", "3", "--seeds", "2", "--steps", "2", "--device", "cpu"]
     assert main([*command, *quick, "--out", str(tmp_path)]) == 0

@@ -1,4 +1,4 @@
-"""Domains: a transform and its inverse, noise of variance 1 in Anscombe's, of one camera in k-sigma's, bounded inputs."""
+"""Domains: the inverse, noise of variance 1 in Anscombe's and of one camera in k-sigma's, bounded inputs."""
 
 from __future__ import annotations
 
