@@ -1,4 +1,4 @@
-"""The command line: ``rawaug run | fit | evaluate | synth | denoise | preview | info | data``, by jsonargparse.
+"""The command line: ``rawaug run | fit | evaluate | synth | denoise | export | preview | info | data`` (jsonargparse).
 
 Bad input ends in one line on stderr that names the file or key and what to do, with exit status 2.
 """
@@ -20,6 +20,7 @@ COMMANDS = {
     "evaluate": "PSNR and SSIM of an ISP or a denoiser; the file says which.",
     "synth": "RAW pairs on disk from a folder of sRGB pictures; stopped, the same command goes on from there.",
     "denoise": "Denoise a RAW file, or a folder of them, to DNG; in a folder what is there is skipped.",
+    "export": "A denoiser as an ONNX file, compared with PyTorch.",
     "preview": "Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.",
     "info": "What is in a file of weights.",
 }

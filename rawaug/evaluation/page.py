@@ -87,14 +87,32 @@ class Page:
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """The file, with ``settings`` at its end."""
-        shown = html.escape(json.dumps(settings, indent=1))
-        body = "\n".join([*self.parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
-        title = f"<title>{html.escape(self.title)}</title>"
-        head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width">{title}'
-        path.parent.mkdir(parents=True, exist_ok=True)
-        text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
-        path.write_text(f"{text}</body></html>\n", encoding="utf-8")
-        return path
+        return _write(path, self.title, self.parts, settings)
+
+
+def write_figure_page(
+    path: Path,
+    title: str,
+    png: bytes,
+    head: Sequence[str],
+    rows: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Any],
+) -> Path:
+    """A page of one figure and one table."""
+    parts = [f"<h1>{html.escape(title)}</h1>", f"<p>{_picture(png, title)}</p>", _table(head, rows)]
+    return _write(path, title, parts, settings)
+
+
+def _write(path: Path, title: str, parts: Sequence[str], settings: Mapping[str, Any]) -> Path:
+    shown = html.escape(json.dumps(settings, indent=1))
+    body = "\n".join([*parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
+    head = (
+        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
+    path.write_text(f"{text}</body></html>\n", encoding="utf-8")
+    return path
 
 
 def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:

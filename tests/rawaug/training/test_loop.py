@@ -70,10 +70,10 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
             raise Killed
         return plain(a, b)
 
-    monkeypatch.setitem(loop.LOSSES, "l1", dies)
+    monkeypatch.setattr(loop, "LOSSES", {"l1": dies})
     with pytest.raises(Killed):
         loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
-    monkeypatch.setitem(loop.LOSSES, "l1", plain)
+    monkeypatch.setattr(loop, "LOSSES", {"l1": plain})
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)

@@ -76,8 +76,7 @@ def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
     sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
     for own in CFA:
         denoised = denoise(Red(width=4, scales=2), sample, pair.cfa, False, own)
-        # Rows of the greens may exchange their names where the pattern moves by a line.
-        ratio = (denoised / sample.noisy).median(-1).values.median(-1).values[0]
-        assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0]) and sorted(ratio[1:3].tolist()) == pytest.approx(
-            [3, 5]
-        )
+        # The two greens may exchange their names where the pattern moves by a line.
+        ratio = denoised.sum((0, 2, 3)) / sample.noisy.sum((0, 2, 3))
+        assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0], rel=1e-4)
+        assert sorted(ratio[1:3].tolist()) == pytest.approx([3.0, 5.0], rel=1e-4)
