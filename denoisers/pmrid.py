@@ -121,8 +121,9 @@ class PMRID(Denoiser):
         for k, ((inputs, outputs), skip) in enumerate(zip(decoder, reversed(sizes[:4]), strict=True), start=1):
             self.add_module(f"dec{k}", DecoderStage(inputs, outputs, skip))
         self.out0 = Residual(width)
-        self.out1 = _named(conv(width, channels))
-        self.initialise(seed, self.out1.conv, gain=RESIDUAL_GAIN)
+        last = conv(width, channels)
+        self.out1 = _named(last)
+        self.initialise(seed, last, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of 16, to the correction ``(B, channels, h, w)``."""

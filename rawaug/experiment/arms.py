@@ -126,4 +126,4 @@ def validation_samples(
         return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in middles]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
-    return [Watched(*(x[None] for x in sample)) for sample in drawn]
+    return [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]

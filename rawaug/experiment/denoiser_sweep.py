@@ -76,7 +76,7 @@ class DenoiserSweep:
 def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
     """The sweep in seconds, on the demo camera, without any trained denoiser."""
     name = f"{settings.name}-smoke"
-    quick = {"data": ["demo:test"], "count": 1, "crop": 128, "isos": settings.isos[:2], "denoisers": [], "pmrid": None}
+    quick: dict[str, Any] = {"data": ["demo:test"], "count": 1, "crop": 128, "isos": settings.isos[:2], "denoisers": [], "pmrid": None}
     return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
 
 

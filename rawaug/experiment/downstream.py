@@ -73,7 +73,8 @@ def psnr_d(
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
     crops = _crops(model, pictures, noise, config)
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
-    watched = [Watched(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
+    drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
+    watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
     net = train(
         stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
     )
