@@ -12,9 +12,9 @@ import argparse
 from pathlib import Path
 
 import torch
-from rawaug.io.pictures import decode_srgb, read_picture
 from torch import Tensor
 
+from rawaug.io.picture_files import decode_srgb, read_picture
 from rawaug.isp.cameras import colour_matrix, published_cameras
 from rawaug.isp.hull import colour_coordinates, greedy_atoms, nearest_in_hull, psnr, second_moment
 

@@ -13,11 +13,11 @@ import json
 from pathlib import Path
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.data import open_pairs
 from rawaug.experiment.methods import ROWS, fit_family, score_rows
 from rawaug.isp.fit import FitConfig
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 COUNTS = (1, 2, 3, 5)
@@ -34,7 +34,7 @@ def main() -> None:
     table: dict[int, list[dict[str, float]]] = {}
     for count in [count for count in COUNTS if count < len(pairs)]:
         table[count] = []
-        for subset in tqdm(range(options.subsets), desc=f"{count} frames", leave=False):
+        for subset in progress(range(options.subsets), label=f"{count} frames", unit="subset"):
             order = torch.randperm(len(pairs), generator=keyed_generator("subset", count, subset)).tolist()
             fitted = fit_family("dictionary", [pairs[k] for k in order[:count]], FitConfig(), (0.0, 0, 0), seed=0)
             scores = [score_rows(fitted, pairs[k], options.patches)["rows"] for k in order[count:]]

@@ -4,7 +4,7 @@
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
 repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
-repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is started anew when a
+repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is restarted when a
 decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
 line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
 more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
@@ -50,7 +50,7 @@ FORBIDDEN = OUTCOMES[3:]
 
 
 def readers(kind: str, path: Path) -> list[Callable[[], object]]:
-    """Everything in the package that reads such a file."""
+    """Every reader in the package for this kind of file."""
     import torch
 
     import denoisers
@@ -124,7 +124,7 @@ def work() -> None:
 
 
 class Worker:
-    """A process that reads files, started anew when it has died or is not to be trusted any more."""
+    """A process that reads files, restarted after a crash or a fault."""
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "stderr.txt"

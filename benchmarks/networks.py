@@ -63,20 +63,19 @@ def trained(name: str, args: argparse.Namespace) -> dict[str, float]:
     """PSNR on validation, in RAW and sRGB, after ``args.minutes`` of training; steps are fitted to the time."""
     import time
 
-    from rawaug.bayer import CFA
     from rawaug.data import open_pairs, open_pictures
     from rawaug.evaluation.scores import frozen_sample
-    from rawaug.isp.camera_sampling import CameraSampler
     from rawaug.noise import noise_model
-    from rawaug.training.camera_crops import CameraCrops
     from rawaug.training.loop import train
-    from rawaug.training.stream import TrainingStream
+    from rawaug.training.stream import PictureCrops, TrainingStream
     from rawaug.training.train_config import DenoiserConfig, TrainConfig
     from rawaug.training.validation import validate, watched
 
-    noise, cfa = noise_model(["any camera", "cycleisp_sidd"]), CFA.RGGB
+    noise = noise_model(["any camera", "cycleisp_sidd"])
     pictures = open_pictures(args.pictures, min_side=args.crop + 6)
-    crops = CameraCrops(pictures, CameraSampler(exposure=(-1.0, 0.2)), noise, args.crop, cfa, zoom=2.0)
+    augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
+    crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
+    cfa = augment.isp.cfa
     middles = [pair.middle(SIDE) for pair in open_pairs(args.validation, split="validation")]
     frames = [watched(frozen_sample(pair, noise, cfa, 0), pair, cfa) for pair in middles]
     stream = TrainingStream(None, crops, args.batch, 1.0, seed=0)

@@ -10,33 +10,37 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from denoisers.block_matching import BM3D
     from denoisers.catalogue import DENOISERS, build
-    from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
     from denoisers.dhdn import DHDN
     from denoisers.dncnn import DnCNN
     from denoisers.ensemble import SelfEnsemble
     from denoisers.nafnet import NAFNet
     from denoisers.network import Denoiser
+    from denoisers.non_local_means import NonLocalMeans
     from denoisers.pmrid import PMRID
     from denoisers.pretrained import from_pretrained
+    from denoisers.stabilised import Stabilised
     from denoisers.tiling import tiled
+    from denoisers.total_variation import TotalVariation
     from denoisers.unet import UNet
+    from denoisers.wavelet import Wavelet
     from denoisers.weight_files import load, save
 
 _MODULES = {
-    "BM3D": "denoisers.classical",
+    "BM3D": "denoisers.block_matching",
     "DENOISERS": "denoisers.catalogue",
     "DHDN": "denoisers.dhdn",
     "Denoiser": "denoisers.network",
     "DnCNN": "denoisers.dncnn",
     "NAFNet": "denoisers.nafnet",
-    "NonLocalMeans": "denoisers.classical",
+    "NonLocalMeans": "denoisers.non_local_means",
     "PMRID": "denoisers.pmrid",
     "SelfEnsemble": "denoisers.ensemble",
-    "Stabilised": "denoisers.classical",
-    "TotalVariation": "denoisers.classical",
+    "Stabilised": "denoisers.stabilised",
+    "TotalVariation": "denoisers.total_variation",
     "UNet": "denoisers.unet",
-    "Wavelet": "denoisers.classical",
+    "Wavelet": "denoisers.wavelet",
     "build": "denoisers.catalogue",
     "from_pretrained": "denoisers.pretrained",
     "load": "denoisers.weight_files",

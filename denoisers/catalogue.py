@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from types import MappingProxyType
 from typing import Any
 
-from denoisers.dhdn import DHDN
-from denoisers.dncnn import DnCNN
-from denoisers.nafnet import NAFNet
 from denoisers.network import Denoiser
-from denoisers.pmrid import PMRID
-from denoisers.unet import UNet
+from rawaug.registry import DENOISERS
 
-DENOISERS = MappingProxyType({"UNet": UNet, "DHDN": DHDN, "DnCNN": DnCNN, "PMRID": PMRID, "NAFNet": NAFNet})
-"""Name to class."""
+__all__ = ["DENOISERS", "build"]
 
 
 def build(name: str, **config: Any) -> Denoiser:
@@ -27,15 +20,5 @@ def build(name: str, **config: Any) -> Denoiser:
         >>> build("DnCNN", width=8, depth=3).config["depth"]
         3
     """
-    if name not in DENOISERS:
-        raise ValueError(f"denoiser {name!r} is unknown; use one of {', '.join(DENOISERS)}")
-    settings = inspect.signature(DENOISERS[name]).parameters
-    for key, value in config.items():
-        if key not in settings:
-            raise ValueError(f"{name} has no setting {key!r}; it has {', '.join(settings)}")
-        expected = type(settings[key].default)
-        if expected is tuple and isinstance(value, list):  # as JSON and YAML have it
-            config[key] = value = tuple(value)
-        if type(value) is not expected:
-            raise ValueError(f"{name}: {key} must be {expected.__name__}, got {value!r}")
-    return DENOISERS[name](**config)
+    network: Denoiser = DENOISERS.make({"name": name, "settings": config})
+    return network

@@ -9,11 +9,14 @@ Source: Park, Yu and Jeong, "Densely Connected Hierarchical Network for Image De
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.network import PACKED, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 LEVELS = 4
 
@@ -44,6 +47,7 @@ def _pointwise(inputs: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(conv(inputs, outputs, size=1), nn.PReLU())
 
 
+@DENOISERS.register("DHDN")
 class DHDN(Denoiser):
     """Park's DHDN; see the module's head. Any h, w >= 2: padded by reflection to multiples of 8 inside.
 
@@ -60,6 +64,8 @@ class DHDN(Denoiser):
         >>> DHDN(width=4, variance_map=False)(noisy).shape
         torch.Size([1, 4, 20, 30])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
     def __init__(
         self,

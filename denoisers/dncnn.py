@@ -7,9 +7,12 @@ Source: Zhang et al., "Beyond a Gaussian Denoiser: Residual Learning of Deep CNN
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 from torch import Tensor, nn
 
 from denoisers.network import PACKED, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 
 def _layer(width: int, batch_norm: bool) -> list[nn.Module]:
@@ -17,6 +20,7 @@ def _layer(width: int, batch_norm: bool) -> list[nn.Module]:
     return [conv(width, width, bias=not batch_norm), *norm, nn.ReLU(inplace=True)]
 
 
+@DENOISERS.register("DnCNN")
 class DnCNN(Denoiser):
     """Zhang's DnCNN; see the module's head. Any h, w >= 2; nothing is padded but the convolutions' zeros.
 
@@ -36,6 +40,8 @@ class DnCNN(Denoiser):
         >>> DnCNN(width=8, depth=5, variance_map=False)(noisy).shape
         torch.Size([1, 4, 20, 30])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
 
     def __init__(
         self,

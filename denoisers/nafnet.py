@@ -10,11 +10,14 @@ The channel attention averages over the whole input: a tile and the whole pictur
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 
 class ChannelNorm(nn.Module):
@@ -56,6 +59,7 @@ class Block(nn.Module):
         return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
 
 
+@DENOISERS.register("NAFNet")
 class NAFNet(Denoiser):
     """See the module's head. Any h, w >= 2: padded by reflection inside.
 
@@ -76,6 +80,8 @@ class NAFNet(Denoiser):
         torch.Size([2, 4, 33, 50])
     """
 
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "encoder": (1, 1), "middle": 1, "decoder": (1, 1)}
+
     def __init__(
         self,
         width: int = 32,
@@ -90,7 +96,7 @@ class NAFNet(Denoiser):
     ) -> None:
         require_width(width)
         if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
-            raise ValueError(f"encoder and decoder have as many scales as each other, got {encoder} and {decoder}")
+            raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
         super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]

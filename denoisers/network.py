@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -82,6 +82,9 @@ class Denoiser(nn.Module, ABC):
         ValueError: if there is no such domain.
     """
 
+    tiny: ClassVar[dict[str, Any]] = {}
+    """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
+
     def __init__(
         self,
         channels: int,
@@ -93,7 +96,7 @@ class Denoiser(nn.Module, ABC):
     ) -> None:
         super().__init__()
         if domain != "linear" and domain not in DOMAINS:
-            raise ValueError(f"domain {domain!r} is none of linear, {', '.join(DOMAINS)}")
+            raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         self.domain = domain
         self.channels = channels
         self.variance_map = variance_map
@@ -134,7 +137,7 @@ class Denoiser(nn.Module, ABC):
             return noisy + self._correction(noisy)
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
-            raise ValueError(f"{name} was made with {needed}: pass the noise variance of each value")
+            raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
         if self.domain == "linear":

@@ -4,18 +4,22 @@ Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwi
 half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
 convolution 2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
 
+ReLUs and sums work in place: on a CPU fresh memory costs more than they do.
+
 Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the
-published weights. ReLUs and sums work in place: on a CPU fresh memory costs more than they do.
+published weights.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 16
 BLOCKS = (2, 2, 4, 4)
@@ -82,6 +86,7 @@ class DecoderStage(nn.Module):
         return y.add_(self.proj_conv(skip).relu_())
 
 
+@DENOISERS.register("PMRID")
 class PMRID(Denoiser):
     """See the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
 
@@ -98,6 +103,8 @@ class PMRID(Denoiser):
         >>> PMRID(width=4)(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4}
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ Domain: packed RAW of any size. The equality is exact (to rounding) where the ov
 receptive radius and the tiles start at multiples of its stride, so that pooling grids fall on the same pixels as in the
 whole picture: from 17 pixels for a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with
 distance: with a trained U-Net of four scales the largest difference was 0.3 of the noise's deviation at an overlap of
-32, and 2e-6 at 64, which is the default. Only the middle of each tile is kept; nothing is blended: that would hide an
+32, and 2e-6 at 64; the default is 96. Only the middle of each tile is kept; nothing is blended: that would hide an
 overlap that is too small. Along each side all tiles have the same size, the smallest that does with as many of them.
 """
 
@@ -30,8 +30,8 @@ def tiled(
     model: Callable[[Tensor, Tensor | None], Tensor],
     noisy: Tensor,
     variance: Tensor | None = None,
-    tile: int = 384,
-    overlap: int = 64,
+    tile: int = 1536,
+    overlap: int = 96,
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients.
 

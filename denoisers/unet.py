@@ -7,11 +7,14 @@ last convolution to four channels. Source: Brooks et al., "Unprocessing Images f
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.network import LEAK, PACKED, Denoiser, conv, require_width
+from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 32
 """Features of the first scale in the paper."""
@@ -25,6 +28,7 @@ def _block(inputs: int, features: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+@DENOISERS.register("UNet")
 class UNet(Denoiser):
     """UPI's U-Net; see the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
 
@@ -42,6 +46,8 @@ class UNet(Denoiser):
         >>> UNet(width=8)(noisy, torch.full_like(noisy, 1e-4)).shape
         torch.Size([2, 4, 33, 50])
     """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
 r"""Files of weights: safetensors, with what is needed to build the network again as string metadata.
 
 ``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
-"info": <JSON: anything the writer wants to tell>}``. Nothing in such a file is code; only the classes in
-:data:`denoisers.catalogue.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
+"info": <JSON: anything else>}``. Nothing in such a file is code; only the classes in
+:data:`rawaug.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
 
     Args:
         model: one of the registered networks, on any device and in any memory format.
-        path: the file, in a folder that exists; by habit ``*.safetensors``.
-        info: what to tell about it (data, steps, seed, ...), as JSON can hold it.
+        path: the file, in a folder that exists; usually ``*.safetensors``.
+        info: JSON-serialisable description (data, steps, seed, ...).
 
     Raises:
-        ValueError: if the class is not registered, or ``info`` is nothing that JSON can hold.
+        ValueError: if the class is not registered, or ``info`` is not JSON-serialisable.
         FileNotFoundError: if the folder does not exist.
     """
     from safetensors.torch import save_file
 
     path = Path(path)
-    name = type(model).__name__
-    if DENOISERS.get(name) is not type(model):
-        raise ValueError(f"{path}: cannot save a {name}; only {', '.join(DENOISERS)} can be loaded again")
+    name = DENOISERS.name_of(type(model))
+    if name is None:
+        known = ", ".join(DENOISERS)
+        raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {known} can be loaded again")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: its folder does not exist; make it first")
+        raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
     try:
         texts = {"config": json.dumps(model.config), "info": json.dumps(info)}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: info must be what JSON can hold: {error}") from None
+        raise ValueError(f"{path}: info must be JSON-serialisable: {error}") from None
     tensors = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -108,7 +109,7 @@ def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
     try:
         value = json.loads(metadata.get(key, ""))
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: metadata {key!r} is no JSON: {error}") from None
+        raise ValueError(f"{path}: metadata {key!r} is not JSON: {error}") from None
     if not isinstance(value, dict):
         raise ValueError(f"{path}: metadata {key!r} must be a JSON object, got {type(value).__name__}")
     return value

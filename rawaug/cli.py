@@ -1,6 +1,6 @@
-"""The command line: ``rawaug run | fit | evaluate | synth | denoise | export | preview | info | data`` (jsonargparse).
+"""Train and evaluate RAW denoisers and camera ISPs.
 
-Bad input ends in one line on stderr that names the file or key and what to do, with exit status 2.
+Errors are one line on stderr that names the file or key and what to do; the exit status is then 2.
 """
 
 from __future__ import annotations
@@ -8,24 +8,12 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any
 
 from rawaug._version import __version__
+from rawaug.extras import MissingExtra
 
 BAD_INPUT = 2
-
-COMMANDS = {
-    "fit": "Fit a dictionary ISP to RAW files (and the camera's JPEGs of the same stems, where there are any).",
-    "evaluate": "PSNR and SSIM of an ISP or a denoiser; the file says which.",
-    "synth": "RAW pairs on disk from a folder of sRGB pictures; stopped, the same command goes on from there.",
-    "denoise": "Denoise a RAW file, or a folder of them, to DNG; in a folder what is there is skipped.",
-    "export": "A denoiser as an ONNX file, compared with PyTorch.",
-    "preview": "Two figures: the stages and augmented RAWs of a picture, and the atoms of the dictionaries.",
-    "info": "What is in a file of weights.",
-}
-"""By name, what each does; its module, with ``add_arguments`` and ``run``, is loaded when the parser is made, for a
-worker process of a command loads this module too."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,19 +23,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(argv)
-    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+    except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
-    except (ValueError, OSError, ArgumentError) as error:
+    except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print("rawaug: stopped; the same command goes on from here", file=sys.stderr)
+        print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
 
 
 def _dispatch(argv: list[str]) -> int:
+    from rawaug.commands.arguments import call
     from rawaug.experiment.kinds import kind_of
     from rawaug.experiment.recipe import find_recipe
+    from rawaug.registry import COMMANDS
 
     kind = "training"
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
@@ -63,43 +53,45 @@ def _dispatch(argv: list[str]) -> int:
     arguments = parser.instantiate(parsed)[command]
     if command == "run":
         _run(kind, arguments)
-    elif command == "data":
-        _module("check_data").run(arguments.check)
     else:
-        _module(command).run(arguments)
+        name, values = command, vars(arguments)
+        if "action" in values:  # a command of two words
+            name, values = f"{command} {values['action']}", vars(values[values["action"]])
+        call(COMMANDS[name], values)
     return 0
 
 
 def _parser(kind: str) -> Any:
     from jsonargparse import ArgumentParser
 
+    from rawaug.commands.arguments import add_arguments, summary
     from rawaug.experiment.kinds import KINDS
+    from rawaug.registry import COMMANDS
 
     def new(description: str) -> Any:
         return ArgumentParser(exit_on_error=False, description=description)
 
-    run = new("Every stage of a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
-    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a recipe in the package")
-    run.add_argument("--smoke", action="store_true", help="every stage in seconds on tiny built-in data")
+    run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
+    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
+    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
     run.add_class_arguments(KINDS[kind].settings)
-    parsers = {"run": run}
-    for name, description in COMMANDS.items():
-        parsers[name] = new(description)
-        _module(name).add_arguments(parsers[name])
-    data = parsers["data"] = new("About data: rawaug data check PATH.")
-    check = new("What is in a folder: which dataset, how many, sizes, patterns, levels, and what is broken.")
-    _module("check_data").add_arguments(check)
-
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
     subcommands = parser.add_subcommands(dest="command")
-    for name, subparser in parsers.items():
-        subcommands.add_subcommand(name, subparser, help=subparser.description)
-    data.add_subcommands(dest="action").add_subcommand("check", check, help=check.description)  # the outer ones first
+    subcommands.add_subcommand("run", run, help=run.description)
+    groups: dict[str, Any] = {}
+    for name, function in COMMANDS.items():
+        group, _, action = name.partition(" ")
+        command = new(summary(function))
+        add_arguments(command, function)
+        if not action:
+            subcommands.add_subcommand(name, command, help=command.description)
+            continue
+        if group not in groups:
+            above = new(f"Commands about {group}.")
+            subcommands.add_subcommand(group, above, help=above.description)  # the outer one first
+            groups[group] = above.add_subcommands(dest="action")
+        groups[group].add_subcommand(action, command, help=command.description)
     return parser
-
-
-def _module(command: str) -> Any:
-    return import_module(f"rawaug.commands.{command}")
 
 
 def _run(kind: str, arguments: Any) -> None:

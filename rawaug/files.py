@@ -104,7 +104,7 @@ def find_weights(name: str | Path, *more: Path) -> Path:
         if path.is_file():
             return path
     shipped = ", ".join(sorted(p.stem for folder in folders for p in folder.glob("*.safetensors")))
-    raise FileNotFoundError(f"{name}: no such weights; give a .safetensors file or a shipped one ({shipped})")
+    raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped name ({shipped})")
 
 
 def digest(*parts: bytes) -> str:

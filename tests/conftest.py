@@ -1,11 +1,17 @@
-"""The way to real camera files, where there are any."""
+"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do."""
 
 from __future__ import annotations
 
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import pytest
+import torch
+
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -18,16 +18,19 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "files", "metrics", "seeding", "_version"}
+BASE = {"bayer", "camera_names", "extras", "files", "metrics", "progress", "registry", "seeding", "_version"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
     "bayer": {"seeding"},
     "camera_names": set(),
+    "extras": set(),
     "files": set(),
     "metrics": set(),
+    "progress": set(),
+    "registry": set(),
     "seeding": set(),
-    "denoisers": {"bayer"},
+    "denoisers": {"bayer", "registry"},
     "kernels": {"bayer"},
     "noise": BASE | {"kernels"},
     "isp": BASE | {"kernels", "denoisers"},
@@ -125,8 +128,9 @@ def test_no_circles() -> None:
     [
         ("import rawaug", set()),
         ("import denoisers", set()),
-        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer"}),
-        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise"}),
+        ("import rawaug.registry", {"registry"}),
+        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "registry"}),
+        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "registry"}),
         ("from rawaug import DictionaryISP", {"bayer", "seeding", "files", "isp", "kernels"}),
     ],
 )

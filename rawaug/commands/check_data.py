@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rawaug.data import check
+from rawaug.registry import COMMANDS
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("path", type=str, help="a folder, a RAW file, or a submission to SIDD")
-    parser.add_argument("--first", type=int | None, default=None, help="read at most this many items of each kind")
+@COMMANDS.register("data check")
+def run(path: str, *, first: int | None = None) -> None:
+    """Identify the dataset, count items, sizes, CFAs and levels, and list damaged files.
 
-
-def run(arguments: Any) -> None:
-    """Print the report.
+    Args:
+        path: a folder, a RAW file, or a submission to SIDD.
+        first: read at most this many items of each kind.
 
     Raises:
         ValueError: if a file is damaged.
     """
-    report = check(arguments.path, arguments.first)
+    report = check(path, first)
     print(report)
     if report.broken:
-        raise ValueError(f"{arguments.path}: {len(report.broken)} damaged, listed above")
+        raise ValueError(f"{path}: {len(report.broken)} damaged, listed above")

@@ -1,4 +1,4 @@
-r"""``rawaug denoise``: RAW files in, denoised DNGs out.
+r"""``rawaug denoise``: RAW files to denoised DNGs.
 
     x = f(y, shot_var max(y, 0) + read_var),    d = round(clip(x, 0 <= d, x <= 1) (white - black) + black)
 
@@ -14,12 +14,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm.auto import tqdm
 
 import denoisers
 from denoisers.network import Denoiser
@@ -33,6 +31,8 @@ from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.progress import progress
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float]
@@ -41,24 +41,28 @@ Noise = str | Sequence[float]
 _NO_NOISE = (0.0, 0.0)
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("source", type=str, help="a RAW file, or a folder of them")
-    parser.add_argument("out", type=str, help="the DNG to write, or a folder")
-    denoiser_help = "a .safetensors file of rawaug run, or the name of a shipped denoiser"
-    parser.add_argument("--denoiser", type=str, default=DEFAULT, help=denoiser_help)
-    noise_help = "auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="auto", help=noise_help)
-    parser.add_argument("--self-ensemble", action="store_true", help="average eight views: eight times the work")
+@COMMANDS.register("denoise")
+def run(
+    source: str,
+    out: str,
+    *,
+    denoiser: str = DEFAULT,
+    noise: tuple[float, float] | str = "auto",
+    self_ensemble: bool = False,
+) -> None:
+    """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
 
-
-def run(arguments: Any) -> None:
-    """Denoise, and print what was done."""
-    a = arguments
-    if Path(a.source).is_dir():
-        print_denoised(denoise_folder(a.source, a.out, a.denoiser, a.noise, a.self_ensemble))
+    Args:
+        source: a RAW file, or a folder of them.
+        out: output DNG, or output folder.
+        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser.
+        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        self_ensemble: average eight views, at eight times the cost.
+    """
+    if Path(source).is_dir():
+        print_denoised(denoise_folder(source, out, denoiser, noise, self_ensemble))
     else:
-        print_denoised(DenoisedFolder([denoise_file(a.source, a.out, a.denoiser, a.noise, a.self_ensemble)]))
+        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, noise, self_ensemble)]))
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,8 @@ class Denoised:
 
     Attributes:
         source, out: the files.
-        shot_var, read_var: the noise that was reckoned with.
-        noise_source: ``"profile"``, ``"estimate"``, or what was asked for.
+        shot_var, read_var: the noise levels used.
+        noise_source: ``"profile"``, ``"estimate"``, or as requested.
         below_zero: share of sites whose result was below the digital number 0, and became 0.
         seconds: reading and writing included.
     """
@@ -114,35 +118,43 @@ def denoise_mosaic(
 
 
 def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame, and what told them; ``auto`` is the profile, else the estimate.
+    """(shot_var, read_var) of a frame and their source; ``auto`` is the profile, else the estimate.
 
     Raises:
-        ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or wants an ISO.
+        ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
     """
     if not isinstance(noise, str):
         fixed = FixedLevels(*noise)
         return fixed.shot_var, fixed.read_var, "given"
     if noise == "profile" or (noise == "auto" and frame.noise_profile is not None):
         if frame.noise_profile is None:
-            raise ValueError(f"{frame.name}: has no NoiseProfile tag; give --noise estimate, or the two variances")
+            raise ValueError(
+                f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or --noise '[shot_var, read_var]'"
+            )
         return *frame.noise_profile, "profile"
     if noise in ("auto", "estimate"):
         try:
             estimate = estimate_noise(frame.mosaic, frame.cfa)
         except ValueError as error:
-            raise ValueError(f"{frame.name}: {error}; or give --noise as two variances, or a camera's name") from None
+            raise ValueError(
+                f"{frame.name}: {error}; or pass --noise '[shot_var, read_var]' or a camera's name"
+            ) from None
         return estimate.shot_var, estimate.read_var, "estimate"
     if noise not in camera_names():
-        raise ValueError(f"noise {noise!r} is none of auto, profile, estimate, two variances, {camera_names()}")
+        raise ValueError(
+            f"noise {noise!r} is unknown; use auto, profile, estimate, [shot_var, read_var] or one of {camera_names()}"
+        )
     if frame.iso is None:
-        raise ValueError(f"{frame.name}: does not tell its ISO, which the levels of {noise} need; give two variances")
+        raise ValueError(
+            f"{frame.name}: has no ISO tag, needed for {noise}'s noise levels; pass --noise '[shot_var, read_var]'"
+        )
     try:
         levels = noise_levels(noise, iso=frame.iso)
     except ValueError as error:
         raise ValueError(f"{frame.name}: {error}") from None
     if isinstance(levels, EldLevels):
         return *levels.typical(), noise
-    shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # one ISO: nothing is left to chance
+    shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
     return float(shot_var), float(read_var), noise
 
 
@@ -159,7 +171,7 @@ def denoise_file(
         source: the RAW file.
         out: the DNG to write; its folder is made.
         weights: a denoiser's file, or the name of a shipped one.
-        noise: see :data:`Noise`; a network that needs no levels does not ask.
+        noise: see :data:`Noise`; ignored by networks without a noise map.
         self_ensemble: average eight flips and turns, eight times the work.
 
     Raises:
@@ -180,9 +192,9 @@ def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
 def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
     start = time.perf_counter()
     if out.suffix.lower() != ".dng":
-        raise ValueError(f"{out}: the result is a DNG; give a name that ends in .dng")
+        raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
     if out.resolve() == source.resolve():
-        raise ValueError(f"{out}: is the file to denoise; give another name")
+        raise ValueError(f"{out}: is the input file; give another name")
     model, cfa = loaded
     frame = read_raw(source)
     shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
@@ -196,7 +208,7 @@ def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     """Clip, in place, what a digital number cannot hold; its share of the sites. It is none where black is high enough.
 
-    A camera with black level 0 has clipped its noise there already: nothing that the source told is lost.
+    A camera with black level 0 has already clipped its noise there, so nothing is lost.
     """
     below = 0
     for (i, j), black in zip(frame.cfa.sites, frame.black, strict=True):
@@ -214,7 +226,7 @@ def denoise_folder(
     noise: Noise = "auto",
     self_ensemble: bool = False,
 ) -> DenoisedFolder:
-    """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; what is there is skipped.
+    """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
     Raises:
         FileNotFoundError: if there is no such file of weights.
@@ -227,7 +239,7 @@ def denoise_folder(
     settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
     require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
     result = DenoisedFolder()
-    for file, target in tqdm(targets.items(), desc="denoise", unit="file"):
+    for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists():
             result.existing += 1
             continue
@@ -242,10 +254,10 @@ def denoise_folder(
 
 def _targets(source: Path, out: Path) -> dict[Path, Path]:
     if out.resolve().is_relative_to(source.resolve()):
-        raise ValueError(f"{out}: the results would lie among the files of {source}; choose a folder outside")
+        raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
     files = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
     if not files:
-        raise ValueError(f"{source}: holds no RAW file; known are {', '.join(EXTENSIONS)}")
+        raise ValueError(f"{source}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}")
     targets: dict[Path, Path] = {}
     for file in files:
         target = (out / file.relative_to(source)).with_suffix(".dng")
@@ -256,12 +268,12 @@ def _targets(source: Path, out: Path) -> dict[Path, Path]:
 
 
 def print_denoised(result: DenoisedFolder) -> None:
-    """A line a file, and the broken ones by name."""
+    """One line per file, and the failed ones by name."""
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
-        clipped = f"; {done.below_zero:.2%} below the digital number 0, written as 0" if done.below_zero else ""
+        clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
         print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
-        print(f"{len(result.files)} denoised, {result.existing} there already, {len(result.broken)} broken")
+        print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for file, reason in result.broken.items():
-        print(f"broken: {reason}" if Path(file).stem in reason else f"broken: {file}: {reason}")
+        print(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}")

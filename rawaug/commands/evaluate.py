@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm.auto import tqdm
-
 import denoisers
 from denoisers.network import Denoiser
 from denoisers.pretrained import FOLDER
@@ -21,6 +19,7 @@ from rawaug.evaluation.scores import (
     Score,
     classical_method,
     installed_classical,
+    label_of,
     network_method,
     row_of,
     score_classical,
@@ -30,46 +29,53 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.progress import progress
+from rawaug.registry import COMMANDS, Spec
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("weights", type=str, help="a .safetensors file of rawaug fit or rawaug run, or a shipped name")
-    parser.add_argument("--data", type=str, required=True, help="folder of RAW files, one file, or kind:path")
-    parser.add_argument(
-        "--self-ensemble", action="store_true", help="also score the average over eight views (denoisers)"
-    )
-    noise_help = "noise added to frames without a noisy capture: a preset, a measured camera, or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str | None, default=None, help=noise_help)
-    parser.add_argument("--seed", type=int, default=0, help="of that noise")
-    classical = "classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D"
-    parser.add_argument("--classical", type=list[str], default=[], help=classical)
-    parser.add_argument("--device", type=str, default="cpu", help="device for a denoiser: cpu, cuda, ...")
-    page_help = "write an HTML page with a denoiser's scores and crops to this file"
-    parser.add_argument("--report", type=str | None, default=None, help=page_help)
-    parser.add_argument("--json", type=str | None, default=None, help="write the result as JSON to this file")
+@COMMANDS.register("evaluate")
+def run(
+    weights: str,
+    *,
+    data: str,
+    self_ensemble: bool = False,
+    noise: tuple[float, float] | str | dict[str, Any] | None = None,
+    seed: int = 0,
+    classical: list[str | dict[str, Any]] | None = None,
+    device: str = "cpu",
+    report: str | None = None,
+    json: str | None = None,
+) -> None:
+    """PSNR and SSIM of an ISP or a denoiser.
 
-
-def run(arguments: Any) -> None:
-    """Print the scores and write the requested files."""
-    settings = vars(arguments)
-    json_path = settings.pop("json")
-    result = evaluate(**settings)
+    Args:
+        weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
+        data: folder of RAW files, one file, or kind:path.
+        self_ensemble: also score the average over eight views (denoisers).
+        noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
+            {name, settings}.
+        seed: of that noise.
+        classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
+        device: device for a denoiser: cpu, cuda, ...
+        report: write an HTML page with a denoiser's scores and crops to this file.
+        json: write the result as JSON to this file.
+    """
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report)
     print_scores(result)
-    if json_path:
-        write_json(result, json_path)
-    if arguments.report:
-        print(f"page: {arguments.report}")
+    if json:
+        write_json(result, json)
+    if report:
+        print(f"page: {report}")
 
 
 def evaluate(
     weights: str | Path,
     data: str,
     self_ensemble: bool = False,
-    noise: str | Sequence[float] | None = None,
+    noise: NoiseSpec | None = None,
     seed: int = 0,
-    classical: Sequence[str] = (),
+    classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
 ) -> dict[str, Any]:
@@ -82,7 +88,7 @@ def evaluate(
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
         seed: of that noise.
-        classical: classical denoisers to score beside it on the same noise, see :data:`CLASSICAL`.
+        classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
 
@@ -99,8 +105,9 @@ def evaluate(
             raise ValueError(
                 f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
             )
-        isp, bar = DictionaryISP.from_pretrained(weights), tqdm(pairs, desc="evaluate", unit="image", leave=False)
-        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in bar])
+        isp = DictionaryISP.from_pretrained(weights)
+        frames = progress(pairs, label="evaluate", unit="image")
+        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
@@ -109,7 +116,7 @@ def evaluate(
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
-            methods = {name: classical_method(name, levels, seed) for name in classical}
+            methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
             methods["denoised"] = network_method(model, cfa)
             for pair in shown_on_page(pairs):
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
@@ -124,7 +131,7 @@ def _denoiser_result(
     cfa: CFA,
     seed: int,
     self_ensemble: bool,
-    classical: Sequence[str],
+    classical: Sequence[Spec],
 ) -> dict[str, Any]:
     """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
     result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}

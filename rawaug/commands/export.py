@@ -27,6 +27,7 @@ from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import replacing
 from rawaug.io import read_raw
 from rawaug.noise import noise_model
+from rawaug.registry import COMMANDS
 
 TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
@@ -51,17 +52,16 @@ class Exported(NamedTuple):
     seconds_torch: float
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("denoiser", type=str, help="a .safetensors file of rawaug run, or the name of a shipped one")
-    parser.add_argument("out", type=str, help="the .onnx file to write")
-    frame_help = "RAW file on whose middle both are compared; by default a generated frame"
-    parser.add_argument("--frame", type=str | None, default=None, help=frame_help)
+@COMMANDS.register("export")
+def run(denoiser: str, out: str, *, frame: str | None = None) -> None:
+    """Write a denoiser as an ONNX file, compared with PyTorch.
 
-
-def run(arguments: Any) -> None:
-    """Export, and print the comparison."""
-    done = export(arguments.denoiser, arguments.out, arguments.frame)
+    Args:
+        denoiser: a .safetensors file written by rawaug run, or the name of a shipped denoiser.
+        out: the .onnx file to write.
+        frame: RAW file on whose middle both are compared; by default a generated frame.
+    """
+    done = export(denoiser, out, frame)
     print(f"{done.out}: {done.out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {done.difference:.1e}")
     seconds = f"ONNX Runtime {done.seconds_onnx:.2f} s a megapixel, PyTorch {done.seconds_torch:.2f} s"
     print(f"{seconds} ({torch.get_num_threads()} threads)")

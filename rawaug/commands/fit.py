@@ -14,37 +14,48 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseEstimate, plot_noise
+from rawaug.registry import COMMANDS
 
 WATCHED_PATCHES = 4
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("data", type=str, nargs="+", help="RAW files, folders of them, or one kind:path")
-    jpeg_help = "use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering"
-    parser.add_argument("--camera-jpeg", type=bool, default=True, help=jpeg_help)
-    held_out_help = "frames excluded from the fit; their PSNR_r is shown during the fit"
-    parser.add_argument("--held-out", type=str | None, default=None, help=held_out_help)
-    parser.add_argument("--out", type=str, required=True, help="output .safetensors file")
-    noise_help = (
-        "measure the camera's noise, for noise: camera; auto continues without it where the frames do not allow it"
-    )
-    parser.add_argument("--noise", type=Literal["auto", "on", "off"], default="auto", help=noise_help)
-    parser.add_argument(
-        "--dark", type=str | None, default=None, help="folder of dark frames to measure the read variance"
-    )
-    parser.add_class_arguments(FitConfig)
+@COMMANDS.register("fit")
+def run(
+    data: list[str],
+    *,
+    camera_jpeg: bool = True,
+    held_out: str | None = None,
+    out: str,
+    noise: Literal["auto", "on", "off"] = "auto",
+    dark: str | None = None,
+    config: FitConfig,
+) -> None:
+    """Fit a dictionary ISP to RAW files, with the camera's JPEGs of the same stems if present.
 
-
-def run(arguments: Any) -> None:
-    """Fit, write the file and print a summary."""
-    settings = vars(arguments)
-    data, out = settings.pop("data"), settings.pop("out")
+    Args:
+        data: RAW files, folders of them, or one kind:path.
+        camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
+        held_out: frames excluded from the fit; their PSNR_r is shown during the fit.
+        out: output .safetensors file.
+        noise: measure the camera's noise, for noise: camera; auto continues without it where the frames do not
+            allow it.
+        dark: folder of dark frames to measure the read variance.
+        config: of the fit.
+    """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"--out {out}: the file must end in .safetensors")
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
-    isp = fit(data, noise_figure=figure, state=f"{out}.state", **settings)
+    isp = fit(
+        data,
+        noise_figure=figure,
+        state=f"{out}.state",
+        camera_jpeg=camera_jpeg,
+        held_out=held_out,
+        noise=noise,
+        dark=dark,
+        **vars(config),
+    )
     isp.info["data"] = data
     isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
@@ -53,9 +64,9 @@ def run(arguments: Any) -> None:
     if "noise_not_measured" in isp.info:
         print(f"noise not measured: {isp.info['noise_not_measured']}")
     if "noise" in isp.info:
-        noise = isp.info["noise"]
-        levels = f"shot_var {noise['shot_var']:.3g}, read_var {noise['read_var']:.3g}"
-        print(f"noise: {levels}, R^2 {noise['r2']:.3f}: {figure}")
+        measured = isp.info["noise"]
+        levels = f"shot_var {measured['shot_var']:.3g}, read_var {measured['read_var']:.3g}"
+        print(f"noise: {levels}, R^2 {measured['r2']:.3f}: {figure}")
 
 
 def fit(

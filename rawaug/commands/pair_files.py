@@ -26,8 +26,10 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug._version import __version__
+from rawaug.extras import extra
 from rawaug.files import find_weights, read_header, replacing, sha256, write_tensors
 from rawaug.io import GainMap, RawFrame, read_picture, write_dng
+from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
@@ -111,7 +113,8 @@ def _beside(stem: Path, ending: str) -> Path:
 
 
 def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
     with replacing(path) as partial:
@@ -146,7 +149,7 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
         "iso": None,
         "orientation": 0,
         "name": "",
-        "gain_maps": (_shading_map(augment, pair),) if "shading" in augment.isp.config.stages else (),
+        "gain_maps": _shading_maps(augment, pair),
     }
     noise = pair.params.noise
     levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
@@ -164,10 +167,10 @@ def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, floa
     With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
     white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
     """
-    stages, isp = augment.isp.config.stages, pair.params.isp
-    matrix = isp.matrix if "colour" in stages else torch.eye(3)
+    isp = pair.params.isp
+    matrix = isp.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
     grey = matrix.sum(1)
-    balance = (isp.gains if "gains" in stages else torch.ones(3)) / grey
+    balance = (isp.gains if augment.isp.find(WhiteBalance) else torch.ones(3)) / grey
     if not balance.min() > 0:
         raise ValueError(f"a DNG cannot store the white balance {balance.tolist()} of this pair; it must be positive")
     red, green, blue = balance.tolist()
@@ -180,15 +183,18 @@ def _black(darkest: float) -> float:
     return float(_BLACK_STEP * max(1, math.ceil(needed / _BLACK_STEP)))
 
 
-def _shading_map(augment: RawAugment, pair: RawPair) -> GainMap:
-    """What corrects the Gaussian part of the shading."""
+def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
+    """What corrects the Gaussian part of the shading, where there is any."""
+    lens = augment.isp.find(LensShading)
+    if lens is None:
+        return ()
     height, width = (2 * side for side in pair.clean.shape[-2:])
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2
     place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
-    mask = augment.isp.shading(place.to(place_in_frame(1, 1)))[0]
-    return GainMap(
+    mask = lens.mask(place.to(place_in_frame(1, 1)))[0]
+    corrected = GainMap(
         area=(0, 0, height, width),
         pitch=(1, 1),
         planes=(0, 1),
@@ -196,3 +202,4 @@ def _shading_map(augment: RawAugment, pair: RawPair) -> GainMap:
         spacing=(1 / (rows - 1), 1 / (columns - 1)),
         gains=1 / mask.detach(),
     )
+    return (corrected,)

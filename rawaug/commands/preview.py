@@ -1,7 +1,8 @@
 """``rawaug preview``: the stages of an ISP on a picture, augmented RAWs of it, and the atoms of the dictionaries.
 
 Linear images are shown through the sRGB curve, RAW bilinearly demosaiced and without white balance: greenish, as a
-sensor sees.
+sensor sees. The drawn RAWs are clean, and all developed alike, by the ISP's forward pass under the setting that it
+chooses for the picture: what differs between them is camera, light, tone and exposure.
 """
 
 from __future__ import annotations
@@ -13,34 +14,36 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.extras import extra
 from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
-_STAGE_TITLES = {"x1": "tone", "x2": "gamma", "x3": "colour", "x4": "white balance", "x5": "lens shading"}
 _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("picture", type=str, help="an sRGB picture")
-    parser.add_argument("--out", type=str, required=True, help="output PNG; the atoms are written to NAME-atoms.png")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    parser.add_argument("--count", type=int, default=4, help="number of augmented RAWs to plot")
-    parser.add_argument("--seed", type=int, default=0, help="of these")
+@COMMANDS.register("preview")
+def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0) -> None:
+    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
-
-def run(arguments: Any) -> None:
-    """Draw, and print the paths of the figures."""
-    for path in preview(arguments.picture, arguments.isp, arguments.out, arguments.count, arguments.seed):
+    Args:
+        picture: an sRGB picture.
+        out: output PNG; the atoms are written to NAME-atoms.png.
+        isp: ISP file, or the name of a shipped ISP.
+        count: number of augmented RAWs to plot.
+        seed: of these.
+    """
+    for path in preview(picture, isp, out, count, seed):
         print(path)
 
 
-def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 4, seed: int = 0) -> list[Path]:
+def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 8, seed: int = 0) -> list[Path]:
     """Draw both figures.
 
     Args:
@@ -74,24 +77,26 @@ def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
 
 @torch.no_grad()
 def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
     reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
-    panels = {"sRGB x": srgb[0] / 255.0}
+    panels, titles = {"sRGB x": srgb[0] / 255.0}, {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
     for name, image in reverse.intermediates.items():
         shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
-        panels[f"{name}: {_STAGE_TITLES[name]}"] = shown.clamp(0, 1)
+        panels[f"{name}: {titles[name]}"] = shown.clamp(0, 1)
     panels["RAW y"] = encode_srgb(bayer.demosaic(reverse.raw, isp.cfa)[0].clamp(0, 1))
     augment = RawAugment(isp)
     generator = keyed_generator(seed, "preview")
     for k in range(count):
         pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
-        title = f"noisy RAW {k + 1}\nshot {pair.params.noise['shot_var'].item():.1e}"
-        panels[title] = encode_srgb(bayer.demosaic(bayer.unpack(pair.noisy, isp.cfa), isp.cfa)[0].clamp(0, 1))
-    columns = len(panels) - count
-    rows = 1 + -(-count // columns)
+        gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
+        developed = isp.forward(bayer.unpack(pair.clean, isp.cfa), reverse.params)
+        panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed.srgb[0]
+    columns = max(len(panels) - count, 4)
+    rows = -(-len(panels) // columns)
     figure = Figure(figsize=(2.6 * columns, 2.6 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes:
@@ -104,28 +109,39 @@ def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> An
 
 @torch.no_grad()
 def _draw_atoms(isp: DictionaryISP) -> Any:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     colour, gains, shading, tone = figure.subplots(1, 4, width_ratios=[3, 2, 1.5, 2])
     _swatches(colour, isp)
     _gain_swatches(gains, isp)
-    mask = isp.shading(place_in_frame(75, 100))[0, 0] if "shading" in isp.config.stages else torch.ones(75, 100)
+    lens = isp.find(LensShading)
+    mask = lens.mask(place_in_frame(75, 100))[0, 0] if lens else torch.ones(75, 100)
     image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
     figure.colorbar(image, ax=shading, shrink=0.6)
     shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)
     shading.set(xticks=[], yticks=[])
-    grey = torch.linspace(0, 1, 256)
-    curve = isp.reverse_networks.tone(grey.expand(1, 3, 1, 256))[0, :, 0]
-    for line, name in zip(curve, ("tab:red", "tab:green", "tab:blue"), strict=True):
-        tone.plot(grey.numpy(), line.numpy(), color=name)
-    tone.set(xlabel="sRGB grey", ylabel="x1", aspect="equal")
-    tone.set_title(f"inverse tone curve, then gamma {isp.reverse_networks.gamma.item():.2f}", fontsize=9)
+    _tone_curves(tone, isp)
     return figure
 
 
+def _tone_curves(axis: Any, isp: DictionaryISP) -> None:
+    """What grey becomes: every tone atom in grey, the learned or typical curve in colour."""
+    grey = torch.linspace(0, 1, 256)
+    if isp.tone is not None:
+        axis.plot(grey.numpy(), isp.tone.curves[:, ::8].T.numpy(), color="0.75", linewidth=0.8)
+    for line, name in zip(isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0], ("red", "green", "blue"), strict=True):
+        axis.plot(grey.numpy(), line.numpy(), color=f"tab:{name}")
+    axis.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
+    atoms = (
+        "inverse tone curve and gamma" if isp.tone is None else f"{isp.config.tone_atoms} tone atoms, the typical one"
+    )
+    axis.set_title(atoms, fontsize=9)
+
+
 def _swatches(axis: Any, isp: DictionaryISP) -> None:
-    """One row an atom: what it makes of sRGB red, green, blue, white, skin and sky."""
+    """One row per atom: the result for sRGB red, green, blue, white, skin and sky."""
     tones = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])
     patches = torch.einsum("nij,kj->nki", isp.colour.atoms(), tones.float())
     axis.imshow(encode_srgb(patches.clamp(0, 1)).numpy(), aspect="auto")
@@ -140,7 +156,7 @@ def _gain_swatches(axis: Any, isp: DictionaryISP) -> None:
     atoms, channels = isp.gain.atoms(), isp.gain.channel_gains()
     light = channels.amin(1, keepdim=True) / channels
     axis.imshow(encode_srgb(light)[:, None].numpy(), aspect="auto", extent=(0, 1, len(atoms) - 0.5, -0.5))
-    weight = isp.reverse_networks.gain_encoder.prior.softmax(0)
+    weight = isp.reverse_encoders.gain.prior.softmax(0)
     for row, ((digital, red, blue), share) in enumerate(zip(atoms.tolist(), weight.tolist(), strict=True)):
         text = f"{digital:.2f}   {red:.2f}   {blue:.2f}   {share:.0%}"
         axis.text(0.5, row, text, ha="center", va="center", fontsize=min(8, 120 / len(atoms)), color="black")

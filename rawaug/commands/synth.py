@@ -19,10 +19,9 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.commands.pair_files import (
     Format,
@@ -33,33 +32,45 @@ from rawaug.commands.pair_files import (
     write_pair,
 )
 from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
+from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
 
 
-def add_arguments(parser: Any) -> None:
-    """The command's arguments."""
-    parser.add_argument("pictures", type=str, help="folder of sRGB pictures")
-    parser.add_argument("out", type=str, help="output folder")
-    parser.add_argument("--format", type=Format, default="dng", help="16-bit DNG, packed float32 NPZ or float32 TIFF")
-    parser.add_argument("--per-image", type=int, default=1, help="pairs per picture")
-    parser.add_argument("--isp", type=str, default="universal", help="ISP file, or the name of a shipped ISP")
-    noise_help = "a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var]"
-    parser.add_argument("--noise", type=tuple[float, float] | str, default="cycleisp_sidd", help=noise_help)
-    parser.add_argument("--sampling", type=Sampling, default="convex", help="how camera settings are drawn")
-    parser.add_argument("--seed", type=int, default=0, help="random seed")
-    parser.add_argument("--workers", type=int | None, default=None, help="number of processes; by default one per core")
+@COMMANDS.register("synth")
+def run(
+    pictures: str,
+    out: str,
+    *,
+    format: Format = "dng",
+    per_image: int = 1,
+    isp: str = "universal",
+    noise: tuple[float, float] | str = "cycleisp_sidd",
+    sampling: Sampling = "convex",
+    seed: int = 0,
+    workers: int | None = None,
+) -> None:
+    """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
-
-def run(arguments: Any) -> None:
-    """Make the pairs, and print a table."""
-    settings = vars(arguments)
-    print_synthesis(synth(settings.pop("pictures"), settings.pop("out"), **settings))
+    Args:
+        pictures: folder of sRGB pictures.
+        out: output folder.
+        format: 16-bit DNG, packed float32 NPZ or float32 TIFF.
+        per_image: pairs per picture.
+        isp: ISP file, or the name of a shipped ISP.
+        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
+        sampling: how camera settings are drawn.
+        seed: random seed.
+        workers: number of processes; by default one per core.
+    """
+    print_synthesis(synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers))
 
 
 @dataclass(frozen=True)
@@ -141,7 +152,8 @@ def synth(
     tasks = list(_tasks(pictures, source, out, per_image))
     result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
     todo = [task for task in tasks if task.numbers]
-    for task, error in tqdm(_done(todo, settings, workers), total=len(todo), desc="synth", unit="picture"):
+    bar = progress(_done(todo, settings, workers), label="synth", unit="picture", total=len(todo), leave=True)
+    for task, error in bar:
         if error is None:
             result.made += len(task.numbers)
         else:
@@ -264,15 +276,9 @@ def _make(task: _Task) -> str | None:
 
 
 def print_synthesis(result: Synthesis) -> None:
-    """A short table, and the broken pictures by name."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=str(result.out))
-    for column in ("pictures", "pairs made", "there already", "broken", "time (s)"):
-        table.add_column(column, justify="right")
+    """A short table, and the unreadable pictures by name."""
+    head = ("pictures", "pairs made", "existing", "unreadable", "time (s)")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
-    table.add_row(*map(str, numbers), f"{result.seconds:.1f}")
-    Console(width=100).print(table)
+    print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"broken: {reason}")
+        print(f"unreadable: {reason}")

@@ -6,7 +6,9 @@ clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writ
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from torch import Tensor
 
@@ -24,6 +26,7 @@ from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.data.sidd.submission import check_submission, write_submission
 from rawaug.data.zurich import Zurich
+from rawaug.registry import DATASETS, PICTURES, Registry, nearest
 
 __all__ = [
     "DataReport",
@@ -53,17 +56,6 @@ __all__ = [
     "write_submission",
 ]
 
-_PAIR_KINDS: dict[str, Callable[[str, str], Sequence[Pair]]] = {
-    "demo": lambda path, split: demo_pairs(path or split),
-    "dnd": lambda path, split: _no_clean_frames(path),
-    "fivek": lambda path, split: fivek_pairs(path, split),
-    "fivek_canon": lambda path, split: fivek_pairs(path, split, ["canon"]),
-    "fivek_nikon": lambda path, split: fivek_pairs(path, split, ["nikon"]),
-    "rawir": lambda path, split: Rawir(path, split),
-    "sidd": lambda path, split: _sidd(path, split),
-    "siddplus": lambda path, split: SiddPlusBlocks(path),
-    "zurich": lambda path, split: Zurich(path, split),
-}
 _SPLITS = ("train", "validation", "test")
 
 
@@ -86,16 +78,13 @@ def open_pairs(spec: str, split: str = "test") -> Sequence[Pair]:
     kind, path = _kind_and_path(spec)
     if kind is None:
         return RawFolder(path)
-    if kind not in _PAIR_KINDS:
-        known = ", ".join(f"{name}:" for name in _PAIR_KINDS)
-        raise ValueError(f"{spec}: unknown kind of data; use {known} or the path of a RAW file or folder")
-    if kind != "demo" and not path:
-        raise ValueError(f"{spec}: has no path; write {kind}:PATH")
+    reader = _reader(DATASETS, spec, kind, path, "a RAW file or folder")
     path, named = _path_and_split(path)
-    return _PAIR_KINDS[kind](path, named or split)
+    pairs: Sequence[Pair] = reader(path, named or split)
+    return pairs
 
 
-def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
+def open_pictures(spec: str, min_side: int = 2) -> Sequence[Tensor] | PictureFolder:
     """Open sRGB pictures, uint8 ``(3, H, W)``: a folder, or ``"demo:"``.
 
     Args:
@@ -108,9 +97,18 @@ def open_pictures(spec: str, min_side: int = 2) -> list[Tensor] | PictureFolder:
     kind, path = _kind_and_path(spec)
     if kind is None:
         return PictureFolder(path, min_side)
-    if kind != "demo" or path:
-        raise ValueError(f"{spec}: unknown kind of pictures; use demo: or the path of a folder")
-    return demo_pictures()
+    pictures: Sequence[Tensor] = _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
+    return pictures
+
+
+def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:
+    if kind not in kinds:
+        known = ", ".join(f"{name}:" for name in kinds)
+        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{nearest(kind, kinds)}")
+    reader: Callable[[str, Any], Any] = kinds[kind]
+    if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
+        raise ValueError(f"{spec}: has no path; write {kind}:PATH")
+    return reader
 
 
 def _kind_and_path(spec: str) -> tuple[str | None, str]:
@@ -123,18 +121,3 @@ def _path_and_split(path: str) -> tuple[str, str | None]:
     """``"path:split"`` taken apart; demo's bare split is its path."""
     folder, colon, split = path.rpartition(":")
     return (folder, split) if colon and split in _SPLITS else (path, None)
-
-
-def _sidd(path: str, split: str) -> Sequence[Pair]:
-    if split == "train":
-        return SiddFrames(path)
-    if split == "test":
-        return SiddBlocks(path)
-    raise ValueError(
-        f"sidd:{path}: no split {split}; use train (full frames) or test (validation blocks), "
-        "and another folder, or null, for validation"
-    )
-
-
-def _no_clean_frames(path: str) -> Sequence[Pair]:
-    raise ValueError(f"dnd:{path}: the clean frames of DND are not public; use rawaug.data.Dnd and submit the results")

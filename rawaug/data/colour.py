@@ -3,7 +3,7 @@ r"""Colour from DNG-style metadata, and a plain development.
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
 with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ (IEC 61966-2-1): grey stays grey. The
-white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's: so were SIDD's pictures made
+white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
 (A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
 """
 

@@ -22,6 +22,8 @@ from torch import Tensor
 from rawaug.bayer import CFA
 from rawaug.data.colour import color_matrix, white_balance
 from rawaug.data.mat import read_array, read_value
+from rawaug.data.pair import Pair
+from rawaug.registry import DATASETS
 
 FRAMES, BOXES = 50, 20
 _EVALUATION = "1.0"
@@ -142,6 +144,16 @@ class _Frame:
             )
         except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
             raise ValueError(f"{file}: frame {index + 1} of info is not as published ({error})") from error
+
+
+@DATASETS.register("dnd")
+def no_clean_frames(path: str, split: str) -> Sequence[Pair]:
+    """Nothing: DND has no pairs.
+
+    Raises:
+        ValueError: always, with what to do instead.
+    """
+    raise ValueError(f"dnd:{path}: the clean frames of DND are not public; use rawaug.data.Dnd and submit the results")
 
 
 def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None:

@@ -14,16 +14,18 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 
 from rawaug.data.raw_folder import RawFolder
+from rawaug.registry import DATASETS
 
 CAMERAS = ("canon", "nikon")
 _DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
 
+@DATASETS.register("fivek")
 def fivek_pairs(
     path: str | Path, split: str, cameras: Sequence[str] = CAMERAS, adjust_maximum_thr: float = 0.0
 ) -> RawFolder:
@@ -56,6 +58,10 @@ def fivek_pairs(
             f"first a{missing[0]}-*.dng"
         )
     return RawFolder([files[number] for number in wanted], camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr)
+
+
+DATASETS.register("fivek_canon")(partial(fivek_pairs, cameras=["canon"]))
+DATASETS.register("fivek_nikon")(partial(fivek_pairs, cameras=["nikon"]))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.extras import extra
+
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
 _DAMAGE = (
@@ -72,7 +74,8 @@ def _read(path: Path, name: str, plain: bool) -> Any:
     if mat_version(path) == "5":
         return _read_5(path, name, plain)
     with _as_os_error(path):
-        import h5py
+        with extra("data"):
+            import h5py
 
         with h5py.File(path, "r") as file:
             if name not in file:
@@ -116,7 +119,8 @@ def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
 
 def _plain(node: Any, file: Any) -> Any:
     """An HDF5 node of a 7.3 file as plain values."""
-    import h5py
+    with extra("data"):
+        import h5py
 
     if isinstance(node, h5py.Group):
         fields = {key: _plain(node[key], file) for key in node}
@@ -136,6 +140,7 @@ def _plain(node: Any, file: Any) -> Any:
 
 def _refers(node: Any) -> bool:
     """Whether a node holds references: a cell, or a field of a struct array."""
-    import h5py
+    with extra("data"):
+        import h5py
 
     return isinstance(node, h5py.Dataset) and h5py.check_ref_dtype(node.dtype) is not None

@@ -1,4 +1,4 @@
-"""A folder of sRGB pictures as a map-style dataset, for folders as they are: large, and with some damaged files.
+"""A folder of sRGB pictures as a map-style dataset, for real folders: large, with some damaged files.
 
 Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
 cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
@@ -164,7 +164,7 @@ class _Names(Sequence[str]):
 
 
 def _listed(folder: Path) -> Iterator[str]:
-    """Paths below ``folder`` that have a picture's extension, as they come; a folder of such a name is a folder."""
+    """Paths below ``folder`` that have a picture's extension, unordered; folders with such a name are skipped."""
 
     def refuse(error: OSError) -> None:
         raise error

@@ -21,6 +21,7 @@ from rawaug.bayer import CFA, unpack
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import read_picture
+from rawaug.registry import DATASETS
 
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
@@ -28,6 +29,7 @@ WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
 
 
+@DATASETS.register("rawir")
 class Rawir(LazyPairs):
     """The pairs below a folder, in RGGB.
 

@@ -23,11 +23,13 @@ from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import read_picture
 from rawaug.io.picture_files import read_plane
+from rawaug.registry import DATASETS
 
 BLACK, WHITE = 63, 1020
 _BITS = 10
 
 
+@DATASETS.register("zurich")
 class Zurich(LazyPairs):
     """The pairs of a split, sorted by number.
 

@@ -24,6 +24,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
 from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, table_rows
+from rawaug.extras import extra
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -133,7 +134,8 @@ def most_detailed(packed: Tensor) -> tuple[int, int]:
 
 def encode_png(srgb: Tensor) -> bytes:
     """sRGB ``(3, H, W)`` in [0, 1] as a PNG file."""
-    from PIL import Image
+    with extra("train"):
+        from PIL import Image
 
     file = io.BytesIO()
     Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).numpy()).save(file, "PNG")
@@ -145,7 +147,8 @@ def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
 
     Thin lines are the thirds of the validation frames with least (dotted), middling and most noise (dash-dotted).
     """
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     lines = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
     figure = Figure(figsize=(15, 3.6), layout="constrained")

@@ -50,7 +50,7 @@ def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
 
 @torch.no_grad()
 def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
-    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, within [0, 1], in the pattern of the pair.
+    """The RAW ``(1, 1, H, W)`` reconstructed from the pair's sRGB under ``params``, within [0, 1], in its pattern.
 
     Strip by strip, to bound memory.
     """
@@ -78,7 +78,7 @@ def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
 
 @torch.no_grad()
 def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: int | None) -> float:
-    """Mean PSNR over windows of what ``make`` makes of an sRGB patch ``(1, 3, h, w)`` and its place in the frame."""
+    """Mean PSNR over windows; ``make`` maps an sRGB patch ``(1, 3, h, w)`` and its place in the frame to RAW."""
     values, (height, width) = [], pair.raw.shape[-2:]
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))

@@ -16,11 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm.auto import tqdm
 
 import denoisers
-from denoisers.classical import Classical, Stabilised
 from denoisers.network import Denoiser
+from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed, exposure_of
@@ -29,10 +28,9 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe
+from rawaug.progress import progress
+from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
-
-TILE, OVERLAP = 1536, 96
-"""Side in packed pixels of the pieces in which large frames are denoised, and what neighbours share on each side."""
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -84,9 +82,7 @@ def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool, own:
         mosaic = bayer.unpack(denoise(model, shifted, own, self_ensemble), own)
         height, width = mosaic.shape[-2:]
         return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
-    run: Any = model
-    if max(sample.noisy.shape[-2:]) > TILE:
-        run = partial(denoisers.tiled, model, tile=TILE, overlap=OVERLAP)
+    run: Any = partial(denoisers.tiled, model)
     if self_ensemble:
         run = denoisers.SelfEnsemble(run, cfa, views=8)
     device = next(model.parameters()).device
@@ -98,7 +94,7 @@ def score_method(
     method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
     """Scores of every frame, with what was compared; one frame in memory at a time."""
-    for pair in tqdm(pairs, desc=label, unit="image", leave=False):
+    for pair in progress(pairs, label=label, unit="image"):
         sample = frozen_sample(pair, noise, cfa, seed)
         denoised = method(pair, sample)
         values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
@@ -139,48 +135,40 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
     return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
 
 
-CLASSICAL: dict[str, Callable[[], Classical]] = {
-    "NonLocalMeans": denoisers.NonLocalMeans,
-    "Wavelet": denoisers.Wavelet,
-    "TotalVariation": denoisers.TotalVariation,
-    "BM3D": denoisers.BM3D,
-}
-"""By name; BM3D needs a wheel of its own."""
-
-
-def require_classical(names: Sequence[str]) -> None:
-    """Check the name of a classical denoiser.
+def require_classical(specs: Sequence[Spec]) -> None:
+    """Check the names and settings of classical denoisers.
 
     Raises:
-        ValueError: if it is unknown.
+        ValueError: if one is unknown.
     """
-    for name in names:
-        if name not in CLASSICAL:
-            raise ValueError(f"classical: {name} is unknown; use one of {', '.join(CLASSICAL)}")
+    for spec in specs:
+        FILTERS.make(spec)
 
 
-def installed_classical(names: Sequence[str]) -> list[str]:
+def installed_classical(specs: Sequence[Spec]) -> list[Spec]:
     """The classical denoisers without BM3D where its wheel is missing, which is then printed.
 
     Raises:
         ValueError: if a name is unknown.
     """
-    require_classical(names)
-    if "BM3D" not in names or find_spec("bm3d") is not None:
-        return list(names)
-    print("classical: BM3D is left out; it needs the bm3d wheel, which is for non-commercial use: pip install bm3d")
-    return [name for name in names if name != "BM3D"]
+    require_classical(specs)
+    if find_spec("bm3d") is not None:
+        return list(specs)
+    kept = [spec for spec in specs if name_and_settings(spec)[0] != "BM3D"]
+    if len(kept) < len(specs):
+        print("classical: BM3D is left out; it needs the bm3d wheel, which is for non-commercial use: pip install bm3d")
+    return kept
 
 
-def classical_method(name: str, noise: NoiseModel, seed: int) -> Method:
+def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
     """A classical denoiser as something to score; shot noise is stabilised before and after."""
-    require_classical([name])
-    denoiser = CLASSICAL[name]()
+    denoiser = FILTERS.make(spec)
 
     def method(pair: Pair, sample: Sample) -> Tensor:
         levels = frozen_levels(pair, noise, seed)
         if levels is None or not levels[0] > 0:
-            return denoiser(sample.noisy, sample.variance)
+            denoised: Tensor = denoiser(sample.noisy, sample.variance)
+            return denoised
         shot_var, read_var = (torch.tensor([level]) for level in levels)
         return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
 
@@ -197,14 +185,20 @@ def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, floa
 
 
 def score_classical(
-    names: Sequence[str], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
+    specs: Sequence[Spec], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
 ) -> dict[str, dict[str, Any]]:
-    """The summary of each classical denoiser, by name."""
-    methods = {name: classical_method(name, noise, seed) for name in names}
+    """The summary of each classical denoiser, by name, with its settings where it has some."""
+    methods = {label_of(spec): classical_method(spec, noise, seed) for spec in specs}
     return {
         name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
         for name, method in methods.items()
     }
+
+
+def label_of(spec: Spec) -> str:
+    """A classical denoiser's name in tables."""
+    name, settings = name_and_settings(spec)
+    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
 
 def summary(scores: Sequence[Score]) -> dict[str, Any]:

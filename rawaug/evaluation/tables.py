@@ -17,6 +17,7 @@ from torch import Tensor
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
+from rawaug.extras import extra
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
@@ -24,6 +25,10 @@ PANEL = 256
 
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
 """Of an image: on the mosaic, and developed."""
+
+
+WIDTH = 140
+"""Columns of a printed table where stdout is no terminal."""
 
 
 @dataclass
@@ -37,7 +42,8 @@ class Row:
 
 def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
     """Write the figure: one line of panels a row."""
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     columns = max(len(row.panels) for row in rows)
     figure = Figure(figsize=(3.2 * columns, 3.2 * len(rows)), layout="constrained")
@@ -111,44 +117,41 @@ def table_rows(
     return rows
 
 
-def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-    """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
+def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
+    """Print a table: a name and figures in each row, a line between sections."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title=title)
-    table.add_column("arm")
-    for column in COLUMNS:
-        table.add_column(column, justify="right")
-    for method, cells in table_rows(results, classical, COLUMNS).items():
-        table.add_row(method, *cells)
-    Console(width=110).print(table)
+    for k, column in enumerate(head):
+        table.add_column(column, justify="right" if k else "left")
+    for rows in sections:
+        for row in rows:
+            table.add_row(*row)
+        table.add_section()
+    console = Console()
+    (console if console.is_terminal else Console(width=WIDTH)).print(table)
+
+
+def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
+    rows = [[method, *cells] for method, cells in table_rows(results, classical, COLUMNS).items()]
+    print_rows(title, ["arm", *COLUMNS], rows)
 
 
 def print_scores(result: Mapping[str, Any]) -> None:
     """The table of ``rawaug evaluate``."""
-    from rich.console import Console
-    from rich.table import Table
-
-    title = "PSNR_r, RAW reconstruction" if result["kind"] == "isp" else "PSNR_d, RAW denoising"
-    table = Table(title=f"{title}: {result['data']}")
-    table.add_column("image")
-    table.add_column("PSNR (dB)", justify="right")
-    for column in ("SSIM", "PSNR, sRGB", "SSIM, sRGB") if result["kind"] == "denoiser" else ():
-        table.add_column(column, justify="right")
-    metrics = METRICS[: len(table.columns) - 1]
-    for image in result["images"]:
-        table.add_row(image["name"], *_cells(image, "{}", metrics))
-    table.add_section()
+    denoiser = result["kind"] == "denoiser"
+    head = ["PSNR (dB)", "SSIM", "PSNR, sRGB", "SSIM, sRGB"][: None if denoiser else 1]
+    metrics = METRICS[: len(head)]
+    images = [[image["name"], *_cells(image, "{}", metrics)] for image in result["images"]]
     shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
-    for label, key in shown.items():
-        if key.format("psnr") in result:
-            table.add_row(label, *_cells(result, key, metrics))
-    if "plain" in result:
-        table.add_row("mean, without self-ensemble", *_cells(result["plain"], "{}", metrics))
-    for name, scores in result.get("classical", {}).items():
-        table.add_row(name, *_cells(scores, "{}", metrics))
-    Console(width=100).print(table)
+    means = [[name, *_cells(result, key, metrics)] for name, key in shown.items() if key.format("psnr") in result]
+    others = {"mean, without self-ensemble": result["plain"]} if "plain" in result else {}
+    others |= result.get("classical", {})
+    means += [[name, *_cells(scores, "{}", metrics)] for name, scores in others.items()]
+    title = "PSNR_d, RAW denoising" if denoiser else "PSNR_r, RAW reconstruction"
+    print_rows(f"{title}: {result['data']}", ["image", *head], images, means)
 
 
 def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:

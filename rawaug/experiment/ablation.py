@@ -1,4 +1,4 @@
-r"""Which stage brings how many decibels: PSNR of every intermediate image of the reverse pass against the RAW.
+r"""The contribution of each stage: PSNR of every intermediate image of the reverse pass against the RAW.
 
 ``x, x1, ..., x5`` against the demosaiced RAW, in RGB, in luminance Y and in chrominance UV (ITU-R BT.601), as in the
 ablation figure of Conde et al., AAAI 2022; with each frame's as-shot gains and blind. And the other way round: fits
@@ -14,12 +14,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.evaluation.tables import print_rows
+from rawaug.extras import extra
 from rawaug.files import write_json
 from rawaug.isp import conditioning
 from rawaug.isp.config import POINTWISE_STAGES
@@ -27,6 +28,7 @@ from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.progress import progress
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """RGB to YUV, ITU-R BT.601."""
@@ -39,7 +41,7 @@ STRIDE = 4
 
 @dataclass
 class Ablation:
-    """What each stage is worth.
+    """The contribution of each stage.
 
     Args:
         experiment: "ablation".
@@ -68,11 +70,11 @@ def ablate(ablation: Ablation) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``."""
     pairs = list(open_pairs(ablation.data, split="train"))
     if len(pairs) < 2:
-        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leaving one out needs two or more")
+        raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), Path(ablation.out) / ablation.name
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
-    for left_out in tqdm(pairs, desc="ablation", unit="frame", leave=False):
+    for left_out in progress(pairs, label="ablation", unit="frame"):
         others = [pair for pair in pairs if pair is not left_out]
         isp = fit_isp(others, config, progress=False)
         for given, curves in stagewise.items():
@@ -136,7 +138,8 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: Path, title: str) -> Path:
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(2, 2, 1.3))
@@ -158,14 +161,9 @@ def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: 
 
 
 def _print(result: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title="PSNR against RAW after each stage (dB), frames left out")
-    for k, head in enumerate(("given", "space", *TITLES)):
-        table.add_column(head, justify="right" if k > 1 else "left")
-    for given, rows in result["stages"].items():
-        for k, space in enumerate(SPACES):
-            table.add_row(given, space, *(f"{row[k]:.2f}" for row in rows))
-    Console().print(table)
+    sections = [
+        [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
+        for given, rows in result["stages"].items()
+    ]
+    print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
     print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))

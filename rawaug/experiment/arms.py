@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
-from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
-from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
-from rawaug.training.camera_crops import CameraCrops
-from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, Supervised
+from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 from rawaug.training.validation import Watched, watched
@@ -31,26 +29,19 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     """The estimator that the arm names.
 
     Example:
-        >>> estimator_of(ArmConfig(estimator="r2r", alpha=0.5)).alpha
+        >>> estimator_of(ArmConfig(estimator={"name": "r2r", "settings": {"alpha": 0.5}})).alpha
         0.5
     """
-    if arm.estimator == "noisier":
-        return Noisier(arm.alpha, arm.correct)
-    if arm.estimator == "noise2noise":
-        return Noise2Noise()
-    if arm.estimator == "r2r":
-        return R2R(arm.alpha)
-    if arm.estimator == "neighbor2neighbor":
-        return Neighbor2Neighbor(arm.gamma)
-    return Supervised()
+    estimator: Supervised = ESTIMATORS.make(arm.estimator)
+    return estimator
 
 
 def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
-    """The ISP of the same camera behind another CFA; its tensors are shared."""
+    """The ISP of the same camera behind another CFA, a copy."""
     if isp.cfa == cfa:
         return isp
-    other = copy.copy(isp)
-    other.config = replace(isp.config, cfa=str(cfa))
+    other = copy.deepcopy(isp)
+    other.configure(cfa=str(cfa))
     return other
 
 
@@ -81,7 +72,7 @@ def training_stream(
             frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
             real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
         if arm.augmented:
-            augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
+            augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
             frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
             synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
     else:
@@ -93,18 +84,9 @@ def training_stream(
 
 
 def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: DictionaryISP, noise: NoiseModel) -> Source:
-    """Crops of the sRGB pictures as RAW of the ISP's cameras, or of published ones."""
-    crop = recipe.train.crop
-    if arm.sampling == "published":
-        return CameraCrops(pictures, CameraSampler(exposure=arm.exposure), noise, crop, isp.cfa, arm.zoom)
-    augment = RawAugment(isp, noise, _of_atoms(arm), arm.strength, exposure=arm.exposure)
-    return PictureCrops(RawPairs(pictures, augment, crop))
-
-
-def _of_atoms(arm: ArmConfig) -> Sampling:
-    if arm.sampling == "published":
-        raise ValueError("arms: sampling published is for supervised arms; use convex, perturb or chosen")
-    return arm.sampling
+    """Crops of the sRGB pictures as RAW of the ISP's cameras."""
+    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
+    return PictureCrops(RawPairs(pictures, augment, recipe.train.crop, zoom=arm.zoom))
 
 
 def validation_samples(

@@ -24,10 +24,11 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.page import write_figure_page
-from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, score_method
+from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
 from rawaug.evaluation.tables import METRICS
 from rawaug.files import replacing, write_json
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.registry import Spec
 
 TITLES = {"psnr": "PSNR, RAW (dB)", "ssim": "SSIM, RAW", "psnr_srgb": "PSNR, sRGB (dB)", "ssim_srgb": "SSIM, sRGB"}
 
@@ -60,7 +61,7 @@ class DenoiserSweep:
     camera: str = "Sony ILCE-7M3"
     isos: list[int] = field(default_factory=lambda: [100, 400, 1600, 6400, 25600])
     denoisers: list[str] = field(default_factory=lambda: [DEFAULT])
-    classical: list[str] = field(default_factory=lambda: ["NonLocalMeans"])
+    classical: list[str | dict[str, Any]] = field(default_factory=lambda: ["NonLocalMeans"])
     pmrid: str | None = None
     seed: int = 0
     device: str = "cpu"
@@ -76,7 +77,14 @@ class DenoiserSweep:
 def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
     """The sweep in seconds, on the demo camera, without any trained denoiser."""
     name = f"{settings.name}-smoke"
-    quick: dict[str, Any] = {"data": ["demo:test"], "count": 1, "crop": 128, "isos": settings.isos[:2], "denoisers": [], "pmrid": None}
+    quick: dict[str, Any] = {
+        "data": ["demo:test"],
+        "count": 1,
+        "crop": 128,
+        "isos": settings.isos[:2],
+        "denoisers": [],
+        "pmrid": None,
+    }
     return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
 
 
@@ -115,14 +123,18 @@ Maker = Callable[[Pair, NoiseModel, int], Method]
 def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
     """Every method by name, the noisy input first."""
     makers: dict[str, Maker] = {"noisy input": lambda pair, noise, seed: lambda _, sample: sample.noisy}
-    for name in installed_classical(settings.classical):
-        makers[name] = lambda pair, noise, seed, name=name: classical_method(name, noise, seed)  # type: ignore[misc]
+    for spec in installed_classical(settings.classical):
+        makers[label_of(spec)] = _filter(spec)
     for name in settings.denoisers:
         model, info = denoisers.load(find(name))
         makers[Path(name).stem] = _network(model.to(settings.device), CFA(info.get("cfa", "RGGB")), clip=False)
     if settings.pmrid is not None:
         makers["PMRID as published"] = _network(_published(settings.pmrid).to(settings.device), CFA.RGGB, clip=True)
     return makers
+
+
+def _filter(spec: Spec) -> Maker:
+    return lambda pair, noise, seed: classical_method(spec, noise, seed)
 
 
 def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:

@@ -1,7 +1,7 @@
 """A recipe, stage by stage: fit the ISP, train every arm, evaluate, report.
 
-Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is not done again, so that
-a run that was stopped goes on where it was.
+Each stage leaves a file in ``OUT/NAME``; a stage whose file was made with the same settings is skipped, so that
+a stopped run resumes.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rawaug.evaluation.scores import (
     Method,
     classical_method,
     installed_classical,
+    label_of,
     network_method,
     row_of,
     score_method,
@@ -36,6 +37,7 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
+from rawaug.extras import extra
 from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -43,6 +45,7 @@ from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
 from rawaug.training.start import first_network, start_of
+from rawaug.training.train_config import weights_key
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -52,7 +55,7 @@ Results = dict[str, list[dict[str, Any]]]
 
 
 def run(recipe: Recipe) -> Results:
-    """Run a recipe; the results by arm, one entry a seed, as they stand in ``results.json``.
+    """Run a recipe; the results by arm, one entry a seed, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return empty lists.
     """
@@ -117,7 +120,7 @@ class _Run:
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
-                print(f"fitted already: {path}")
+                print(f"already fitted: {path}")
                 return isp
         isp = fit(self.pairs, noise="on" if measure else "off", **settings)
         isp.info["key"] = key
@@ -129,14 +132,11 @@ class _Run:
         recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
         path = place / "denoiser.safetensors"
         config, network, start = recipe.loop_of(arm), recipe.network_of(arm), self.starts[arm]
-        parts = (recipe.arms[arm], config, network, self.data)
-        seen = [stamps(self.pairs), stamps(self.validation), len(self.pictures)]
-        seen += [] if start is None else [start.sha256]
-        key = fingerprint(isp.info["key"], recipe.noise, *seen, *(_settings(part) for part in parts))
+        key = self.weights_key(arm, isp, seed)
         if path.is_file():
             model, info = denoisers.load(path)
             if info.get("key") == key:
-                print(f"trained already: {path}")
+                print(f"already trained: {path}")
                 return model
         if _leads():
             _discard_other_checkpoint(place, key)
@@ -155,6 +155,16 @@ class _Run:
         (place / "last.pt").unlink(missing_ok=True)
         return model
 
+    def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
+        """What the weights of an arm depend on."""
+        recipe, data, start = self.recipe, self.data, self.starts[arm]
+        pictures = (data.pictures, len(self.pictures))
+        settings = _settings(recipe.arms[arm])
+        samples = [isp.info["key"], recipe.noise, settings, data.pairs, stamps(self.pairs), pictures]
+        samples += [] if start is None else [start.sha256]
+        validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
+        return weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *samples), validation)
+
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
@@ -162,7 +172,7 @@ class _Run:
         key = fingerprint(digest, self.data.test, stamps(self.test))
         path = place / "evaluation.json"
         if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
-            print(f"evaluated already: {path}")
+            print(f"already evaluated: {path}")
             return {kind: known[kind] for kind in ("plain", "self_ensemble")}
         result: dict[str, Any] = {}
         model.to(_device(self.recipe.device))
@@ -175,7 +185,7 @@ class _Run:
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
-        methods = {name: classical_method(name, noise, seed=0) for name in self.classical}
+        methods = {label_of(spec): classical_method(spec, noise, seed=0) for spec in self.classical}
         for name, (model, info) in self.untouched.items():
             methods[name] = network_method(model.to(_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
         return methods
@@ -197,7 +207,8 @@ class _Run:
         page.add_curves(
             draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
         )
-        methods = {name: method for name, method in others.items() if name not in self.classical[1:]}
+        hidden = [label_of(spec) for spec in self.classical[1:]]
+        methods = {name: method for name, method in others.items() if name not in hidden}
         for arm, model in models.items():
             methods[arm] = network_method(model.to(_device(recipe.device)), cfa, self.pattern(arm, isp))
         for pair in shown_on_page(self.test):
@@ -224,14 +235,16 @@ def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
 
 def _leads() -> bool:
     """Whether this is the one of several training processes that writes and evaluates."""
-    from lightning_fabric.utilities.rank_zero import rank_zero_only
+    with extra("train"):
+        from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _device(accelerator: str) -> torch.device:
     """Where Fabric would put a network."""
-    from lightning_fabric import Fabric
+    with extra("train"):
+        from lightning_fabric import Fabric
 
     return Fabric(accelerator=accelerator, devices=1).device
 
@@ -242,11 +255,11 @@ def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> 
     for part, pairs in others.items():
         seen = unseen & _identities(pairs)
         if seen:
-            raise ValueError(f"data.test: {min(seen)} is also among data.{part}; test on frames that nothing has seen")
+            raise ValueError(f"data.test: {min(seen)} is also in data.{part}; test on unseen frames")
 
 
 def _identities(pairs: Sequence[Pair]) -> set[str]:
-    """What tells frames apart without reading them: the path of a file, else the name."""
+    """Identifies frames without reading them: the path of a file, else the name."""
     if isinstance(pairs, RawFolder):
         return {str(file.resolve()) for file in pairs.files}
     if isinstance(pairs, LazyPairs):
@@ -265,10 +278,10 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage that was done with these frames depends on, by frame, told without reading files again.
+    """What a stage depends on, by frame, without reading files again.
 
-    Of RAW files path, size and time of change; of the frames of a dataset their names; of frames in memory what is in
-    them, in samples.
+    Path, size and modification time of RAW files; names of a dataset's frames; samples of the content of frames in
+    memory.
     """
     if isinstance(pairs, RawFolder):
         return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]

@@ -1,4 +1,4 @@
-"""PSNR_d: how well a denoiser does on real RAW that was trained on the RAW that a method makes of sRGB pictures.
+"""PSNR_d: a denoiser trained on a method's RAW from sRGB pictures, scored on real RAW.
 
 Pictures, network, steps and noise are the same for every method; what differs is the way from sRGB to RAW. The
 dictionary ISP draws camera settings from its hull, UPI from its published distributions; a network has one answer.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import singledispatch
 from pathlib import Path
 
 import torch
@@ -19,8 +20,8 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import score_denoiser
-from rawaug.isp.baselines import UPI, ReverseISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
@@ -40,9 +41,9 @@ class DownstreamConfig:
     """The denoising experiment.
 
     Args:
-        methods: families that are tried.
-        test: RAW frames of cameras that no method has seen; folders, or ``kind:path``.
-        test_crop: side of the piece at each test frame's centre that is scored; null scores all of it.
+        methods: families to compare.
+        test: RAW frames of unseen cameras; folders, or ``kind:path``.
+        test_crop: side of the central crop scored of each test frame; null for the whole frame.
         exposure: lowest and highest exposure in stops at which the dictionary ISP's RAW is drawn, for the test cameras'
             headroom is not known; UPI's published distributions have theirs.
         noise: preset, in training and on the test frames.
@@ -58,6 +59,10 @@ class DownstreamConfig:
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
+    def sampling(self) -> tuple[object, ...]:
+        """What the training samples depend on."""
+        return self.noise, self.exposure
+
     def smoke(self) -> DownstreamConfig:
         """In seconds, on the demo camera."""
         few = TrainConfig(steps=2, batch=2, crop=32, warmup=1, validate_every=2, checkpoint_every=2)
@@ -66,9 +71,7 @@ class DownstreamConfig:
         )
 
 
-def psnr_d(
-    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int
-) -> float:
+def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
     crops = _crops(model, pictures, noise, config)
@@ -83,15 +86,16 @@ def psnr_d(
     return sum(scores) / len(scores)
 
 
-def _crops(
-    model: DictionaryISP | ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig
-) -> Source:
-    crop = config.train.crop
-    if isinstance(model, DictionaryISP):
-        return PictureCrops(RawPairs(pictures, RawAugment(model, noise, exposure=config.exposure), crop))
-    if isinstance(model, UPI):
-        return MadeCrops(pictures, lambda x, g: model.apply(x, model.sample(1, g)), model.cfa, noise, crop)
-    return MadeCrops(pictures, lambda x, g: model.reverse(x), model.cfa, noise, crop)
+@singledispatch
+def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+
+
+@_crops.register
+def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    """By the plugin, so that each crop keeps its place in its frame."""
+    augment = RawAugment(model, noise, exposure=config.exposure)
+    return PictureCrops(RawPairs(pictures, augment, config.train.crop))
 
 
 class MadeCrops:

@@ -50,5 +50,5 @@ def kind_of(recipe: str | Path) -> str:
         raise ValueError(f"{recipe}: not a YAML file ({reason}); see the recipes in the package") from error
     kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
     if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"{recipe}: experiment {kind!r} is none of {', '.join(KINDS)}")
+        raise ValueError(f"{recipe}: unknown experiment {kind!r}; use one of {', '.join(KINDS)}")
     return kind

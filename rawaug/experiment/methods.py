@@ -1,7 +1,7 @@
-"""The methods of the reconstruction table, on one footing: fitted on the same pairs, asked for the same patches.
+"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
 A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best weights there are (oracle), which tells what the dictionaries could do.
+samples, and with the best possible weights (oracle), the limit of the dictionaries.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import singledispatch
 from typing import Any, NamedTuple
 
 import torch
@@ -19,19 +20,18 @@ from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.isp import conditioning
-from rawaug.isp.baselines import BASELINES, ReverseISP, fit_baseline
+from rawaug.isp.baselines import BASELINES, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams
-from rawaug.isp.stages import as_float
+from rawaug.isp.stages import as_float, placed
 from rawaug.metrics import PATCH, psnr
 from rawaug.seeding import keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
-POINTWISE = ("dictionary", "dictionary-encoders", "upi", "upi-tuned")
-"""Families that need no pixel-exact pairs."""
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
 ORACLE_STEPS = 300
@@ -49,9 +49,14 @@ class Fitted(NamedTuple):
         parameters: of its reverse pass.
     """
 
-    model: DictionaryISP | ReverseISP
+    model: ReverseISP
     seconds: float
     parameters: int
+
+
+def learns_by_descent(family: str) -> bool:
+    """Whether a family trains on crops: it has a budget, and needs pairs that are registered pixel by pixel."""
+    return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
 
 
 def fit_family(
@@ -61,7 +66,7 @@ def fit_family(
     start = time.perf_counter()
     if family.startswith("dictionary"):
         isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
-        return Fitted(isp, time.perf_counter() - start, _in_use(isp))
+        return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
     method = BASELINES[family]
     start_of: dict[str, Any] = {"seed": seed} if issubclass(method, CropTrainedISP) else {}
     model = method(cfa=pairs[0].cfa, **start_of)
@@ -70,26 +75,15 @@ def fit_family(
     return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
 
 
-def _in_use(isp: DictionaryISP) -> int:
-    """Parameters that the reverse pass uses: encoders count where they look at the picture."""
-    parts = {name: p for name, p in isp.named_parameters() if not name.startswith("forward_networks")}
-    if not isp.encoders_in_use:
-        parts = {name: p for name, p in parts.items() if "_encoder.layers" not in name}
-    return sum(p.numel() for p in parts.values())
-
-
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
     """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass.
 
-    An unregistered pair is scored over blocks, by methods of :data:`POINTWISE`.
+    An unregistered pair is scored over blocks, by methods that do not learn by descent.
     """
     model = fitted.model
     if not pair.registered:
         return {"rows": _block_rows(model, pair), "mpix_s": None}
-    if isinstance(model, DictionaryISP):
-        makers = {row: _dictionary(model, params) for row, params in dictionary_params(model, pair).items()}
-    else:
-        makers = {"blind": _baseline(model)}
+    makers = {row: _maker(model, setting) for row, setting in settings(model, pair).items()}
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
     area = min(PATCH, pair.raw.shape[-2]) * min(PATCH, pair.raw.shape[-1])
@@ -97,22 +91,30 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
 
 
-@torch.no_grad()
-def _block_rows(model: DictionaryISP | ReverseISP, pair: Pair) -> dict[str, float]:
-    if isinstance(model, DictionaryISP):
-        return {"blind": psnr_r(model, pair), "as-shot": psnr_r(model, pair, white_balance=True)}
+@singledispatch
+def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
+    """Row to the camera setting that it is made with; a method that knows nothing of settings has one row."""
+    return {"blind": None}
+
+
+@singledispatch
+def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-    return {"blind": block_psnr(model.unprocess(blocks.srgb[None])[0], blocks.raw, blocks.clipped)}
+    with torch.no_grad():
+        made = model.unprocess(blocks.srgb[None])[0]
+    return {"blind": block_psnr(made, blocks.raw, blocks.clipped)}
 
 
-def _dictionary(isp: DictionaryISP, params: ISPParams) -> Maker:
-    return lambda patch, place: isp.reverse(patch, params, place=place).raw
+@_block_rows.register
+def _(model: DictionaryISP, pair: Pair) -> dict[str, float]:
+    return {"blind": psnr_r(model, pair), "as-shot": psnr_r(model, pair, white_balance=True)}
 
 
-def _baseline(model: ReverseISP) -> Maker:
-    return lambda patch, place: model.reverse(patch)
+def _maker(model: ReverseISP, setting: Any) -> Maker:
+    return lambda patch, place: model.make(patch, setting, place)
 
 
+@settings.register
 def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     """The camera settings of the dictionary's rows for a frame."""
     with torch.no_grad():
@@ -131,7 +133,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in (height, width))
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return conditioning.with_raw_samples(isp, x, blind, readings, isp.place(x))
+    return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
 
 
 @torch.enable_grad()
@@ -154,21 +156,16 @@ def _oracle(isp: DictionaryISP, pair: Pair) -> ISPParams:
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
     """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back.
 
-    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, tells what its stages lose.
+    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, is the loss of its stages alone.
     """
     model, through, without = fitted.model, [], []
-    if isinstance(model, ReverseISP) and not model.bidirectional:
+    if not model.bidirectional:
         return {}
     for picture in pictures:
         x = as_float(picture[None])
-        if isinstance(model, DictionaryISP):
-            result = model.reverse(x)
-            back = model.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
-            linear = model.reverse_pixels(x, result.params)
-            without.append(psnr(model.forward_pixels(linear, result.params).clamp(0.0, 1.0), x).item())
-        else:
-            back = model.cycle(x)
-        through.append(psnr(back, x).item())
+        through.append(psnr(model.cycle(x), x).item())
+        if (back := model.cycle_without_mosaic(x)) is not None:
+            without.append(psnr(back, x).item())
     result_ = {"cycle": sum(through) / len(through)}
     return result_ | ({"cycle_without_mosaic": sum(without) / len(without)} if without else {})
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rawaug.isp.fit import FitConfig
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 
@@ -16,15 +17,15 @@ class DataConfig:
     """Where pictures come from.
 
     Args:
-        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null if there are none.
-        count: how many of them are used; all if null.
+        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null for none.
+        count: number of pairs to use; null for all.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
-        memory_mb: pictures are kept in memory once decoded, up to so many megabytes.
-        validation: pairs on which training is watched, of which self-supervised arms see the noisy frames alone; null
-            watches it on RAW made from the pictures, which chooses no weights: those of the end are kept.
-        validation_crop: side of the middle of each validation frame that is looked at; null for the whole frame.
-        test: pairs on which the result is measured; no stage sees them before.
-        test_count: how many of them are used; all if null.
+        memory_mb: size in megabytes of the cache of decoded pictures.
+        validation: validation pairs, of which self-supervised arms see only the noisy frames; null validates on RAW
+            made from the pictures and keeps the final weights.
+        validation_crop: side of the central crop used of each validation frame; null for the whole frame.
+        test: test pairs; no earlier stage sees them.
+        test_count: number of pairs to use; null for all.
     """
 
     pairs: str | None = "demo:train"
@@ -39,39 +40,50 @@ class DataConfig:
 
 @dataclass
 class ArmConfig:
-    """One way of training; arms differ in nothing else.
+    """One way of training; everything else is the same for all arms.
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`; or published, cameras, lights and tone
-            curves from the tables of the package, see :mod:`rawaug.isp.camera_sampling`.
-        zoom: of published: pictures are enlarged up to this factor, half of the time; 1 for none.
+        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
+            :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
-        exposure: lowest and highest exposure of the RAW in stops.
-        estimator: what is learned from: supervised has clean targets; the others know noisy frames alone, see
-            :mod:`rawaug.training.estimators`.
-        alpha: of noisier and r2r: strength of the extra noise.
-        correct: of noisier: extrapolate the result, which takes its bias away.
-        gamma: of neighbor2neighbor: weight of its second term.
+        exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
+        estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
+            and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
+        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen", "published"] = "convex"
+    sampling: Literal["convex", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
-    exposure: tuple[float, float] = (0.0, 0.0)
-    estimator: Literal["supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"] = "supervised"
-    alpha: float = 1.0
-    correct: bool = False
-    gamma: float = 1.0
+    exposure: tuple[float, float] | None = None
+    estimator: str | dict[str, Any] = "supervised"
+    alpha: float | None = None
+    correct: bool | None = None
+    gamma: float | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
-            raise ValueError(f"augmented is a share between 0 and 1, got {self.augmented}")
+            raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
+        name, settings = name_and_settings(self.estimator)
+        for key in ("alpha", "correct", "gamma"):
+            if (old := getattr(self, key)) is not None:
+                settings[key] = old
+                setattr(self, key, None)
+        self.estimator = {"name": name, "settings": settings} if settings else name
+        ESTIMATORS.make(self.estimator)
+
+    @property
+    def sees_clean(self) -> bool:
+        """Whether the estimator needs clean frames."""
+        name, _ = name_and_settings(self.estimator)
+        return bool(ESTIMATORS[name].sees_clean)
 
 
 @dataclass
@@ -79,24 +91,24 @@ class Recipe:
     """A whole experiment.
 
     Args:
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP that is taken as it is, the name of a shipped one or a file; null fits one to ``data.pairs``.
-        noise: what is added to clean RAW, in training and where a test frame has no noisy capture: the name of a preset
-            or of a camera, a list of names of which each picture draws one, [shot_var, read_var], or "camera", the
-            levels measured on the frames that the ISP is fitted to.
+        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
+        noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
+            or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
+            camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
         denoiser: the network.
         train: the loop.
-        arms: by name, what is compared; all supervised, or all self-supervised (then no stage sees a clean frame).
-        classical: classical denoisers to compare with, such as Wavelet; see :mod:`denoisers.classical`. BM3D is left
-            out, with a line that says so, where its wheel is not installed.
+        arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
+        classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
+            BM3D is left out, with a line that says so, where its wheel is not installed.
         untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
-        seeds: how many runs, with seeds ``seed``, ``seed + 1``, ...; more than one gives mean and spread.
+        seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
         device: auto, cpu, cuda, ...: Fabric's accelerator.
-        devices: how many of them.
+        devices: number of devices.
         out: folder of all runs.
     """
 
@@ -104,11 +116,11 @@ class Recipe:
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
     camera: str | None = None
-    noise: tuple[float, float] | str | list[str] = "cycleisp_sidd"
+    noise: tuple[float, float] | str | list[str] | dict[str, Any] = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
-    classical: list[str] = field(default_factory=list)
+    classical: list[str | dict[str, Any]] = field(default_factory=list)
     untouched: list[str] = field(default_factory=list)
     steps: int | None = None
     seed: int = 0
@@ -119,18 +131,19 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if not self.arms:
-            raise ValueError("arms: a recipe compares at least one way of training")
+            raise ValueError("arms: a recipe needs at least one arm")
         if self.seeds < 1:
-            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
         if self.data.pairs is None and self.camera is None:
-            raise ValueError("data.pairs: an ISP is fitted to pairs; give some, or camera: universal")
+            raise ValueError("data.pairs: fitting an ISP needs pairs; set it, or camera: universal")
         if self.data.pairs is None and any(arm.augmented < 1.0 for arm in self.arms.values()):
-            raise ValueError("data.pairs: without real pairs every arm has augmented: 1")
-        supervised = [arm.estimator == "supervised" for arm in self.arms.values()]
-        if any(supervised) and not all(supervised):
-            raise ValueError("arms: supervised and self-supervised do not mix, since these must see no clean frame")
+            raise ValueError("data.pairs: without real pairs every arm must have augmented: 1")
+        if len({arm.sees_clean for arm in self.arms.values()}) > 1:
+            raise ValueError(
+                "arms: supervised and self-supervised arms cannot be mixed; the latter must not see clean frames"
+            )
 
     def network_of(self, arm: str) -> DenoiserConfig:
         """The arm's network, else the recipe's."""
@@ -144,7 +157,7 @@ class Recipe:
     @property
     def self_supervised(self) -> bool:
         """Whether noisy frames are all that may be seen."""
-        return all(arm.estimator != "supervised" for arm in self.arms.values())
+        return not any(arm.sees_clean for arm in self.arms.values())
 
 
 def smoke(recipe: Recipe) -> Recipe:
@@ -152,25 +165,18 @@ def smoke(recipe: Recipe) -> Recipe:
 
     No trained denoiser is read: what would continue from one starts from nothing.
     """
-    tiny: dict[str, dict[str, Any]] = {
-        "UNet": {"width": 4, "scales": 2},
-        "DHDN": {"width": 4},
-        "DnCNN": {"width": 8, "depth": 3},
-        "PMRID": {"width": 2},
-        "NAFNet": {"width": 4, "encoder": [1], "middle": 1, "decoder": [1]},
-    }
     name = recipe.denoiser.name
-    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=2, checkpoint_every=2, workers=0)
+    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=4, checkpoint_every=2, workers=0)
     return replace(
         recipe,
         name=f"{recipe.name.replace('/', '-')}-smoke",
         data=replace(
-            DataConfig(count=1, test_count=1),
+            DataConfig(count=1, validation_crop=64, test_count=1),
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
         isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
-        denoiser=DenoiserConfig(name, tiny.get(name, {})),
+        denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
         untouched=[],
@@ -200,4 +206,4 @@ def find_recipe(name: str) -> Path:
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]
-    raise FileNotFoundError(f"{name}: no such recipe file, and none of the shipped recipes ({', '.join(known)})")
+    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe ({', '.join(known)})")

@@ -2,7 +2,7 @@
 
 PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. PSNR_d is that of a
 denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
-fit's figures go into a file of their own, so that a stopped run goes on where it was.
+fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -16,21 +16,20 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.evaluation.tables import mean_and_spread
+from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.methods import (
     FAMILIES,
-    POINTWISE,
     ROWS,
     cycle_psnr,
     fit_family,
+    learns_by_descent,
     mosaic_only_psnr,
     score_rows,
 )
@@ -39,6 +38,8 @@ from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
+from rawaug.training.train_config import weights_key
 
 
 @dataclass
@@ -47,21 +48,21 @@ class Comparison:
 
     Args:
         experiment: "reconstruction".
-        name: of the folder in ``out`` that it writes.
+        name: of the output folder within ``out``.
         data: the pairs, of one CFA; methods that train on crops need them registered.
-        noise: preset that is added to every frame once and for all; the dictionary ISP is then fitted to these noisy
+        noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines.
-        seconds: budget of methods that learn by descent, reading not counted.
+        seconds: training budget of methods trained by gradient descent, without file reading.
         crop, batch: of these methods' training: small ones give more steps to a short budget.
-        longer: a second budget for them, as a factor; 0 leaves it out.
+        longer: factor of a second, longer budget for them; 0 for none.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
-        downstream: PSNR_d; null leaves it out.
+        downstream: PSNR_d; null skips it.
         seed: of the first run.
-        seeds: how many runs.
+        seeds: number of runs.
         out: folder of all runs.
     """
 
@@ -88,11 +89,11 @@ class Comparison:
         if unknown or not self.methods:
             raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
         if self.seeds < 1:
-            raise ValueError(f"seeds is at least 1, got {self.seeds}")
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
-            raise ValueError(f"patches is at least 1, or null for all, got {self.patches}")
+            raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
-            raise ValueError("noise: only the dictionary ISP is fitted to noisy frames; leave the other methods out")
+            raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
 
 def smoke_comparison(comparison: Comparison) -> Comparison:
@@ -115,7 +116,7 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 
 
 def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
-    """Run a comparison; the rows as they stand in ``table.json``."""
+    """Run a comparison; the rows as in ``table.json``."""
     return _Comparison(comparison).table()
 
 
@@ -124,11 +125,11 @@ class _Comparison:
         self.settings, self.folder = settings, Path(settings.out) / settings.name
         self.pairs = list(open_pairs(settings.data, split="train"))
         if len(self.pairs) < 2:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leaving one out needs two or more")
-        exact = any(method not in POINTWISE for method in settings.methods)
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
+        exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
-                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has another CFA"
+                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has a different CFA"
                 raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
         if settings.noise:
             noise = noise_model(settings.noise)
@@ -136,7 +137,7 @@ class _Comparison:
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
         names = [pair.name for pair in self.pairs]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"data: several frames are named {twice[0]}; give each file a name of its own")
+            raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
         if settings.longer and not 1 <= settings.longer_frames <= len(names):
             raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
         side = settings.downstream.train.crop if settings.downstream else 2
@@ -155,14 +156,14 @@ class _Comparison:
     def _families(self) -> Iterator[tuple[str, float]]:
         for family in self.settings.methods:
             yield family, 1.0
-            if self.settings.longer and family in ("unet", "cycleisp", "invisp", "invgrey"):
+            if self.settings.longer and learns_by_descent(family):
                 yield family, self.settings.longer
 
     def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
         settings, longer = self.settings, scale != 1.0
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
         frames = range(settings.longer_frames if longer else len(self.pairs))
-        bar = tqdm([(s, k) for s in seeds for k in frames], desc=f"{family} x{scale:g}", unit="fit", leave=False)
+        bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
         folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
         whole = {} if longer else self._whole(family)
         rows = {}
@@ -217,7 +218,9 @@ class _Comparison:
         fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
         if downstream:
-            place = self.folder / f"{family}-denoisers-{key}"  # a checkpoint of other settings is not gone on from
+            samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
+            trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
+            place = self.folder / f"{family}-denoisers-{trained}"
             result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
         write_json(result, path)
         return result
@@ -265,17 +268,9 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     frames = len(next(iter(rows.values()))["frames"])
-    table = Table(title=f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}")
+    title = f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}"
     heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
-    for k, head in enumerate(("method", *heads)):
-        table.add_column(head, justify="right" if k else "left")
-    for name, row in rows.items():
-        table.add_row(name, *_cells(row))
-    console = Console()
-    (console if console.is_terminal else Console(width=140)).print(table)
+    print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

@@ -13,7 +13,8 @@ from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_told
+from rawaug.extras import extra
+from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_as_os_error
 
 _DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
@@ -75,7 +76,7 @@ class CarriedTags:
 
 
 def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
-    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing where it is no TIFF.
+    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing if it is not a TIFF.
 
     A DNG gives all tags of its first directory and of the mosaic's; another TIFF (NEF, CR2, ARW, ...), whose private
     tags mean something else, its description, author, XMP, EXIF and GPS.
@@ -83,10 +84,11 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
     Raises:
         OSError: if the tags are damaged.
     """
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
-        with damage_told(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
+        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
             dng = any(_DNG_VERSION in page.tags for page in pages)

@@ -19,11 +19,12 @@ import torch
 
 from rawaug._version import __version__
 from rawaug.bayer import CFA
+from rawaug.extras import extra
 from rawaug.files import replacing
 from rawaug.io.carried_tags import CarriedTags, Entry, Tag, append_directory, read_carried_tags
 from rawaug.io.gain_map import opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
-from rawaug.io.tiff_tags import damage_told
+from rawaug.io.tiff_tags import damage_as_os_error
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
@@ -71,14 +72,15 @@ def write_dng(
     tags = own | carried.tags | _tags_of_the_pixels(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
-        with damage_told(Path(source)) if source is not None else nullcontext():
+        with damage_as_os_error(Path(source)) if source is not None else nullcontext():
             _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
         for name, entries in directories.items():
             append_directory(partial, name, entries)
 
 
 def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]) -> None:
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     software = f"rawaug {__version__}"
     tifffile.imwrite(

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.extras import extra
+
 _MODES = {"RGB": "RGB", "GRAY": "L"}
 
 
@@ -23,7 +25,8 @@ def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
     Raises:
         ValueError: if the profile is damaged, or is neither of RGB nor of grey.
     """
-    from PIL import Image, ImageCms
+    with extra("raw"):
+        from PIL import Image, ImageCms
 
     try:
         mode, transform = _transform(profile)
@@ -40,7 +43,8 @@ def _transform(profile: bytes) -> tuple[str, Any]:
     """The mode of the stored pixels, and the conversion; None for sRGB."""
     from io import BytesIO
 
-    from PIL import ImageCms
+    with extra("raw"):
+        from PIL import ImageCms
 
     source = ImageCms.ImageCmsProfile(BytesIO(profile))
     mode = _MODES[source.profile.xcolor_space.strip()]

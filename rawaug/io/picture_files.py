@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import turn
+from rawaug.extras import extra
 from rawaug.io.icc import to_srgb
 
 MAX_PIXELS = 2**28
@@ -68,7 +69,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    with _text_damage_told(Path(path)):
+    with _text_damage_as_os_error(Path(path)):
         pixels, orientation = _read(Path(path), max_pixels)
     return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
 
@@ -80,7 +81,7 @@ def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
         FileNotFoundError, OSError: as :func:`read_picture`.
         ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
     """
-    with _text_damage_told(Path(path)):
+    with _text_damage_as_os_error(Path(path)):
         pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
@@ -95,7 +96,8 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         ValueError: if the shape is wrong, a value leaves [0, 1], or the extension is unknown.
         OSError: if the file cannot be written.
     """
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     if srgb.ndim != 3 or srgb.shape[0] != 3:
         raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
@@ -112,7 +114,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 
 @contextmanager
-def _text_damage_told(path: Path) -> Iterator[None]:
+def _text_damage_as_os_error(path: Path) -> Iterator[None]:
     """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
     try:
         yield
@@ -139,7 +141,8 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
 
 def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
     """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
@@ -164,7 +167,8 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
 
 def _floating() -> tuple[Any, ...]:
-    import OpenImageIO as oiio
+    with extra("raw"):
+        import OpenImageIO as oiio
 
     return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
 

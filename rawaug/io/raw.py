@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.extras import extra
 from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.shot import UNKNOWN, Exposure, camera_of, exposure_of
 from rawaug.io.tiff_tags import TiffTags, read_tiff_tags
@@ -148,7 +149,8 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
     """The unpacked file, and its TIFF tags; LibRaw's errors become one line that names the file."""
-    import rawpy
+    with extra("raw"):
+        import rawpy
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such RAW file")
@@ -230,7 +232,8 @@ def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
 
 def _kind(raw: Any) -> str:
     """What a file holds instead of a Bayer mosaic, in words."""
-    import rawpy
+    with extra("raw"):
+        import rawpy
 
     if raw.raw_type == rawpy.RawType.Stack:
         return "full colour at every pixel (linear DNG, small RAW, Foveon)"

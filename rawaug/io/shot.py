@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from typing import Any
 
+from rawaug.extras import extra
 from rawaug.io.tiff_tags import TiffTags
 
 _EXIF_MAKE, _EXIF_MODEL = 271, 272
@@ -46,8 +47,9 @@ def camera_of(raw: Any, tags: TiffTags) -> str:
 
 
 def _thumbnail_camera(raw: Any) -> tuple[str | None, str | None]:
-    import rawpy
-    from PIL import Image
+    with extra("raw"):
+        import rawpy
+        from PIL import Image
 
     try:
         thumbnail = raw.extract_thumb()

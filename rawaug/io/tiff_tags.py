@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.extras import extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
 
 _MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
@@ -55,10 +56,11 @@ def read_tiff_tags(path: Path) -> TiffTags:
     Raises:
         OSError: if the tags are damaged.
     """
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
-        with damage_told(path), tifffile.TiffFile(path) as tiff:
+        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff:
             pages = list(all_pages(tiff.pages))
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
@@ -71,9 +73,10 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
 
 @contextmanager
-def damage_told(path: Path) -> Iterator[None]:
+def damage_as_os_error(path: Path) -> Iterator[None]:
     """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
-    import tifffile
+    with extra("raw"):
+        import tifffile
 
     try:
         yield

@@ -29,9 +29,9 @@ SRGB_TO_XYZ = torch.tensor(
 """Linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
 
 DAYLIGHT_GAINS = (0.6, 4.0)
-"""Red and blue gains under D65 of a camera that is believed."""
+"""Red and blue gains under D65 of a plausible camera."""
 LARGEST_ENTRY = 2.0
-"""Of C, in absolute value, of a camera that is believed."""
+"""Of C, in absolute value, of a plausible camera."""
 
 
 class CameraMatrices(NamedTuple):
@@ -66,15 +66,15 @@ class CameraMatrices(NamedTuple):
 
 @cache
 def published_cameras() -> CameraMatrices:
-    """The cameras of the package's table that are believed; where two sources name one camera LibRaw's comes first."""
+    """The plausible cameras of the package's table; where two sources name one camera LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
     rows = [line.split("\t") for line in text.splitlines()[2:]]
     matrices = torch.tensor([[float(value) for value in row[2:11]] for row in rows], dtype=torch.float64)
     matrices = matrices.reshape(-1, 3, 3) / 1e4
     reasons = {
-        "sensor of four colours": torch.tensor([row[12] != "" for row in rows]),
+        "four-colour sensor": torch.tensor([row[12] != "" for row in rows]),
         "singular": torch.linalg.det(matrices).abs() < 1e-3,
-        "response that is not positive": ~(responses(matrices, white_point(D65)) > 0).all(dim=1),
+        "response not positive": ~(responses(matrices, white_point(D65)) > 0).all(dim=1),
     }
     gains = white_balance(matrices, white_point(D65))[:, 0::2]
     reasons["implausible gains"] = ~((gains >= DAYLIGHT_GAINS[0]) & (gains <= DAYLIGHT_GAINS[1])).all(dim=1)

@@ -30,33 +30,37 @@ class Chooser(nn.Module):
         isp: the fitted ISP; its encoders look at the picture if they do so now.
     """
 
+    tone_weights: Tensor
+
     def __init__(self, isp: DictionaryISP) -> None:
         super().__init__()
         self.knee = isp.config.knee
         self.colour, self.gain = deepcopy(isp.colour), deepcopy(isp.gain)
-        networks = isp.reverse_networks
+        self.register_buffer("tone_weights", isp.typical_tones().clone())
+        encoders = isp.reverse_encoders
         with torch.no_grad():
-            self.colour_encoder = _folded(networks.colour_encoder, [isp.colour.atoms()])
+            self.colour_encoder = _folded(encoders.colour, [isp.colour.atoms()])
             floor = 1.0 / isp.gain.channel_gains()
             self.gain_encoder = _folded(
-                networks.gain_encoder, [torch.diag_embed(floor), torch.diag_embed((1.0 - floor).clamp_min(0.0))]
+                encoders.gain, [torch.diag_embed(floor), torch.diag_embed((1.0 - floor).clamp_min(0.0))]
             )
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, table: Tensor) -> ISPParams:
         """The setting for sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1]; ``table`` gives x2 of sRGB."""
         images = srgb[:, None]
-        if self.colour_encoder.enabled:
+        if self.colour_encoder.looks:
             x2 = small(srgb, table)
             images = x2[:, None]
         colour_weights = self.colour_encoder(images)
         matrix = self.colour.combine(colour_weights)
-        if self.gain_encoder.enabled:
+        if self.gain_encoder.looks:
             x3 = torch.einsum("bij,bjhw->bihw", matrix, x2)
             m = ((x3.mean(dim=1, keepdim=True) - self.knee) / (1.0 - self.knee)).clamp(0.0, 1.0).square()
             images = torch.stack([x3, m * x3], dim=1)
         gain_weights = self.gain_encoder(images)
-        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights))
+        tone_weights = self.tone_weights.expand(len(srgb), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights), tone_weights)
 
 
 def small(srgb: Tensor, table: Tensor) -> Tensor:
@@ -73,6 +77,8 @@ def small(srgb: Tensor, table: Tensor) -> Tensor:
 def _folded(encoder: Encoder, maps: list[Tensor]) -> Encoder:
     """The encoder for K maps of 3 channels, of which its N images are sums: ``maps`` are K times ``(N, 3, 3)``."""
     encoder = deepcopy(encoder)
+    if encoder.layers is None:
+        return encoder
     first = encoder.layers[0]
     assert isinstance(first, nn.Conv2d) and first.bias is not None
     weight = first.weight.unflatten(1, (-1, 3))

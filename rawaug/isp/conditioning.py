@@ -1,8 +1,12 @@
-r"""What the user knows of a shot, put in place of what the ISP would guess: the camera's gains, or a few RAW readings.
+r"""Known data of a shot that replace the ISP's guess: the camera's gains, or a few RAW readings.
 
 Grey ``(1, 1, 1)`` becomes ``C 1 / g``, and the file says that it is ``1 / (wb d)``; hence ``g = wb d (C 1)``. Readings
 ``y_k`` of a channel give its gain by least squares, ``1 / g = sum w x5 y / sum w x5^2`` with ``x5`` made under gain 1,
 weighted by ``w = 1 / (y + 0.01)`` for shot noise and reweighted (Cauchy) against readings that lie on edges.
+
+Where tone is a mixture of curves, and the camera one of cameras, readings choose these as well: given the gains,
+``g_c y = sum_k v_k (C T_k(x))_c`` is linear in the weights v, and ``sum_n w_n (C_n T(x))_c`` in w. Gains, v and w are
+solved for in turn.
 """
 
 from __future__ import annotations
@@ -14,19 +18,26 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.isp.dictionary import ColourDictionary
+from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, ToneDictionary
+from rawaug.isp.hull import nearest_in_hull
 from rawaug.isp.setting import ISPParams
+from rawaug.kernels.raw_torch import through_curves
 
 CLIPPED = 0.98
 SHADOW = 0.01
-"""Added to a reading where it stands for a variance: the read noise's share."""
+"""Added to a reading used as a variance: the share of read noise."""
 ROUNDS = 4
+PULL = 1e-4
+"""Of the typical weights, against the readings' mean square."""
 
 
 class Camera(Protocol):
     """What is used of an ISP: its pattern, its colour atoms and its reverse pass."""
 
     colour: ColourDictionary
+
+    @property
+    def tone(self) -> ToneDictionary | None: ...
 
     @property
     def cfa(self) -> CFA: ...
@@ -45,7 +56,7 @@ def with_white_balance(
     Args:
         isp: whose dictionaries are used.
         params: chosen parameters.
-        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as the file tells them; green is made 1.
+        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as in the file; scaled to green 1.
         digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
 
     Raises:
@@ -55,14 +66,14 @@ def with_white_balance(
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
-            raise ValueError(f"white_balance is (3,) or ({batch}, 3), got {tuple(balance.shape)}")
+            raise ValueError(f"white_balance must be (3,) or ({batch}, 3), got {tuple(balance.shape)}")
         _require_factor("white_balance", balance)
         balance = balance / balance[..., 1:2]
         params = _in_light(isp, params, balance.expand_as(params.gains))
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
         if len(digital) not in (1, batch):
-            raise ValueError(f"digital_gain is one number or ({batch},), got {len(digital)}")
+            raise ValueError(f"digital_gain must be a number or ({batch},), got {len(digital)}")
         _require_factor("digital_gain", digital)
         own = params.gains[:, 1:2] / params.matrix[:, 1:2].sum(2)
         params = params._replace(gains=params.gains / own * digital)
@@ -71,7 +82,7 @@ def with_white_balance(
 
 def _require_factor(name: str, value: Tensor) -> None:
     if not (value.isfinite() & (value > 0)).all():
-        raise ValueError(f"{name} is positive, got {value.flatten().tolist()}")
+        raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
 
 
 def _in_light(isp: Camera, params: ISPParams, balance: Tensor) -> ISPParams:
@@ -103,21 +114,58 @@ def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Ten
     where = place.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
-    params = _solve(isp, pixels, where, own, raw_samples[..., 2], params)
+    value = raw_samples[..., 2]
+    params = _solve(isp, pixels, where, own, value, params)
+    if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
+        for _ in range(ROUNDS):
+            params = _solve(isp, pixels, where, own, value, _mixed(isp.colour, isp.tone, pixels, own, value, params))
+        return params
     light = params.gains / params.matrix.sum(2) / (params.colour_weights @ isp.colour.neutral).exp()
     weights = isp.colour.weights_for(light)
     params = params._replace(colour_weights=weights, matrix=isp.colour.combine(weights))
-    return _solve(isp, pixels, where, own, raw_samples[..., 2], params)
+    return _solve(isp, pixels, where, own, value, params)
+
+
+def _mixed(
+    cameras: CameraDictionary, tones: ToneDictionary, pixels: Tensor, own: Tensor, value: Tensor, params: ISPParams
+) -> ISPParams:
+    """The nearest mixture of curves, then of cameras, under the gains that ``params`` have."""
+    target = value * torch.einsum("bck,bc->bk", own, params.gains)
+    weight = ((value < CLIPPED) / (value.clamp_min(0.0) + SHADOW)).sqrt()
+    seen = torch.einsum("bck,bcd->bkd", own, params.matrix)
+    curved = torch.stack([through_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
+    makes = torch.einsum("bkd,bndk->bnk", seen, curved[:, :, :, 0])
+    tone_weights = _nearest(weight * target, weight[:, None] * makes, tones.typical)
+    x2 = through_curves(tones.combine(tone_weights), pixels)[:, :, 0]
+    makes = torch.einsum("bck,ncd,bdk->bnk", own, cameras.atoms(), x2)
+    colour_weights = _nearest(weight * target, weight[:, None] * makes, cameras.typical)
+    matrix = cameras.combine(colour_weights)
+    return params._replace(tone_weights=tone_weights, colour_weights=colour_weights, matrix=matrix)
+
+
+def _nearest(target: Tensor, makes: Tensor, typical: Tensor) -> Tensor:
+    """Weights ``(B, N)`` on the simplex of what N atoms make of K readings, ``(B, N, K)``, nearest ``(B, K)``.
+
+    A weak pull to the typical weights decides where the readings do not.
+    """
+    rows = []
+    for wanted, atoms in zip(target.double(), makes.double(), strict=True):
+        pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)
+        point = torch.cat([wanted, typical.to(atoms) @ pull])
+        rows.append(nearest_in_hull(point[None], torch.cat([atoms, pull], dim=1))[0][0])
+    return torch.stack(rows).to(target.dtype)
 
 
 def _require_places(raw_samples: Tensor, x: Tensor) -> None:
     if raw_samples.ndim != 3 or len(raw_samples) != len(x) or raw_samples.shape[2] != 3 or not raw_samples.shape[1]:
-        raise ValueError(f"raw_samples is ({len(x)}, K, 3): row, column, value; got {tuple(raw_samples.shape)}")
+        raise ValueError(
+            f"raw_samples must be ({len(x)}, K, 3) of (row, column, value), got {tuple(raw_samples.shape)}"
+        )
     if not raw_samples.isfinite().all():
-        raise ValueError("raw_samples: a value is not a number; leave such readings out")
+        raise ValueError("raw_samples: a value is NaN; remove such readings")
     sides = torch.tensor(x.shape[-2:], device=raw_samples.device)
     if ((raw_samples[..., :2] < 0) | (raw_samples[..., :2] >= sides)).any():
-        raise ValueError(f"raw_samples: a row or column lies outside the picture, {x.shape[-2]} x {x.shape[-1]}")
+        raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
 def _solve(isp: Camera, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:

@@ -1,11 +1,15 @@
 r"""Dictionaries of camera parameters: atoms, and augmentation in their convex hull.
 
-``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (non-negative, sum 1).
+``C = sum_i w_i D_ccm[i]``, ``1 / g = sum_i w_i / D_wb[i]`` and ``T = sum_i w_i D_tone[i]``, with ``w`` on the simplex
+(non-negative, sum 1).
 
-Combining the parameters equals combining the N transformed images, since both stages are linear in them (Conde et al.,
-AAAI 2022, "Parameter Dictionaries"). Colour atoms act in the reverse direction, sRGB to camera; each row of theirs (a
-column in the paper, where pixels are row vectors) has l1 norm 1, so that with no negative entry white stays white and
-the gains carry all of the white balance.
+Combining colour matrices, or tone curves, equals combining the N transformed images, since both are linear in them
+(Conde et al., AAAI 2022, "Parameter Dictionaries"). For gains that holds below the highlights. There Brooks' rule takes
+the larger of two factors, gain by gain, which is not linear where the gains of the atoms lie on both sides of 1.
+
+Colour atoms act in the reverse direction, sRGB to camera; each row of theirs (a column in the paper, where pixels are
+row vectors) has l1 norm 1, so that with no negative entry white stays white and the gains carry all of the white
+balance. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
 """
 
 from __future__ import annotations
@@ -13,6 +17,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from rawaug.isp.cameras import SRGB_TO_XYZ, colour_matrix, white_balance
+from rawaug.isp.light import D65, white_point
+from rawaug.isp.tone_curves import NODES, srgb_to_linear
 
 
 def l1_normalised(matrices: Tensor) -> Tensor:
@@ -23,14 +31,14 @@ def l1_normalised(matrices: Tensor) -> Tensor:
 class ColourDictionary(nn.Module):
     """N colour correction matrices, sRGB to camera, rows l1-normalised.
 
-    Each atom remembers the light that it was seen in, so that a known white balance can choose among them, as a DNG's
+    Each atom stores the light it was seen in, so that a known white balance can choose among them, as a DNG's
     two illuminants do.
 
     Attributes:
         matrices: ``(N, 3, 3)``, normalised on use.
         light: ``(N, 2)`` log of the as-shot red and blue multipliers over green.
         neutral: ``(N, 3)`` log of what the channels' gains are beyond as-shot balance and matrix: the digital gain.
-        spread: width of the kernel in ``light``; infinite where the light tells nothing.
+        spread: width of the kernel in ``light``; infinite where the light is uninformative.
     """
 
     light: Tensor
@@ -62,6 +70,56 @@ class ColourDictionary(nn.Module):
         return white_balance * (weights @ self.neutral).exp() * self.combine(weights).sum(2)
 
 
+class CameraDictionary(ColourDictionary):
+    """N cameras: matrices from sRGB to white-balanced camera RGB, rows of sum 1, and the white balance of each in D65.
+
+    Matrix and balance together are the matrix from XYZ, so that the gains of a mixture follow from any light:
+
+    ``M = diag(r) C S^-1`` with ``C = sum_i w_i C_i``, ``r = sum_i w_i r_i``, the response to D65 (green 1), and S from
+    linear sRGB to XYZ.
+
+    Attributes:
+        matrices: ``(N, 3, 3)``, rows divided by their sums on use.
+        light: ``(N, 2)`` log of the red and blue multipliers in D65.
+        known: ``(P, N)`` weights of the cameras that the hull was made for. Atoms are the odd ones among them: they
+            make the hull wide, but few cameras are like these.
+    """
+
+    known: Tensor
+
+    def __init__(self, atoms: int, known: int) -> None:
+        super().__init__(atoms)
+        self.register_buffer("known", torch.full((known, atoms), 1.0 / atoms))
+
+    @property
+    def typical(self) -> Tensor:
+        """Weights ``(N,)`` where nothing is known of the camera: the mean of the known ones."""
+        return self.known.mean(dim=0)
+
+    @torch.no_grad()
+    def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
+        """Take matrices ``(N, 3, 3)`` from XYZ to camera for the atoms, and weights ``(P, N)`` of the known cameras."""
+        self.matrices.copy_(colour_matrix(xyz_to_camera))
+        self.light.copy_(log_light(white_balance(xyz_to_camera, white_point(D65))))
+        self.known.copy_(known)
+
+    def atoms(self) -> Tensor:
+        """``(N, 3, 3)``, rows of sum 1."""
+        return self.matrices / self.matrices.sum(dim=2, keepdim=True)
+
+    def xyz_to_camera(self, weights: Tensor) -> Tensor:
+        """Weights ``(B, N)`` to matrices from XYZ to camera ``(B, 3, 3)``, float64, green response 1 to D65."""
+        weights = weights.double()
+        inverse = (-self.light.double()).exp()
+        response = weights @ torch.stack([inverse[:, 0], torch.ones_like(inverse[:, 0]), inverse[:, 1]], dim=1)
+        matrix = torch.einsum("bn,nij->bij", weights, self.atoms().double())
+        return response[:, :, None] * matrix @ torch.linalg.inv(SRGB_TO_XYZ.to(matrix))
+
+    def weights_for(self, white_balance: Tensor) -> Tensor:
+        """The typical camera ``(B, N)``: as-shot multipliers ``(B, 3)`` are of an unknown light, and name no camera."""
+        return self.typical.expand(len(white_balance), -1)
+
+
 def log_light(white_balance: Tensor) -> Tensor:
     """Log of the red and blue multipliers over green, ``(B, 3)`` to ``(B, 2)``."""
     return (white_balance[:, 0::2] / white_balance[:, 1:2]).log()
@@ -91,6 +149,32 @@ class GainDictionary(nn.Module):
         return 1.0 / (weights @ (1.0 / self.channel_gains()))
 
 
+class ToneDictionary(nn.Module):
+    """K inverse tone curves, sRGB code to linear light, as fine tables (:mod:`rawaug.isp.tone_curves`).
+
+    The curve of sRGB itself at first. A convex combination of monotone curves is monotone.
+
+    Attributes:
+        curves: ``(K, 2041)`` tables, not decreasing, from 0 to 1.
+        typical: ``(K,)`` weights where nothing is known of the picture.
+    """
+
+    curves: Tensor
+    typical: Tensor
+
+    def __init__(self, atoms: int) -> None:
+        super().__init__()
+        self.register_buffer("curves", srgb_to_linear(torch.linspace(0.0, 1.0, NODES)).repeat(atoms, 1))
+        self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
+
+    def combine(self, weights: Tensor) -> Tensor:
+        """Weights ``(B, K)`` to tables ``(B, 2041)``, the same bits in a batch of any size."""
+        table = weights.new_zeros(len(weights), self.curves.shape[1])
+        for weight, curve in zip(weights.unbind(1), self.curves, strict=True):
+            table += weight[:, None] * curve
+        return table
+
+
 def project_to_simplex(weights: Tensor) -> Tensor:
     """The nearest point of the simplex, row by row: ``(B, N)`` to ``(B, N)`` (Duchi et al., ICML 2008, algorithm 1)."""
     ordered = weights.sort(dim=1, descending=True).values
@@ -110,8 +194,20 @@ def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Ten
 def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor:
     """Weights ``(batch, atoms)`` uniform on the simplex: dictionary augmentation without encoders.
 
-    Normalised exponentials are the flat Dirichlet distribution.
+    Normalised exponentials are the flat Dirichlet distribution. Uniform weights do not fill the hull evenly: the more
+    atoms, the more of the mixtures are near its middle.
     """
     uniform = torch.rand(batch, atoms, generator=generator, device=generator.device)
     exponential = -torch.log1p(-uniform)
     return exponential / exponential.sum(dim=1, keepdim=True)
+
+
+def sparse_weights(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> Tensor:
+    """Weights ``(batch, atoms)`` on the simplex, float64, of which at most ``mixed`` are not zero: Dirichlet(1/2).
+
+    Squares of normals divided by their sum: they crowd the corners and edges of a hull.
+    """
+    chosen = torch.randint(atoms, (batch, mixed), generator=generator)
+    squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
+    shares = squares / squares.sum(dim=1, keepdim=True)
+    return torch.zeros(batch, atoms, dtype=torch.float64).scatter_add_(1, chosen, shares)

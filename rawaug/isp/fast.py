@@ -15,17 +15,19 @@ import math
 from collections.abc import Sequence
 from copy import deepcopy
 from importlib import import_module
+from itertools import pairwise
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rawaug.bayer import CFA
-from rawaug.isp import stages
 from rawaug.isp.chooser import Chooser
-from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
+from rawaug.isp.stage import Dials, Stage, Tables, node_colours
+from rawaug.isp.tone_curves import STEPS
 from rawaug.kernels import compiled, fallback, raw_torch
 from rawaug.kernels.threads import one_thread
 
@@ -56,19 +58,17 @@ class BakedISP(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         self.config = isp.config
-        if not bakeable(self.config.stages):
+        if not bakeable(isp.ordered_stages):
             raise ValueError(f"only stages in the usual order can be baked, got {' '.join(self.config.stages)}")
-        axis = torch.linspace(0.0, 1.0, nodes)
-        cube = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
-        networks = isp.reverse_networks
+        self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
+        cube = node_colours(nodes)
+        tables = Tables(cube, cube)
         with torch.no_grad(), one_thread():  # the same table in every process
-            x = networks.tone(cube) if "tone" in self.config.stages else cube
-            x = stages.gamma_expand(x, networks.gamma) if "gamma" in self.config.stages else x
-            self.register_buffer("table", _as_table(x, nodes))
-            attends = self.config.attention and "shading" in self.config.stages
-            attention = _as_table(networks.attention(cube), nodes) if attends else torch.empty(0, 0, 0, 4)
+            for stage in isp.ordered_stages:
+                tables = stage.bake(tables)
+            attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
+            self.register_buffer("table", _as_table(tables.x2, nodes))
             self.register_buffer("attention", attention)
-        self.shading = deepcopy(isp.shading)
         self.chooser = Chooser(isp)
 
     def choose(self, srgb: Tensor) -> ISPParams:
@@ -107,33 +107,38 @@ class BakedISP(nn.Module):
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> raw_torch.Camera:
         batch, _, height, width = srgb.shape
-        kept, table = self.config.stages, self.table
-        matrix = params.matrix.to(table) if "colour" in kept else torch.eye(3).to(table).expand(batch, 3, 3)
-        floor = 1.0 / params.gains.to(table)[:, None] if "gains" in kept else torch.ones(batch, 1, 3).to(table)
+        table = self.table
+        dials = Dials(
+            torch.eye(3).to(table).expand(batch, 3, 3),
+            torch.ones(batch, 1, 3).to(table),
+            table.new_zeros(batch, 6),
+            table.new_empty(batch, 0),
+            table.new_empty(0),
+        )
+        for stage in self.stages:
+            dials = cast(Stage, stage).adjust(dials, params, place, (height, width))
+        matrix, floor, frame, curves, shading = dials
+        if curves.numel():
+            table = table[:0]
+            curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
-        frame, shading = table.new_zeros(batch, 6), table.new_empty(0)
-        if "shading" in kept:
-            centre = (float(self.shading.mean[0]), float(self.shading.mean[1]))
-            places = [[0, 0, height, width]] * batch if place is None else place.tolist()
-            frame = table.new_tensor([raw_torch.frame_of(p, height, width, centre) for p in places]).reshape(batch, 6)
-            precision = self.shading.precision * (0.5 / math.log(2.0))
-            shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
-        return raw_torch.Camera(table, self.attention, colour, self.config.knee, frame, shading, torch.tensor(sites))
+        knee, where = self.config.knee, torch.tensor(sites)
+        return raw_torch.Camera(table, curves, self.attention, colour, knee, frame, shading, where)
 
 
-def bakeable(order: Sequence[str]) -> bool:
+def bakeable(order: Sequence[Stage]) -> bool:
     """Whether stages stand in the usual order; any may be left out."""
-    return list(order) == [stage for stage in POINTWISE_STAGES if stage in order]
+    return all(first.makes < second.makes for first, second in pairwise(order))
 
 
 def require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
     """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
     if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
-        raise ValueError(f"sRGB has shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
+        raise ValueError(f"sRGB must have shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
     for what, value in (("matrix", params.matrix), ("gains", params.gains), ("place", place)):
         if value is not None and len(value) != len(srgb):
-            raise ValueError(f"{what} is for {len(value)} pictures, the batch has {len(srgb)}")
+            raise ValueError(f"{what} is for {len(value)} pictures, but the batch has {len(srgb)}")
 
 
 def _as_table(values: Tensor, nodes: int) -> Tensor:

@@ -95,7 +95,7 @@ def sample_lights(
         ValueError: if a limit is outside its range.
     """
     if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1):
-        raise ValueError(f"lights are of 1000 to 15000 K, lamps a share in [0, 1]; got {kelvin} and {lamps}")
+        raise ValueError(f"kelvin must be 1000 to 15000 and lamps in [0, 1], got {kelvin} and {lamps}")
     drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64)
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64)
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])

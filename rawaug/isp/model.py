@@ -3,43 +3,47 @@ r"""The dictionary ISP: sRGB to RAW and back, six stages whose parameters come f
 ``y = f6^-1 . f5^-1 . f4^-1 . f3^-1 . f2^-1 . f1^-1 (x)`` and ``x = f1 . f2 . f3 . f4 . f5 . f6 (y)``
 
 Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022. The stages are in
-:mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
+:mod:`rawaug.isp.paper_stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.files import find_weights, read_tensors, write_tensors
-from rawaug.isp import conditioning, stages
-from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
-from rawaug.isp.dictionary import ColourDictionary, GainDictionary
-from rawaug.isp.encoder import Encoder, thumbnail
+from rawaug.files import find_weights
+from rawaug.isp import (
+    conditioning,
+    paper_stages,  # noqa: F401 - registers the stages
+    stages,
+)
+from rawaug.isp.camera_sampling import CameraSampler
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.curve_stage import ToneCurve
+from rawaug.isp.dictionary import (
+    CameraDictionary,
+    ColourDictionary,
+    GainDictionary,
+    ToneDictionary,
+    convex_weights,
+)
+from rawaug.isp.encoder import Encoder, Encoders, thumbnail
+from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams, ISPResult
-from rawaug.seeding import initialised_from
+from rawaug.isp.stage import Stage, stage_class
+from rawaug.seeding import derived_seed, initialised_from
+
+S = TypeVar("S", bound=Stage)
 
 
-class DirectionNetworks(nn.Module):
-    """What each direction has of its own: tone network, gamma, attention mask and the two encoders."""
-
-    def __init__(self, config: ISPConfig) -> None:
-        super().__init__()
-        self.tone = stages.ToneNetwork()
-        self.gamma = nn.Parameter(torch.tensor(2.2))
-        self.attention = stages.AttentionMask()
-        self.colour_encoder = Encoder(config.colour_atoms, config.encoder_widths)
-        self.gain_encoder = Encoder(config.gain_atoms, config.encoder_widths)
-
-
-class DictionaryISP(nn.Module):
+class DictionaryISP(ReverseISP):
     """A learned, interpretable camera.
 
     Args:
@@ -53,17 +57,25 @@ class DictionaryISP(nn.Module):
         torch.Size([2, 1, 64, 96])
     """
 
+    name = "dictionary"
+
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
-        self.config = config or ISPConfig()
-        self.info: dict[str, Any] = {}
+        self._config = config or ISPConfig()
         with initialised_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
+            if self.config.cameras:
+                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
             self.gain = GainDictionary(self.config.gain_atoms)
-            self.shading = stages.GaussianMask()
-            self.reverse_networks = DirectionNetworks(self.config)
-            self.forward_networks = DirectionNetworks(self.config)
-        self.use_encoders(self.config.encoders)
+            made = [stage_class(name)(self.config) for name in self.config.stages]
+            self.stages = nn.ModuleDict({stage.name: stage for stage in made})
+            self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
+        self.use_encoders(self.config.encoders, seed)
+
+    @property
+    def config(self) -> ISPConfig:
+        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
+        return self._config
 
     @property
     def cfa(self) -> CFA:
@@ -71,43 +83,106 @@ class DictionaryISP(nn.Module):
         return CFA(self.config.cfa)
 
     @property
+    def ordered_stages(self) -> list[Stage]:
+        """The stages in reverse order."""
+        return [cast(Stage, stage) for stage in self.stages.values()]
+
+    def find(self, kind: type[S]) -> S | None:
+        """The stage of this class, or None."""
+        return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
+
+    @property
+    def reverse_parameters(self) -> int:
+        """Number of parameters of the reverse pass."""
+        names = (name for name, _ in self.named_parameters())
+        reverse = [name for name in names if not name.startswith("forward_") and ".forward_" not in name]
+        return sum(self.get_parameter(name).numel() for name in reverse)
+
+    # -- configuration ----------------------------------------------------------------------------------------------
+
+    def configure(self, **changes: Any) -> None:
+        """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them.
+
+        Raises:
+            ValueError: if there is no such stage in the ISP, or a value is out of its range.
+        """
+        config = replace(self.config, **changes)
+        if absent := [name for name in config.stages if name not in self.stages]:
+            raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
+        self._config = config
+        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
+        for stage in self.ordered_stages:
+            stage.config = config
+
+    @property
     def encoders_in_use(self) -> bool:
         """Whether the encoders look at the picture."""
-        return self.reverse_networks.colour_encoder.enabled
+        return self.config.encoders
 
-    def use_encoders(self, enabled: bool) -> None:
-        """Let the encoders look at the picture, or use their learned constants; goes into the file."""
-        self.config = replace(self.config, encoders=enabled)
-        for networks in (self.reverse_networks, self.forward_networks):
-            networks.colour_encoder.enabled = networks.gain_encoder.enabled = enabled
+    def use_encoders(self, enabled: bool, seed: int = 0) -> None:
+        """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
+
+        Without them the learned constants decide.
+        """
+        with initialised_from(derived_seed(seed, "encoders")):
+            for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
+                if not enabled:
+                    encoder.layers = None
+                elif not encoder.looks:
+                    encoder.add_layers(self.config.encoder_widths)
+        self.configure(encoders=enabled)
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
-    def params_from_weights(self, colour_weights: Tensor, gain_weights: Tensor) -> ISPParams:
-        """Parameters from given weights ``(B, N)`` and ``(B, M)``."""
+    def params_from_weights(
+        self, colour_weights: Tensor, gain_weights: Tensor, tone_weights: Tensor | None = None
+    ) -> ISPParams:
+        """Parameters from given weights ``(B, N)``, ``(B, M)`` and ``(B, K)``; of the typical tone by default."""
         matrix, gains = self.colour.combine(colour_weights), self.gain.combine(gain_weights)
-        return ISPParams(colour_weights, gain_weights, matrix, gains)
+        if tone_weights is None:
+            tone_weights = self.typical_tones().expand(len(matrix), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
+
+    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
+        """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
+
+        A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
+        atoms with uniform weights.
+        """
+        if isinstance(self.colour, CameraDictionary):
+            return CameraSampler(self.colour, self.config.tone_atoms).sample(batch, generator)
+        config, device = self.config, self.colour.matrices.device
+        atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
+        return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
+
+    @property
+    def tone(self) -> ToneDictionary | None:
+        """The dictionary of tone curves; None where the curve is learned."""
+        stage = self.find(ToneCurve)
+        return stage.dictionary if stage else None
+
+    def typical_tones(self) -> Tensor:
+        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
+        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
-        networks = self.reverse_networks
-        x2 = self._linear(thumbnail(stages.as_float(srgb)))
+        x2 = self.linear(thumbnail(stages.as_float(srgb)))
         candidates = torch.einsum("nij,bjhw->bnihw", self.colour.atoms(), x2)
-        colour_weights = networks.colour_encoder(candidates)
+        colour_weights = self.reverse_encoders.colour(candidates)
         x3 = torch.einsum("bn,bnihw->bihw", colour_weights, candidates)
         gains = self.gain.channel_gains()
         balanced = [stages.inverse_gains(x3, g.expand(len(x3), 3), self.config.knee) for g in gains]
-        return self.params_from_weights(colour_weights, networks.gain_encoder(torch.stack(balanced, dim=1)))
+        return self.params_from_weights(colour_weights, self.reverse_encoders.gain(torch.stack(balanced, dim=1)))
 
     def choose_forward(self, x4: Tensor) -> ISPParams:
         """The parameters that the forward encoders choose for a linear image before white balance ``(B, 3, H, W)``."""
-        networks = self.forward_networks
         small = thumbnail(x4)
         balanced = small[:, None] * self.gain.channel_gains()[None, :, :, None, None]
-        gain_weights = networks.gain_encoder(balanced)
+        gain_weights = self.forward_encoders.gain(balanced)
         x3 = stages.apply_gains(small, self.gain.combine(gain_weights))
         candidates = torch.einsum("nij,bjhw->bnihw", torch.linalg.pinv(self.colour.atoms()), x3)
-        return self.params_from_weights(networks.colour_encoder(candidates), gain_weights)
+        return self.params_from_weights(self.forward_encoders.colour(candidates), gain_weights)
 
     # -- passes -----------------------------------------------------------------------------------------------------
 
@@ -144,13 +219,13 @@ class DictionaryISP(nn.Module):
                 what is given is for another number of pictures.
         """
         if srgb.ndim != 4 or srgb.shape[1] != 3:
-            raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
+            raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
         x = stages.display_referred(srgb)
         params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
         if len(params.gains) != len(x):
-            raise ValueError(f"the parameters are those of {len(params.gains)} pictures, the batch has {len(x)}")
+            raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
         if raw_samples is not None:
-            params = conditioning.with_raw_samples(self, x, params, raw_samples, self.place(x, place))
+            params = conditioning.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
         seen: dict[str, Tensor] = {}
         x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
         return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
@@ -159,21 +234,10 @@ class DictionaryISP(nn.Module):
         self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
     ) -> Tensor:
         """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
-        networks = self.reverse_networks
-        for name in self.config.stages:
-            if name == "tone":
-                x = networks.tone(x)
-            elif name == "gamma":
-                x = stages.gamma_expand(x, networks.gamma)
-            elif name == "colour":
-                x = stages.correct_colour(x, params.matrix)
-            elif name == "gains":
-                x = stages.inverse_gains(x, params.gains, self.config.knee)
-            else:
-                x = x * self.shading(self.place(x, place))
-                x = x * networks.attention(x) if self.config.attention else x
+        for stage in self.ordered_stages:
+            x = stage.reverse(x, params, place)
             if seen is not None:
-                seen[f"x{POINTWISE_STAGES.index(name) + 1}"] = x
+                seen[f"x{stage.makes}"] = x
         return x
 
     def forward(
@@ -188,8 +252,7 @@ class DictionaryISP(nn.Module):
         """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
         x5 = bayer.demosaic(raw, self.cfa)
         if params is None:
-            x4 = self._correct_shading(x5, place) if "shading" in self.config.stages else x5
-            params = self.choose_forward(x4)
+            params = self.choose_forward(self._unshaded(x5, place))
         params = conditioning.with_white_balance(self, params, white_balance, None)
         seen: dict[str, Tensor] = {"x5": x5}
         srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
@@ -199,43 +262,47 @@ class DictionaryISP(nn.Module):
         self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
     ) -> Tensor:
         """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
-        networks = self.forward_networks
-        for name in reversed(self.config.stages):
-            if name == "shading":
-                x = self._correct_shading(x, place)
-            elif name == "gains":
-                x = stages.apply_gains(x, params.gains)
-            elif name == "colour":
-                x = stages.correct_colour(x, torch.linalg.pinv(params.matrix))
-            elif name == "gamma":
-                x = stages.gamma_compress(x, networks.gamma)
-            else:
-                x = networks.tone(x)
-            number = POINTWISE_STAGES.index(name)
-            if seen is not None and number:
-                seen[f"x{number}"] = x
+        for stage in reversed(self.ordered_stages):
+            x = stage.forward(x, params, place)
+            if seen is not None and stage.makes > 1:
+                seen[f"x{stage.makes - 1}"] = x
         return x
 
-    def _linear(self, x: Tensor) -> Tensor:
-        if "tone" in self.config.stages:
-            x = self.reverse_networks.tone(x)
-        return stages.gamma_expand(x, self.reverse_networks.gamma) if "gamma" in self.config.stages else x
+    def make(self, srgb: Tensor, setting: ISPParams | None = None, place: Tensor | None = None) -> Tensor:
+        """The mosaic of :meth:`reverse`."""
+        return self.reverse(srgb, setting, place=place).raw
 
-    def _correct_shading(self, x5: Tensor, place: Tensor | None) -> Tensor:
-        x = x5 / self.shading(self.place(x5, place))
-        return x * self.forward_networks.attention(x) if self.config.attention else x
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        return self.make(srgb, self.draw_setting(len(srgb), generator))
 
-    def place(self, x: Tensor, place: Tensor | None = None) -> Tensor:
-        """``place``, or that of a full frame, in the type of ``x``."""
-        return (stages.place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
+    def cycle(self, srgb: Tensor) -> Tensor:
+        """Through the mosaic, within [0, 1], and back."""
+        result = self.reverse(srgb)
+        return self.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
+
+    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor:
+        """What the stages alone lose."""
+        x = stages.as_float(srgb)
+        params = self.choose(x)
+        return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
+
+    def linear(self, x: Tensor) -> Tensor:
+        """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
+        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
+            x = stage.reverse(x, None) if stage.makes <= 2 else x
+        return x
+
+    def _unshaded(self, x: Tensor, place: Tensor | None) -> Tensor:
+        """x5 to x4, what the forward encoders look at."""
+        for stage in reversed(self.ordered_stages):
+            x = stage.forward(x, None, place) if stage.makes >= 5 else x
+        return x
 
     # -- files ------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
         """Write weights, configuration and ``info`` to one safetensors file, atomically."""
-        header = {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(self.config))}
-        header["info"] = json.dumps(self.info)
-        write_tensors(self.state_dict(), header, path)
+        write_isp(self.config, self.info, self.state_dict(), path)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> DictionaryISP:
@@ -246,22 +313,14 @@ class DictionaryISP(nn.Module):
             ValueError: if the file is not that of an ISP.
         """
         path = find_weights(name)
-        header, state = read_tensors(path, "fit or copy it again")
-        if header.get("kind") != "isp":
-            raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
+        config, info, state = read_isp(path)
         try:
-            settings: dict[str, Any] = json.loads(header["config"])
-            config = ISPConfig(**settings)
-            info = dict(json.loads(header.get("info", "{}")))
-            with torch.device("meta"):  # takes no memory before the tensors are known to fit
-                expected = cls(config).state_dict()
-        except (AttributeError, LookupError, OverflowError, RuntimeError, TypeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{path}: its configuration is damaged ({reason}); fit or copy it again") from error
-        shapes, needed = ({key: value.shape for key, value in tensors.items()} for tensors in (state, expected))
+            isp = cls(config)
+        except ValueError as error:
+            raise damaged(path, error) from error
+        shapes, needed = ({key: value.shape for key, value in tensors.items()} for tensors in (state, isp.state_dict()))
         if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
-            raise ValueError(f"{path}: tensor {wrong[0]} does not fit its configuration; fit or copy it again")
-        isp = cls(config)
+            raise misfit(path, wrong[0])
         isp.load_state_dict(state)
         isp.info = info
         return isp.eval()

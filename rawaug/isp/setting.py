@@ -13,15 +13,17 @@ class ISPParams(NamedTuple):
 
     Args:
         colour_weights: ``(B, N)`` weights of the colour atoms.
-        gain_weights: ``(B, M)`` weights of the gain atoms.
+        gain_weights: ``(B, M)`` weights of the gain atoms; ``(B, 0)`` where the gains follow from a light.
         matrix: ``(B, 3, 3)`` sRGB to camera.
         gains: ``(B, 3)`` white balance times digital gain, forward direction.
+        tone_weights: ``(B, K)`` weights of the tone curves; ``(B, 0)`` where the tone is learned.
     """
 
     colour_weights: Tensor
     gain_weights: Tensor
     matrix: Tensor
     gains: Tensor
+    tone_weights: Tensor
 
 
 @dataclass

@@ -46,19 +46,21 @@ def display_referred(srgb: Tensor) -> Tensor:
         ValueError: if it is not.
     """
     if srgb.dtype not in (torch.uint8, torch.float32):
-        raise ValueError(f"a picture is uint8, or float32 in [0, 1], got {srgb.dtype}; convert it first")
+        raise ValueError(f"a picture must be uint8 or float32 in [0, 1], got {srgb.dtype}; convert it first")
     require_display_range(srgb)
     return as_float(srgb)
 
 
 def require_display_range(image: Tensor) -> None:
-    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level."""
+    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level, or are NaN."""
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
     low, high = (float(value) for value in torch.aminmax(image.detach()))
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
+        if missing := int(image.isnan().sum()):
+            raise ValueError(f"a float picture is in [0, 1], got NaN in {missing} of {image.numel()} values; mend it")
         raise ValueError(
-            f"a float picture is in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
+            f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
         )
 
 
@@ -148,6 +150,11 @@ def place_in_frame(
     y = (torch.arange(height) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
     x = (torch.arange(width) + (offset[1] + 0.5 - full_width / 2)) / half_diagonal
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
+
+
+def placed(x: Tensor, place: Tensor | None) -> Tensor:
+    """``place``, or that of a full frame, in the type of the image ``x``."""
+    return (place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
 
 
 class GaussianMask(nn.Module):

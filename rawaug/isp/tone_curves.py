@@ -20,8 +20,9 @@ from importlib import resources
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
+
+from rawaug.kernels.raw_torch import through_curves
 
 STEPS = 8
 """Entries of a table for each 8-bit level."""
@@ -58,17 +59,16 @@ def tone_tables(names: Sequence[str] | None = None) -> Tensor:
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Pictures ``(B, C, H, W)``, uint8 or float in [0, 1], through one table ``(B, 2041)`` each; float32."""
-    if srgb.dtype == torch.uint8:
-        return _take(tables[:, ::STEPS], srgb.int())
-    position = srgb.clamp(0.0, 1.0) * (NODES - 1)
-    left = position.int().clamp_max(NODES - 2)
-    low, high = _take(tables, left), _take(tables, left + 1)
-    return torch.lerp(low, high, position - left)
+    return through_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
 
 
-def _take(tables: Tensor, index: Tensor) -> Tensor:
-    taken = [table.index_select(0, own.flatten()) for table, own in zip(tables, index, strict=True)]
-    return torch.stack(taken).reshape(index.shape)
+def to_code(linear: Tensor, tables: Tensor) -> Tensor:
+    """The way back: linear light ``(B, C, H, W)``, held to [0, 1], to sRGB codes in [0, 1], float32."""
+    light = linear.clamp(0.0, 1.0).flatten(1).to(tables)
+    right = torch.searchsorted(tables, light).clamp(1, NODES - 1)
+    low, high = tables.gather(1, right - 1), tables.gather(1, right)
+    share = ((light - low) / (high - low).clamp_min(1e-12)).clamp(0.0, 1.0)
+    return ((right - 1 + share) / (NODES - 1)).reshape(linear.shape)
 
 
 @cache
@@ -88,6 +88,8 @@ def _inverse_smoothstep(code: Tensor) -> Tensor:
 
 def _through(points: Sequence[Sequence[float]]) -> Callable[[np.ndarray], np.ndarray]:
     """The monotone cubic through ``points`` (camera, display), from black: a measured one may start at an offset."""
+    from scipy.interpolate import PchipInterpolator  # slow to import, and needed by nothing else
+
     light, display = np.array(points).T
     display[0] = 0.0
     curve: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(light, display)

@@ -1,4 +1,4 @@
-"""The reverse pass of an ISP whose stages stand in an order of their own, which no table can hold.
+"""The reverse pass of an ISP with reordered stages, which cannot be baked into a table.
 
 Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.fast.BakedISP`; dozens of times slower.
 """
@@ -47,7 +47,7 @@ def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
         >>> type(reverse_pass(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))).__name__
         'UnbakedISP'
     """
-    return BakedISP(isp) if bakeable(isp.config.stages) else UnbakedISP(isp)
+    return BakedISP(isp) if bakeable(isp.ordered_stages) else UnbakedISP(isp)
 
 
 def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Loops over pixels that are compiled on first use, and the threads they run on.
 
-Numba compiles for the CPU at hand, without a compiler being installed, and keeps the result on disk: beside the source,
+Numba compiles for the current CPU, without an installed compiler, and keeps the result on disk: beside the source,
 in the user's cache folder where that is not writable, or where ``NUMBA_CACHE_DIR`` says. The loops work on rows and
 release the GIL, so that plain threads share them out: as many as ``torch.get_num_threads()``, which is 1 in a
 DataLoader's worker. A result never depends on their number. Where Numba is missing, or ``NUMBA_DISABLE_JIT=1`` turns it

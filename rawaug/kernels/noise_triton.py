@@ -60,16 +60,16 @@ def _pair(u, turn):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _disturb(clean, normal, noisy, variance, at, inside, shot, read, white, TOLD: tl.constexpr):  # type: ignore[no-untyped-def]
+def _disturb(clean, normal, noisy, variance, at, inside, shot, read, white, MAP: tl.constexpr):  # type: ignore[no-untyped-def]
     y = tl.load(clean + at, mask=inside, other=0.0)
     value = tl.minimum(y + tl.sqrt(shot * tl.maximum(y, 0.0) + read) * normal, white)
     tl.store(noisy + at, value, mask=inside)
-    if TOLD:
+    if MAP:
         tl.store(variance + at, shot * tl.maximum(value, 0.0) + read, mask=inside)
 
 
 @triton.jit
-def _cells(clean, levels, keys, noisy, variance, cells, white, TOLD: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _cells(clean, levels, keys, noisy, variance, cells, white, MAP: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     picture = tl.program_id(1)
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = cell < cells
@@ -79,7 +79,7 @@ def _cells(clean, levels, keys, noisy, variance, cells, white, TOLD: tl.constexp
     green_b, blue = _pair(c, d)
     size = cells.to(tl.int64)
     at = picture * 4 * size + cell
-    _disturb(clean, red, noisy, variance, at, inside, shot, read, white, TOLD)
-    _disturb(clean, green_r, noisy, variance, at + size, inside, shot, read, white, TOLD)
-    _disturb(clean, green_b, noisy, variance, at + 2 * size, inside, shot, read, white, TOLD)
-    _disturb(clean, blue, noisy, variance, at + 3 * size, inside, shot, read, white, TOLD)
+    _disturb(clean, red, noisy, variance, at, inside, shot, read, white, MAP)
+    _disturb(clean, green_r, noisy, variance, at + size, inside, shot, read, white, MAP)
+    _disturb(clean, green_b, noisy, variance, at + 2 * size, inside, shot, read, white, MAP)
+    _disturb(clean, blue, noisy, variance, at + 3 * size, inside, shot, read, white, MAP)

@@ -37,15 +37,34 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     if not raw.numel():
         return raw
     picture, out = srgb.detach().contiguous().numpy(), raw.numpy()
-    scale = np.float32((len(camera.table) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0))
+    entries = camera.curves.shape[1] if camera.curves.numel() else len(camera.table)
+    in_bytes = srgb.dtype == torch.uint8
+    scale = np.float32((entries - 1) / (255.0 if in_bytes else 1.0))
     # Absent parts are None, so that no code is compiled for them.
-    table, attention, colour, frame, shading, sites = (
+    table, curves, attention, colour, frame, shading, sites = (
         value.contiguous().numpy() if value.numel() else None for value in camera if isinstance(value, Tensor)
     )
+    codes, curves = (curves, None) if in_bytes and entries == 256 else (None, curves)
     knee, ceiling = np.float32(camera.knee), np.float32(white)
 
     def run(start: int, stop: int) -> None:
-        _rows(picture, scale, table, attention, colour, knee, frame, shading, sites, ceiling, out, start, stop)
+        _rows(
+            picture,
+            scale,
+            table,
+            codes,
+            curves,
+            attention,
+            colour,
+            knee,
+            frame,
+            shading,
+            sites,
+            ceiling,
+            out,
+            start,
+            stop,
+        )
 
     over_rows(batch * height, width, run)
     return raw
@@ -148,6 +167,27 @@ def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # typ
 
 
 @part
+def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
+    """Values of a curve ``(T,)`` at one channel of a row: even sites to ``out`` ``(2, n)`` [0], odd ones to [1]."""
+    last, share = np.int32(len(curve) - 2), shares[0]
+    for j in range(len(plane)):
+        nodes[j], share[j] = _cell_of(plane[j], scale, last)
+    even, odd = out[0], out[1]
+    for j in range(len(plane) // 2):
+        a, b = np.uint32(nodes[2 * j]), np.uint32(nodes[2 * j + 1])  # unsigned, or negative ones are looked for
+        even[j] = curve[a] + (curve[a + np.uint32(1)] - curve[a]) * share[2 * j]
+        odd[j] = curve[b] + (curve[b + np.uint32(1)] - curve[b]) * share[2 * j + 1]
+
+
+@part
+def _of_codes(plane, curve, out):  # type: ignore[no-untyped-def]
+    """:func:`_through_curve` of bytes, for which the curve has an entry each."""
+    even, odd = out[0], out[1]
+    for j in range(len(plane) // 2):
+        even[j], odd[j] = curve[plane[2 * j]], curve[plane[2 * j + 1]]
+
+
+@part
 def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
     """The mask at every second pixel of a row from ``first`` on.
 
@@ -197,7 +237,7 @@ def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: igno
 
 
 @compiled
-def _rows(srgb, scale, table, attention, colour, knee, frame, shading, sites, white, raw, start, stop):  # type: ignore[no-untyped-def]
+def _rows(srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop):  # type: ignore[no-untyped-def]
     """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
     height, width = srgb.shape[2], raw.shape[3]
     nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)
@@ -209,7 +249,14 @@ def _rows(srgb, scale, table, attention, colour, knee, frame, shading, sites, wh
         for first in range(0, width, _TILE):
             last = min(first + _TILE, width)
             pixels = slice(2 * first, 2 * last)
-            _look_up(red[pixels], green[pixels], blue[pixels], scale, table, nodes, shares, 1, x2)
+            if table is not None:
+                _look_up(red[pixels], green[pixels], blue[pixels], scale, table, nodes, shares, 1, x2)
+            if codes is not None:
+                for c in range(3):
+                    _of_codes(srgb[b, c, i, pixels], codes[b], x2[:, c])
+            if curves is not None:
+                for c in range(3):
+                    _through_curve(srgb[b, c, i, pixels], scale, curves[b], nodes, shares, x2[:, c])
             for k in range(len(sites)):
                 if sites[k, 0] != i % 2:
                     continue

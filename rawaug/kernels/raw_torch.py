@@ -26,7 +26,10 @@ class Camera(NamedTuple):
     """What the pass needs to know, float32 on the device of the pictures.
 
     Args:
-        table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used.
+        table: ``(N, N, N, 4)`` x2 over the sRGB cube, axes B, G, R; the last of the four is not used. Empty if the
+            pictures have curves.
+        curves: ``(B, T)`` x2 over the sRGB code, one curve a picture for all of its channels; T is 256 for uint8, where
+            it is not interpolated. Empty if there is a table.
         attention: of the same form, A in the first of the four over the cube of x4; or empty, for none.
         colour: ``(B, 6, 3)``: the rows of the matrix, their mean, floor, rise.
         knee: mean of x3 where the gains start to spare highlights.
@@ -36,6 +39,7 @@ class Camera(NamedTuple):
     """
 
     table: Tensor
+    curves: Tensor
     attention: Tensor
     colour: Tensor
     knee: float
@@ -48,18 +52,20 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
     """One row of :attr:`Camera.frame`.
 
     Args:
-        place: top, left, height, width of the full frame, and the view in which the crop was turned (none if left out).
+        place: top, left, height, width of the full frame, the view in which the crop was turned, and how many rows
+            were enlarged to it (neither if left out).
         height, width: of the picture as it is, turned.
         centre: y and x of the mask's centre in the coordinates of :func:`rawaug.isp.stages.place_in_frame`.
     """
-    top, left, frame_height, frame_width, view = (*place, 0)[:5]
+    top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
+    step = rows / height if rows else 1.0
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
 
     def position(i: int, j: int) -> tuple[float, float]:
         i, j = height - 1 - i if view & 2 else i, width - 1 - j if view & 1 else j
         row, column = (j, i) if view & 4 else (i, j)
-        y = (row + top + 0.5 - frame_height / 2) / half_diagonal - centre[0]
-        return y, (column + left + 0.5 - frame_width / 2) / half_diagonal - centre[1]
+        y = ((row + 0.5) * step + top - frame_height / 2) / half_diagonal - centre[0]
+        return y, ((column + 0.5) * step + left - frame_width / 2) / half_diagonal - centre[1]
 
     (y, x), down, right = position(0, 0), position(1, 0), position(0, 1)
     return [y, x, down[0] - y, down[1] - x, right[0] - y, right[1] - x]
@@ -74,7 +80,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
         pictures, rows = 1, max(2, _BAND // max(width, 1) // 2 * 2)
     for b in range(0, batch, pictures):
         own = slice(b, b + pictures)
-        camera_here = camera._replace(colour=camera.colour[own], frame=camera.frame[own])
+        camera_here = camera._replace(curves=camera.curves[own], colour=camera.colour[own], frame=camera.frame[own])
         for top in range(0, height, rows):
             _develop(srgb[own, :, top : top + rows], camera_here, top, raw[own, :, top // 2 : (top + rows) // 2])
     return raw.clamp_(max=white)
@@ -89,9 +95,27 @@ def look_up(table: Tensor, x: Tensor) -> Tensor:
     return found[0].transpose(0, 1)
 
 
+def through_curves(curves: Tensor, x: Tensor) -> Tensor:
+    """Each picture of ``x`` ``(B, C, H, W)`` through its own curve, ``curves`` ``(B, T)``, by linear interpolation.
+
+    Of 256 entries each is a code of uint8, and nothing is interpolated; floats are held to [0, 1].
+    """
+    if x.dtype == torch.uint8 and curves.shape[1] == 256:
+        return _take(curves, x.int())
+    unit = x / 255.0 if x.dtype == torch.uint8 else x.clamp(0.0, 1.0)
+    position = unit * (curves.shape[1] - 1)
+    left = position.int().clamp_max(curves.shape[1] - 2)
+    return torch.lerp(_take(curves, left), _take(curves, left + 1), position - left)
+
+
+def _take(curves: Tensor, index: Tensor) -> Tensor:
+    taken = [curve.index_select(0, own.flatten()) for curve, own in zip(curves, index, strict=True)]
+    return torch.stack(taken).reshape(index.shape) if taken else curves.new_empty(index.shape)
+
+
 def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
     """Rows of pictures from ``top`` on, to ``raw``."""
-    x2 = look_up(camera.table, srgb)[:, :3]
+    x2 = through_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
     mask = _fall_off(camera, top, *srgb.shape[-2:])
     for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
         here = x2[..., i::2, j::2]

@@ -21,13 +21,15 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2
     raw = torch.empty(batch, 4, h, w, device=srgb.device)
-    nodes = camera.table.shape[0]
-    scale = (nodes - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)
+    nodes = max(camera.table.shape[0], camera.attention.shape[0])
+    entries = camera.curves.shape[1] if camera.curves.numel() else 0
+    scale = ((entries or nodes) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)
     sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
     with torch.cuda.device_of(srgb):  # which need not be the current one
         _cells[(triton.cdiv(h * w, _BLOCK), batch)](
             srgb.contiguous(),
             camera.table,
+            camera.curves.contiguous(),
             camera.attention,
             camera.colour.contiguous(),
             camera.frame.contiguous(),
@@ -43,6 +45,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
             S1=sites[1],
             S2=sites[2],
             S3=sites[3],
+            ENTRIES=entries,
             ATTENDS=camera.attention.numel() > 0,
             SHADES=camera.shading.numel() > 0,
             BLOCK=_BLOCK,
@@ -75,6 +78,14 @@ def _read(table, at, u, v, t, NODES: tl.constexpr):  # type: ignore[no-untyped-d
 
 
 @triton.jit
+def _curve(curve, x, ENTRIES: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Linear interpolation of a picture's curve."""
+    node, share = _axis(x, ENTRIES)
+    low = tl.load(curve + node)
+    return low + (tl.load(curve + node + 1) - low) * share
+
+
+@triton.jit
 def _row(colour, k, r, g, b):  # type: ignore[no-untyped-def]
     """Row ``k`` of the matrix (3: the mean of its rows) times a colour."""
     return tl.load(colour + 3 * k) * r + tl.load(colour + 3 * k + 1) * g + tl.load(colour + 3 * k + 2) * b
@@ -88,21 +99,27 @@ def _channel(colour, k, r, g, b, m, shade):  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _site(  # type: ignore[no-untyped-def]
-    srgb, table, attention, colour, frame, shading, raw, cell, h, w, scale, knee, white,
-    SITE: tl.constexpr, NODES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
+    srgb, table, curve, attention, colour, frame, shading, raw, cell, h, w, scale, knee, white,
+    SITE: tl.constexpr, NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr,
 ):  # fmt: skip
     """One plane of the cells: SITE is row + 2 column + 4 colour of its sites."""
     size = h.to(tl.int64) * w
     inside = cell < h * w
     row, column = cell // w * 2 + SITE % 2, cell % w * 2 + SITE // 2 % 2
     pixel = row.to(tl.int64) * (2 * w) + column
-    red, u = _axis(tl.load(srgb + pixel, mask=inside, other=0).to(tl.float32) * scale, NODES)
-    green, v = _axis(tl.load(srgb + 4 * size + pixel, mask=inside, other=0).to(tl.float32) * scale, NODES)
-    blue, t = _axis(tl.load(srgb + 8 * size + pixel, mask=inside, other=0).to(tl.float32) * scale, NODES)
-    at = ((blue * NODES + green) * NODES + red) * 4
-    r = _read(table, at, u, v, t, NODES)
-    g = _read(table, at + 1, u, v, t, NODES)
-    b = _read(table, at + 2, u, v, t, NODES)
+    r = tl.load(srgb + pixel, mask=inside, other=0).to(tl.float32) * scale
+    g = tl.load(srgb + 4 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
+    b = tl.load(srgb + 8 * size + pixel, mask=inside, other=0).to(tl.float32) * scale
+    if ENTRIES:
+        r, g, b = _curve(curve, r, ENTRIES), _curve(curve, g, ENTRIES), _curve(curve, b, ENTRIES)
+    else:
+        red, u = _axis(r, NODES)
+        green, v = _axis(g, NODES)
+        blue, t = _axis(b, NODES)
+        at = ((blue * NODES + green) * NODES + red) * 4
+        r = _read(table, at, u, v, t, NODES)
+        g = _read(table, at + 1, u, v, t, NODES)
+        b = _read(table, at + 2, u, v, t, NODES)
 
     m = tl.minimum(tl.maximum((_row(colour, 3, r, g, b) - knee) / (1.0 - knee), 0.0), 1.0)
     shade = 1.0
@@ -124,16 +141,20 @@ def _site(  # type: ignore[no-untyped-def]
 
 @triton.jit
 def _cells(  # type: ignore[no-untyped-def]
-    srgb, table, attention, colour, frame, shading, raw, h, w, scale, knee, white,
+    srgb, table, curves, attention, colour, frame, shading, raw, h, w, scale, knee, white,
     S0: tl.constexpr, S1: tl.constexpr, S2: tl.constexpr, S3: tl.constexpr,
-    NODES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr, BLOCK: tl.constexpr,
+    NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     picture = tl.program_id(1).to(tl.int64)
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = h.to(tl.int64) * w
     x, y = srgb + picture * 12 * size, raw + picture * 4 * size
-    c, f = colour + picture * 18, frame + picture * 6
-    _site(x, table, attention, c, f, shading, y, cell, h, w, scale, knee, white, S0, NODES, ATTENDS, SHADES)
-    _site(x, table, attention, c, f, shading, y + size, cell, h, w, scale, knee, white, S1, NODES, ATTENDS, SHADES)
-    _site(x, table, attention, c, f, shading, y + 2 * size, cell, h, w, scale, knee, white, S2, NODES, ATTENDS, SHADES)
-    _site(x, table, attention, c, f, shading, y + 3 * size, cell, h, w, scale, knee, white, S3, NODES, ATTENDS, SHADES)
+    c, f, curve = colour + picture * 18, frame + picture * 6, curves + picture * ENTRIES
+    _site(x, table, curve, attention, c, f, shading, y, cell, h, w, scale, knee, white,
+          S0, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, y + size, cell, h, w, scale, knee, white,
+          S1, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, y + 2 * size, cell, h, w, scale, knee, white,
+          S2, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
+    _site(x, table, curve, attention, c, f, shading, y + 3 * size, cell, h, w, scale, knee, white,
+          S3, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip

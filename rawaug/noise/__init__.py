@@ -1,6 +1,6 @@
 """Noise that real sensors make: models, published levels, the estimate of a camera's own, and stabilisation."""
 
-from rawaug.noise.by_name import camera_names, noise_levels, noise_model, noise_names
+from rawaug.noise.by_name import NoiseSpec, camera_names, noise_levels, noise_model, noise_names
 from rawaug.noise.compose import Compose, EldNoise, SensorNoise
 from rawaug.noise.dark import DarkNoise, from_dark_frames
 from rawaug.noise.estimate import NoiseEstimate, NoisePoints, estimate_noise
@@ -23,6 +23,7 @@ __all__ = [
     "NoiseLevels",
     "NoiseModel",
     "NoisePoints",
+    "NoiseSpec",
     "Params",
     "PmridLevels",
     "PoissonGaussianNoise",

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from rawaug.noise.by_name import noise_levels
 from rawaug.noise.iso import EldLevels, Iso
 from rawaug.noise.levels import FixedLevels, NoiseLevels
 from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadNoise
@@ -24,6 +25,7 @@ from rawaug.noise.sensor import (
     TukeyLambdaNoise,
     tukey_lambda_variance,
 )
+from rawaug.registry import NOISE
 
 
 class Compose(NoiseModel):
@@ -60,11 +62,12 @@ class Compose(NoiseModel):
         return torch.stack([model.variance(clean, params) for model in self.models]).sum(0)
 
 
+@NOISE.register("SensorNoise")
 class SensorNoise(Compose):
     """Shot and read noise with a switch for everything else that a sensor does; what is 0 or None is off.
 
     Args:
-        levels: what samples (shot_var, read_var).
+        levels: what samples (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
         poisson: exact photon statistics instead of the Gaussian.
         tukey_lambda: shape of heavy-tailed read noise instead of Gaussian, or a range of it. Implies ``poisson``.
         row_var: variance of banding, or a range of it.
@@ -80,7 +83,7 @@ class SensorNoise(Compose):
 
     def __init__(
         self,
-        levels: NoiseLevels,
+        levels: NoiseLevels | str | Sequence[float] | Sequence[str],
         *,
         poisson: bool = False,
         tukey_lambda: float | tuple[float, float] | None = None,
@@ -92,6 +95,7 @@ class SensorNoise(Compose):
         bits: int | None = None,
         black_level: int = 0,
     ) -> None:
+        levels = noise_levels(levels) if isinstance(levels, (str, Sequence)) else levels
         models: list[NoiseModel] = [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
         if tukey_lambda is not None:
             models = [TukeyLambdaNoise(levels, tukey_lambda)]
@@ -108,6 +112,7 @@ class SensorNoise(Compose):
         super().__init__(models)
 
 
+@NOISE.register("EldNoise")
 class EldNoise(Compose):
     """ELD's full model of one of its five cameras: photons, Tukey-lambda read noise, banding, colour bias and rounding.
 

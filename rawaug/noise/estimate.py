@@ -119,6 +119,8 @@ def estimate_noise(
 
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
+    from scipy.fft import dctn
+
     if frame.shape[:-3].numel() != 1 or frame.ndim < 3 or frame.shape[-3] != 1:
         raise ValueError(f"a mosaic must have shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
     if min(frame.shape[-2:]) < 2 * BLOCK:
@@ -126,9 +128,8 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
     floor, ceiling = _clipping_levels(frame)
     planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
     tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
-    dct = _dct_matrix().to(tiles)
-    energy = (dct @ tiles @ dct.T).square_()
-    bands = [energy[..., band.to(tiles.device)].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
+    energy = torch.from_numpy(dctn(tiles.cpu().numpy(), axes=(-2, -1), norm="ortho")).square_()
+    bands = [energy[..., band].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
     signal = tiles.mean((-2, -1)).flatten()
     channel = torch.arange(4, device=tiles.device).repeat_interleave(tiles.shape[1])
     inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
@@ -151,13 +152,6 @@ def _piles_up(frame: Tensor) -> bool:
         return False
     count, next_count = frame.numel() - above.numel(), int((above == above.min()).sum())
     return count >= max(10, frame.numel() // 100_000, next_count)
-
-
-def _dct_matrix() -> Tensor:
-    k = torch.arange(BLOCK, dtype=torch.float64)
-    matrix = torch.cos(math.pi / BLOCK * k[:, None] * (k + 0.5)) * math.sqrt(2 / BLOCK)
-    matrix[0] /= math.sqrt(2)
-    return matrix
 
 
 def _split_levels(blocks: _Blocks) -> list[_Blocks]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rawaug.extras import extra
 from rawaug.noise.estimate import NoiseEstimate
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ def plot_noise(
     Returns:
         The matplotlib figure.
     """
-    from matplotlib.figure import Figure
+    with extra("train"):
+        from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     points = estimate.points

@@ -1,4 +1,4 @@
-r"""How strong the noise is: what samples (shot_var, read_var) for a picture.
+r"""Noise levels: samplers of (shot_var, read_var) per picture.
 
 A published preset draws shot_var log-uniformly and read_var around a line in the logarithms,
 

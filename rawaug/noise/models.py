@@ -1,4 +1,4 @@
-r"""Shot and read noise, the two that every sensor makes.
+r"""Shot and read noise, which every sensor has.
 
 .. math:: y_{noisy} = y + n, \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 

@@ -1,4 +1,4 @@
-r"""Noise of any camera by name: darktable's profiles, 374 models by ISO.
+r"""Noise of a camera by name: darktable's profiles, 374 models by ISO.
 
 .. math:: \operatorname{var}(y) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 

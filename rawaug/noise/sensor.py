@@ -1,4 +1,4 @@
-r"""What a sensor adds to shot and read noise, each a model of its own that composes with the others.
+r"""Sensor noise beyond shot and read noise, each effect a model that composes with the others.
 
 Row noise (banding), heavy-tailed read noise, the offset of the black level, the bias of a colour, dead and hot pixels
 and the rounding to digital numbers; after Wei et al., "A physics-based noise formation model for extreme low-light raw
@@ -43,12 +43,11 @@ def tukey_lambda_variance(shape: float) -> float:
     Raises:
         ValueError: for a shape of -1/2 or less, where it is infinite.
     """
+    from scipy.stats import tukeylambda
+
     if shape <= -0.5:
         raise ValueError(f"a Tukey lambda shape must be above -0.5 (finite variance), got {shape}")
-    if abs(shape) < 1e-4:
-        return math.pi**2 / 3
-    beta = math.exp(2 * math.lgamma(shape + 1) - math.lgamma(2 * shape + 2))
-    return 2 / shape**2 * (1 / (1 + 2 * shape) - beta)
+    return float(tukeylambda.var(shape))
 
 
 class TukeyLambdaNoise(PoissonGaussianNoise):

@@ -1,6 +1,7 @@
-r"""Online augmentation: sRGB pictures in, noisy/clean RAW pairs out.
+r"""Online augmentation: sRGB pictures to noisy/clean RAW pairs.
 
-``y = isp^-1(x; C, g)`` with the camera setting (C, g) drawn from the hull of the dictionaries' atoms, then
+``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
+atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.camera_sampling`), then
 ``noisy ~ N(y, shot_var y + read_var)``, clipped at white, never at black (Conde et al., AAAI 2022, "Dictionary
 Augmentations").
 
@@ -12,18 +13,21 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypeVar, overload
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from rawaug.isp.dictionary import convex_weights, perturb
+from rawaug.isp.camera_sampling import EXPOSURE
+from rawaug.isp.dictionary import perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.isp.universal import of_cameras
+from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
@@ -34,18 +38,22 @@ Sampling = Literal["convex", "perturb", "chosen"]
 class RawAugment(nn.Module):
     """sRGB batches to RAW pairs.
 
+    It has no parameters and adds nothing to the ``state_dict`` of a surrounding network.
+
     Args:
-        isp: the fitted camera; is put in eval mode, without gradients.
+        isp: the fitted camera; a frozen copy is taken, later changes do not reach it.
         noise: name of a preset or a measured camera, (shot_var, read_var), a :class:`rawaug.noise.NoiseModel`, or
             ``"camera"`` for the levels that were measured when the ISP was fitted.
-        sampling: ``"convex"`` draws uniform convex combinations of the atoms, without looking at the picture;
-            ``"perturb"`` adds Gaussian noise to the weights that the ISP chooses; ``"chosen"`` takes these as they are.
+        sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
+            ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
+            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
+            ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
-        seed: of the module's own draws, where no generator is passed. They are counted from its construction on: what
-            is to go on where it stopped passes a generator, or takes RawPairs or wrap.
-        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly; ``(0, 0)`` is that of the
-            camera which the ISP knows. Cameras differ in the headroom that they leave above their JPEG's white: for
-            training that is to serve others, (-1.5, 0).
+        seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
+            resume, pass a generator, or use RawPairs or wrap.
+        exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
+            default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
+            above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -63,17 +71,20 @@ class RawAugment(nn.Module):
         sampling: Sampling = "convex",
         strength: float = 0.1,
         seed: int = 0,
-        exposure: tuple[float, float] = (0.0, 0.0),
+        exposure: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
         if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is none of convex, perturb, chosen")
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
         if not strength >= 0:
-            raise ValueError(f"strength is a standard deviation, at least 0, got {strength}")
+            raise ValueError(f"strength must be at least 0, got {strength}")
+        if exposure is None:
+            exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
-            raise ValueError(f"exposure is the lowest and the highest in stops, got {exposure}")
-        self.isp = isp.eval().requires_grad_(False)
-        self.baked = reverse_pass(self.isp)
+            raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
+        self.isp = frozen(isp)
+        self.baked = frozen(reverse_pass(isp))
+        self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
         self.sampling = sampling
         self.strength = strength
@@ -82,9 +93,28 @@ class RawAugment(nn.Module):
         self._calls = 0
 
     @classmethod
-    def from_pretrained(cls, isp: str | Path | DictionaryISP, **settings: Any) -> RawAugment:
-        """From the name of a shipped ISP, a path, or an ISP; ``settings`` as in the constructor."""
-        return cls(isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp), **settings)
+    def from_pretrained(
+        cls, isp: str | Path | DictionaryISP, camera: str | Sequence[str] | None = None, **settings: Any
+    ) -> RawAugment:
+        """From the name of a shipped ISP, a path, or an ISP.
+
+        Args:
+            isp: the name, path or ISP.
+            camera: maker and model of a published camera, or several, in place of the ISP's colour atoms; for an ISP of
+                published cameras, such as ``universal``.
+            settings: as in the constructor.
+
+        Raises:
+            FileNotFoundError: if there is no such ISP.
+            ValueError: if a camera is not listed, or the ISP was fitted to frames.
+
+        Example:
+            >>> augment = RawAugment.from_pretrained("universal", camera="Nikon D750")
+            >>> augment.isp.info["cameras"]
+            ['Nikon D750']
+        """
+        loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
+        return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
@@ -105,18 +135,13 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        config, device = self.isp.config, srgb.device
         if self.sampling == "convex":
-            colour, gain = (
-                convex_weights(len(srgb), n, generator).to(device) for n in (config.colour_atoms, config.gain_atoms)
-            )
-        else:
-            chosen = self.baked.choose(srgb)
-            if self.sampling == "chosen":
-                return chosen
-            colour = perturb(chosen.colour_weights, self.strength, generator)
-            gain = perturb(chosen.gain_weights, self.strength, generator)
-        return self.isp.params_from_weights(colour, gain)
+            return self.isp.draw_setting(len(srgb), generator)
+        chosen = self.baked.choose(srgb)
+        if self.sampling == "chosen":
+            return chosen
+        weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
+        return self.isp.params_from_weights(*(perturb(w, self.strength, generator) for w in weights))
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""
@@ -144,7 +169,7 @@ class RawAugment(nn.Module):
 
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
         if len(params.place) != len(srgb):
-            raise ValueError(f"the parameters are those of {len(params.place)} pictures, the batch has {len(srgb)}")
+            raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
             clean = self.baked(srgb, params.isp, params.place, white=1.0)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
@@ -188,16 +213,18 @@ class RawAugment(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the module is."""
-        return next(self.isp.parameters()).device
+        return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
-        """``(B, 3, H, W)`` with even sides; what is no tensor yet goes to the module's device."""
+        """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
         device = self.device
         srgb = even_sided(to_rgb_batch(pictures))
         if not isinstance(pictures, Tensor):
             return srgb.to(device)
         if srgb.device != device:
-            raise ValueError(f"the pictures are on {srgb.device}, the augmentation on {device}; call augment.to(...)")
+            raise ValueError(
+                f"the pictures are on {srgb.device} but the augmentation is on {device}; call augment.to(...)"
+            )
         return srgb
 
     def _own_generator(self) -> torch.Generator:
@@ -207,13 +234,34 @@ class RawAugment(nn.Module):
         return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
 
 
+M = TypeVar("M", bound=nn.Module)
+
+
+def frozen(module: M) -> M:
+    """A copy in eval mode whose tensors are buffers outside of ``state_dict``; the module stays as it is."""
+    copy = deepcopy(module).eval()
+    for part in copy.modules():
+        tensors = {**part._parameters, **part._buffers}
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                delattr(part, name)
+                part.register_buffer(name, tensor.detach(), persistent=False)
+    return copy
+
+
+def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Checkpoints of version 0.1 hold the ISP."""
+    for name in [name for name in state if name.startswith((f"{prefix}isp.", f"{prefix}baked."))]:
+        del state[name]
+
+
 def _float32(like: Tensor) -> torch.autocast:
     """RAW is float32, inside mixed precision too."""
     return torch.autocast(like.device.type, enabled=False)
 
 
-def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels that stand in its file.
+def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels in its file.
 
     Raises:
         ValueError: if none were measured, or the name is unknown.
@@ -221,5 +269,5 @@ def noise_for(isp: DictionaryISP, noise: str | Sequence[float] | Sequence[str] |
     if noise != "camera":
         return noise_model(noise)
     if "noise" not in isp.info:
-        raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again, or name a preset')
+        raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
     return noise_model((isp.info["noise"]["shot_var"], isp.info["noise"]["read_var"]))

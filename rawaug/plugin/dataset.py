@@ -2,21 +2,31 @@
 
 Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone: first its
 crop, then one of eight flips and turns, then camera and noise. So the pairs are the same with any number of workers,
-any start method, any batch size, and after a resume in the middle of an epoch.
+any start method and any batch size.
+
+The epoch advances by itself: it is the number of times that picture i was asked for before (:mod:`rawaug.plugin.epochs`
+says why, and how a stream does it). ``set_epoch`` pins it instead: from then on the same index is the same pair, also
+after a resume in the middle of an epoch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+import math
+from collections.abc import Iterator, Sequence, Sized
+from pathlib import Path
 from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
+from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.threads import one_thread
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.epochs import Passes, Visits
+from rawaug.plugin.params import AugmentParams, RawPair, require_keys
 from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_tensor
 from rawaug.seeding import keyed_generator
 
@@ -27,14 +37,22 @@ class RawPairs(Dataset[Any]):
     Args:
         dataset: yields pictures (tensor, NumPy array or PIL picture, HWC or CHW, grey or RGBA too: see
             :mod:`rawaug.plugin.pictures`), or tuples or mappings that have one. All other fields pass through.
-        augment: makes the pair; on the CPU where workers are to run it.
-        crop: side of the square crop in pixels, even; None keeps whole pictures (made even by dropping a line).
+        augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, for a
+            :class:`RawAugment` of it with the default settings.
+        crop: side of the square crop in pixels, or (height, width), even; None keeps whole pictures (made even by
+            dropping a line).
         seed: of all draws.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
-        turns: whether to draw flips and quarter turns; whole pictures are only flipped.
+        turns: whether to draw flips and quarter turns; what is not square is only flipped.
+        keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
+            then a dict of these. In samples that are mappings they stand in place of the picture.
+        zoom: half of the crops are enlarged by up to this factor (bicubic), drawn log-uniformly; 1 for none. Pictures
+            scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
-        ValueError: if the crop is odd, or, on access, if a picture is smaller than the crop or none.
+        TypeError: if ``augment`` is none of these.
+        ValueError: if the crop is odd, the zoom less than 1 or without a crop, or, on access, if a picture is smaller
+            than the crop or none.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -42,6 +60,9 @@ class RawPairs(Dataset[Any]):
         >>> pairs = RawPairs(pictures, RawAugment(DictionaryISP()), crop=32)
         >>> pairs[1].noisy.shape
         torch.Size([4, 16, 16])
+        >>> sample = RawPairs(pictures, RawAugment(DictionaryISP()), crop=(16, 32), keys=("noisy", "clean"))[0]
+        >>> sample["noisy"].shape
+        torch.Size([4, 8, 16])
     """
 
     def __new__(cls, dataset: Any = None, *args: Any, **settings: Any) -> RawPairs:
@@ -51,23 +72,52 @@ class RawPairs(Dataset[Any]):
     def __init__(
         self,
         dataset: Any,
-        augment: RawAugment,
-        crop: int | None = 256,
+        augment: RawAugment | DictionaryISP | str | Path,
+        crop: int | tuple[int, int] | None = 256,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
+        keys: Sequence[str] | None = None,
+        zoom: float = 1.0,
     ) -> None:
-        self.dataset, self.augment, self.crop, self.seed, self.key = dataset, augment, crop, seed, key
-        self.turns = turns
-        if crop is not None:
-            bayer.RandomCrop(int(crop))  # raises for an odd crop here, not in a worker
-        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()  # persistent workers see it change
+        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
+            raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
+        self.dataset, self.augment = dataset, augmentation(augment)
+        self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
+        self.key, self.keys = key, require_keys(keys)
+        self._epochs = self._new_epochs()
+
+    def _new_epochs(self) -> Any:
+        return Visits(len(self.dataset) if isinstance(self.dataset, Sized) else 0)
 
     def set_epoch(self, epoch: int) -> None:
-        """Select the epoch's draws; call before each epoch. Forwarded to the dataset's own ``set_epoch``, if any."""
-        self._epoch[0] = epoch
+        """Pin the epoch: from now on an index is the same pair whenever it is asked for, until the next call.
+
+        Call it before each pass to number the epochs yourself, or once for validation data. Forwarded to the dataset's
+        own ``set_epoch``, if any.
+        """
+        self._epochs.pin(epoch)
         if hasattr(self.dataset, "set_epoch"):
             self.dataset.set_epoch(epoch)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What :meth:`load_state_dict` goes on from: the same draws follow.
+
+        Exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers, pictures
+        that they had fetched ahead go on with their next draw.
+        """
+        state: dict[str, Any] = self._epochs.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state``, while no loader is in the middle of a pass.
+
+        Raises:
+            ValueError: if it is no state, or that of a dataset of another length.
+        """
+        self._epochs.load_state_dict(state)
+        if self._epochs.pinned is not None:
+            self.set_epoch(self._epochs.pinned)
 
     def __len__(self) -> int:
         if not isinstance(self.dataset, Sized):
@@ -80,10 +130,10 @@ class RawPairs(Dataset[Any]):
                 f"the index must be an integer, got {type(index).__name__}; for slices use torch.utils.data.Subset"
             )
         index = range(len(self))[index]  # IndexError ends iteration
-        return self.draw(index, self._generator(index))
+        return self.draw(index, self._generator(*self._epochs.key(index)))
 
     def draw(self, index: int, generator: torch.Generator) -> Any:
-        """The pair of picture ``index`` with all that is random taken from ``generator``."""
+        """The pair of picture ``index`` with all that is random taken from ``generator``; counts no epoch."""
         return self._paired(self.dataset[index], index, generator)
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
@@ -93,34 +143,36 @@ class RawPairs(Dataset[Any]):
         pair: RawPair = self.augment.apply(placed(picture, params.place, self.crop), params)
         return pair
 
-    def _generator(self, key: int | str) -> torch.Generator:
-        return keyed_generator(self.seed, "pairs", int(self._epoch), key)
+    def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
+        return keyed_generator(self.seed, "pairs", epoch, *names)
 
     def _paired(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
         try:
             picture = even_sided(to_rgb_tensor(picked(sample, where)))
-            place = random_place(picture, self.crop, self.turns, generator)
+            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         patch = placed(picture, place, self.crop)[None]
         pair: RawPair = self.augment.apply(patch, self.augment.sample(patch, generator, place[None]))
-        return replaced(sample, where, pair.map(lambda t: t[0]))
+        pair = pair.map(lambda t: t[0])
+        return replaced(sample, where, pair if self.keys is None else pair.under(self.keys))
 
 
 class RawPairStream(RawPairs, IterableDataset[Any]):
-    """An iterable Dataset of pictures as one of RAW pairs; what :class:`RawPairs` makes of it.
+    """An iterable Dataset of pictures as one of RAW pairs; :class:`RawPairs` creates it.
 
     A stream has no index. Without ``identity`` the n-th sample that worker w of W meets is number nW + w: no two share
-    a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that hands out
-    whole shards needs ``identity`` for that. Processes of a distributed run need it too, or a seed for each.
+    a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that distributes
+    whole shards needs ``identity`` for that. Processes of a distributed run draw apart, by their rank, unless it is
+    given. Each pass is a new epoch, unless one is pinned.
 
     Args:
         dataset: an iterable of samples, as for :class:`RawPairs`. It divides itself between workers, as those of
             WebDataset and Hugging Face do, or ``divide`` does.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
-        augment, crop, seed, key, turns: as for :class:`RawPairs`.
+        augment, crop, seed, key, turns, keys, zoom: as for :class:`RawPairs`.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -132,26 +184,37 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
     def __init__(
         self,
         dataset: Any,
-        augment: RawAugment,
-        crop: int | None = 256,
+        augment: RawAugment | DictionaryISP | str | Path,
+        crop: int | tuple[int, int] | None = 256,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
+        keys: Sequence[str] | None = None,
         identity: str | int | None = None,
         divide: bool = False,
+        zoom: float = 1.0,
     ) -> None:
-        super().__init__(dataset, augment, crop, seed, key, turns)
+        super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
         self.identity, self.divide = identity, divide
+
+    def _new_epochs(self) -> Passes:
+        return Passes()
 
     def __iter__(self) -> Iterator[Any]:
         info = get_worker_info()
-        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        epoch, start = self._epochs.begin(info.num_workers if info else 0, info.id if info else 0)  # now, not at next()
+        return self._samples(epoch, start, *((info.id, info.num_workers) if info else (0, 1)))
+
+    def _samples(self, epoch: int, start: int, worker: int, workers: int) -> Iterator[Any]:
         for n, sample in enumerate(self.dataset):
-            if self.divide and n % workers != worker:
-                continue
             number = n if self.divide else n * workers + worker
-            name = number if self.identity is None else self._identity(sample)
-            yield self._paired(sample, name, self._generator(name))
+            if number < start or (self.divide and n % workers != worker):
+                continue
+            name = (number, *self._epochs.rank()) if self.identity is None else (self._identity(sample),)
+            pair = self._paired(sample, name[0], self._generator(epoch, *name))
+            self._epochs.at(number + 1)
+            yield pair
+        self._epochs.end()
 
     def __getitem__(self, index: int) -> Any:
         raise TypeError("a stream of RAW pairs cannot be indexed; iterate over it")
@@ -164,28 +227,84 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         return value if isinstance(value, int) else str(value)
 
 
-def random_place(picture: Tensor, crop: int | None, turns: bool, generator: torch.Generator) -> Tensor:
+def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment:
+    """A :class:`RawAugment`, or one of an ISP, its name or its path.
+
+    Raises:
+        TypeError: if it is something else.
+        FileNotFoundError: if there is no such ISP.
+    """
+    if isinstance(augment, RawAugment):
+        return augment
+    if isinstance(augment, (DictionaryISP, str, Path)):
+        return RawAugment.from_pretrained(augment)
+    raise TypeError(
+        "augment must be a RawAugment, a DictionaryISP, or the name or path of an ISP, such as 'universal'; "
+        f"got {type(augment).__name__}"
+    )
+
+
+def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
+    """Height and width of a crop that is given as a side or as both; None are whole pictures.
+
+    Raises:
+        ValueError: if it is odd, or neither.
+    """
+    if crop is None:
+        return None
+    sides = (crop, crop) if isinstance(crop, SupportsIndex) else tuple(crop) if isinstance(crop, Sequence) else ()
+    if len(sides) != 2 or not all(isinstance(side, SupportsIndex) for side in sides):
+        raise ValueError(f"crop must be an even side or (height, width), got {crop!r}")
+    height, width = (int(side) for side in sides)
+    return bayer.RandomCrop((height, width)).size
+
+
+def random_place(
+    picture: Tensor, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+) -> Tensor:
     """Position and turn of a crop of ``(3, H, W)``: ``(5,)`` top, left, height, width (H, W) and view.
+
+    With a zoom ``(6,)``: the last are the rows that are enlarged to the crop.
 
     Raises:
         ValueError: if the picture is smaller than the crop.
     """
     height, width = picture.shape[-2:]
-    size = (crop, crop) if crop else (height, width)
+    size = crop or (height, width)
+    if crop and zoom > 1.0:
+        share, drawn = torch.rand(2, generator=generator).tolist()
+        rows = crop[0] if share < 0.5 else math.ceil(crop[0] / 2 * zoom**-drawn) * 2
+        return torch.cat([random_place(picture, _region(crop, rows), turns, generator), torch.tensor([rows])])
     corner = bayer.RandomCrop(size).sample(height, width, generator)
     turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=size[0] == size[1])
     view = turn.sample(generator) if turns else torch.tensor(0)
     return torch.cat([corner, torch.tensor([height, width]), view[None]])
 
 
-def placed(picture: Tensor, place: Tensor, crop: int | None) -> Tensor:
+def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tensor:
     """The patch of a whole picture ``(3, H, W)`` at ``place``.
 
     Raises:
         ValueError: if the picture does not have the size it was drawn for.
     """
-    top, left, height, width, view = place.tolist()
+    top, left, height, width, view, rows = (*place.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
-    patch = bayer.crop(picture, top, left, crop or height, crop or width)
+    patch = bayer.crop(picture, top, left, *(_region(crop, rows) if crop else (height, width)))
+    if crop and patch.shape[-2:] != crop:
+        patch = enlarged(patch, crop)
     return bayer.turn(patch, view).contiguous()
+
+
+def _region(crop: tuple[int, int], rows: int) -> tuple[int, int]:
+    """Even height and width of what is enlarged to the crop, by its rows; 0 for the crop itself."""
+    return (rows, math.ceil(crop[1] * rows / crop[0] / 2) * 2) if rows else crop
+
+
+def enlarged(patch: Tensor, size: tuple[int, int]) -> Tensor:
+    """``(3, h, w)`` to ``(3, *size)`` of the same type, bicubic."""
+    with one_thread():  # the same bits everywhere
+        larger = F.interpolate(patch[None].float(), size=size, mode="bicubic", align_corners=False)[0]
+    if patch.dtype == torch.uint8:
+        return larger.round_().clamp_(0, 255).to(torch.uint8)
+    return larger.clamp_(0.0, 1.0).to(patch.dtype)

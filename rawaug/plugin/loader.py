@@ -1,23 +1,26 @@
 """A DataLoader of sRGB pictures as a loader of RAW pairs: one line, on the device of the training.
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
-augmentation's: whatever the loader's workers do, the same batches make the same pairs. In a distributed run the keys of
-processes but the first have their rank as well.
+augmentation's: whatever the loader's workers do, the same batches make the same pairs. Each pass is a new epoch. In a
+distributed run each process has its share of the pictures (:mod:`rawaug.plugin.shares`), and the keys of processes but
+the first have their rank as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data import IterableDataset
 
-from rawaug.bayer import RandomCrop
+from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import placed, random_place
-from rawaug.plugin.params import RawPair
+from rawaug.plugin.dataset import augmentation, crop_size, placed, random_place
+from rawaug.plugin.params import RawPair, require_keys
 from rawaug.plugin.pictures import (
     even_sided,
     find_picture,
@@ -28,7 +31,16 @@ from rawaug.plugin.pictures import (
     to_rgb_batch,
     to_rgb_tensor,
 )
+from rawaug.plugin.shares import own_share, world_size
 from rawaug.seeding import keyed_generator, rank_key
+
+
+class Position(NamedTuple):
+    """Where a pass begins or has come to: the next batch, and how many the wrapped loader gives again before it."""
+
+    epoch: int
+    batch: int
+    passed: int = 0
 
 
 class WrappedLoader:
@@ -40,36 +52,99 @@ class WrappedLoader:
         augment: RawAugment,
         device: torch.device | str | None,
         key: str | int | None,
-        crop: int | None,
+        crop: tuple[int, int] | None,
+        keys: tuple[str, ...] | None,
     ) -> None:
-        self.loader, self.key, self.crop = loader, key, crop
+        self.loader, self.key, self.crop, self.keys = loader, key, crop, keys
         self.device = torch.device(device) if device is not None else augment.device
         self.augment = augment.to(self.device)
-        self._epoch, self._start = 0, 0
+        self._share: Any = None
+        self._next = self._at = Position(0, 0)
+        self._order: Tensor | None = None
+
+    @property
+    def share(self) -> Any:
+        """The wrapped loader; in a distributed run this process's part of it."""
+        if self._share is None and world_size() > 1:
+            self._share = own_share(self.loader, self.augment.seed)
+        return self.loader if self._share is None else self._share
 
     def __len__(self) -> int:
-        return len(self.loader)  # type: ignore[arg-type]
+        return len(self.share)
 
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Set the next pass's epoch and first batch number; forwarded to the wrapped loader's ``set_epoch``, if any.
 
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
-        data, to meet the same noise again, and with ``start`` where a loader goes on in the middle of an epoch.
+        data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
+        an epoch.
         """
-        self._epoch, self._start = epoch, start
+        self._next = self._at = Position(epoch, start)
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
 
-    def __iter__(self) -> Iterator[Any]:
-        batches = self._pairs(self._epoch, self._start)
-        self._epoch, self._start = self._epoch + 1, 0
-        return batches
+    def state_dict(self) -> dict[str, Any]:
+        """Epoch and number of the next batch, the state of the loader's own ``generator`` at the start of the pass, and
+        the ``state_dict`` of the wrapped loader, where it has these."""
+        state: dict[str, Any] = {"epoch": self._at.epoch, "batch": self._at.batch}
+        if self._generator is not None:
+            state["order"] = self._generator.get_state() if self._order is None else self._order
+        if hasattr(self.loader, "state_dict"):
+            state["loader"] = self.loader.state_dict()
+        return state
 
-    def _pairs(self, epoch: int, start: int) -> Iterator[Any]:
-        for number, batch in enumerate(self.loader, start):
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on with the batch after the last one that ``state`` knows.
+
+        A wrapped loader with a ``load_state_dict`` of its own goes on by itself; of any other the first batches are
+        loaded again and passed over. Their order is the same if it is sequential, drawn from the loader's own
+        ``generator``, or that of a distributed run; what a script shuffles from PyTorch's global state it restores.
+
+        Raises:
+            ValueError: if it is no state of a wrapped loader.
+        """
+        if missing := {"epoch", "batch"} - set(state):
+            raise ValueError(f"not the state of a wrapped loader: {', '.join(sorted(missing))} missing")
+        goes_on = "loader" in state and hasattr(self.loader, "load_state_dict")
+        self._next = self._at = Position(state["epoch"], state["batch"], 0 if goes_on else state["batch"])
+        if goes_on:
+            self.loader.load_state_dict(state["loader"])  # type: ignore[attr-defined]
+        if self._generator is not None and "order" in state:
+            self._generator.set_state(state["order"])
+
+    @property
+    def _generator(self) -> torch.Generator | None:
+        return getattr(self.loader, "generator", None)
+
+    def __iter__(self) -> Iterator[Any]:
+        epoch, start, passed = self._at = self._next
+        self._next = Position(epoch + 1, 0)
+        self._order = None if self._generator is None else self._generator.get_state()
+        if self.share is not self.loader:
+            self.share.sampler.set_epoch(epoch)
+        first = start - passed
+        length = self._length()
+        for number, batch in enumerate(self.share, first):
+            if number < start:
+                continue
             where = find_picture(batch, self.key, batched=True)
             generator = keyed_generator(self.augment.seed, "wrap", epoch, number, *rank_key())
-            yield replaced(batch, where, self._pair(self._pictures(picked(batch, where)), generator))
+            pair = self._pair(self._pictures(picked(batch, where)), generator)
+            last = number - first + 1 == length  # where training loops stop, before the end of the iterator
+            self._reached(Position(epoch + 1, 0) if last else Position(epoch, number + 1))
+            yield replaced(batch, where, pair if self.keys is None else pair.under(self.keys))
+        self._reached(Position(epoch + 1, 0))
+
+    def _length(self) -> int | None:
+        """Batches of a pass, where they can be counted on."""
+        if isinstance(getattr(self.loader, "dataset", None), IterableDataset):
+            return None
+        return len(self) if isinstance(self.loader, Sized) else None
+
+    def _reached(self, position: Position) -> None:
+        self._at = position
+        if not position.batch:
+            self._order = None
 
     def _pictures(self, batch: Any) -> Any:
         """Batches of grey pictures ``(B, H, W)``, which a DataLoader collates, with an axis for their one channel."""
@@ -92,17 +167,18 @@ class WrappedLoader:
         return stacked(patches), torch.stack(places)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "loader":  # asked for before it is set, by copy and pickle
+        if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
             raise AttributeError(name)
-        return getattr(self.loader, name)
+        return getattr(self.share, name)
 
 
 def wrap(
     loader: Iterable[Any],
-    augment: RawAugment,
+    augment: RawAugment | DictionaryISP | str | Path,
     device: torch.device | str | None = None,
     key: str | int | None = None,
-    crop: int | None = None,
+    crop: int | tuple[int, int] | None = None,
+    keys: Sequence[str] | None = None,
 ) -> WrappedLoader:
     """Any loader of sRGB batches as a loader of RAW pairs; the rest of the training script stays as it is.
 
@@ -110,14 +186,16 @@ def wrap(
         loader: a DataLoader, or what iterates like one. Its batches are pictures ``(B, 3, H, W)`` in any form that
             :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
             :class:`RawPair` takes their place, all else passes through.
-        augment: moves to ``device``.
+        augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
         device: where the pairs are made, by default where ``augment`` is. Pictures travel there as uint8, if they are.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
-        crop: even side of a square crop, drawn for each picture: makes a batch of pictures of different sizes. By
-            default whole pictures, without their last row or column where a side is odd.
+        crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
+            different sizes. By default whole pictures, without their last row or column where a side is odd.
+        keys: names for noisy, clean, variance and params, as for :class:`rawaug.RawPairs`.
 
     Raises:
-        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they make no batch.
+        TypeError: if ``augment`` is none of these.
+        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they do not form a batch.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -125,6 +203,4 @@ def wrap(
         >>> [(pair.noisy.shape, labels) for pair, labels in loader]
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
-    if crop is not None:
-        RandomCrop(crop)  # raises for an odd crop here
-    return WrappedLoader(loader, augment, device, key, crop)
+    return WrappedLoader(loader, augmentation(augment), device, key, crop_size(crop), require_keys(keys))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -21,7 +21,8 @@ class AugmentParams(NamedTuple):
         isp: camera settings.
         noise: levels and seeds of the noise.
         place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
-            turned after the crop (see :func:`rawaug.bayer.turn`).
+            turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
+            enlarged to the crop.
     """
 
     isp: ISPParams
@@ -71,6 +72,25 @@ class RawPair(NamedTuple):
     def map(self, change: Callable[[Tensor], Tensor]) -> RawPair:
         """The same function applied to every tensor: ``pair.map(lambda t: t[0])`` is the first pair of a batch."""
         return RawPair(change(self.noisy), change(self.clean), change(self.variance), self.params.map(change))
+
+    def under(self, keys: Sequence[str]) -> dict[str, Any]:
+        """Noisy, clean, variance and params, as many as there are keys, as a dict with these: ``("lq", "gt")``."""
+        return dict(zip(keys, self, strict=False))
+
+
+def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
+    """The keys of :meth:`RawPair.under`, checked.
+
+    Raises:
+        ValueError: if they are not 1 to 4 different names.
+    """
+    if keys is None:
+        return None
+    named = () if isinstance(keys, str) else tuple(keys)
+    if not 1 <= len(named) <= len(RawPair._fields) or len(set(named)) < len(named):
+        wanted = ", ".join(RawPair._fields)
+        raise ValueError(f'keys are different names for {wanted}, in this order, as ("noisy", "clean"); got {keys!r}')
+    return named
 
 
 def save_params(params: AugmentParams, path: str | Path) -> None:

@@ -123,16 +123,27 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
 
 def picked(sample: Any, where: Where) -> Any:
-    """The value at ``place``."""
+    """The value at ``where``."""
     return sample if where is None else sample[where]
 
 
 def replaced(sample: Any, where: Where, value: Any) -> Any:
-    """The sample with ``value`` there, all else as it was; mappings become dicts."""
+    """The sample with ``value`` there, all else as it was; mappings become dicts.
+
+    A dict in place of the picture of a mapping is merged with it.
+
+    Raises:
+        ValueError: if that would overwrite another field.
+    """
     if where is None:
         return value
     if isinstance(sample, Mapping):
-        return {**sample, where: value}
+        if not isinstance(value, dict):
+            return {**sample, where: value}
+        others = {name: field for name, field in sample.items() if name != where}
+        if taken := sorted(map(str, others.keys() & value.keys())):
+            raise ValueError(f"the samples have {', '.join(taken)} already; give other keys=")
+        return others | value
     fields = [value if index == where else field for index, field in enumerate(sample)]
     if isinstance(sample, tuple):
         return type(sample)(*fields) if hasattr(sample, "_fields") else tuple(fields)

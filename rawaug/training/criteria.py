@@ -1,4 +1,4 @@
-r"""What the distance between a denoised and a clean RAW is: a norm, and how it weighs light and shade.
+r"""The distance between a denoised and a clean RAW: a norm, and its weighting of light and shade.
 
 ==============  ====================================================================================================
 ``weigh``       what is compared
@@ -16,23 +16,47 @@ the stabilised domain it is not the mean of the RAW.
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import MappingProxyType
 
 from torch import Tensor, nn
 
 from denoisers.domains import DOMAINS, Anscombe, levels_of
 from rawaug.data.sample import Sample
+from rawaug.registry import LOSSES
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
 """Of a denoised and a clean (or target) RAW, a scalar."""
 
-LOSSES: MappingProxyType[str, Criterion] = MappingProxyType(
-    {
-        "l1": nn.functional.l1_loss,
-        "l2": nn.functional.mse_loss,
-        "charbonnier": lambda a, b: ((a - b) ** 2 + 1e-6).sqrt().mean(),
-    }
-)
+
+@LOSSES.register("l1")
+class L1(nn.Module):
+    """The mean of ``|a - b|``."""
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        return nn.functional.l1_loss(a, b)
+
+
+@LOSSES.register("l2")
+class L2(nn.Module):
+    """The mean of ``(a - b)^2``."""
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        return nn.functional.mse_loss(a, b)
+
+
+@LOSSES.register("charbonnier")
+class Charbonnier(nn.Module):
+    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink.
+
+    Args:
+        epsilon: below which it is quadratic.
+    """
+
+    def __init__(self, epsilon: float = 1e-3) -> None:
+        super().__init__()
+        self.epsilon = epsilon
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
 
 
 def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
@@ -44,7 +68,7 @@ def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
     if weigh == "linear":
         return loss
     if weigh not in ("stabilised", "mixed"):
-        raise ValueError(f"train.weigh {weigh!r} is none of linear, stabilised, mixed")
+        raise ValueError(f"train.weigh {weigh!r} is unknown; use one of linear, stabilised, mixed")
     levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
 
     def stabilised(denoised: Tensor, clean: Tensor) -> Tensor:

@@ -19,11 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
-from tqdm.auto import tqdm
 
 from denoisers.network import Denoiser
+from rawaug.extras import extra
 from rawaug.files import replacing
-from rawaug.training.criteria import LOSSES, weighed
+from rawaug.progress import progress
+from rawaug.registry import LOSSES
+from rawaug.training.criteria import Criterion, weighed
 from rawaug.training.estimators import Supervised
 from rawaug.training.start import first_network
 from rawaug.training.stream import StepSampler, TrainingStream
@@ -44,7 +46,7 @@ def train(
     estimator: Supervised | None = None,
     choose: bool = True,
 ) -> Denoiser:
-    """Train a denoiser, going on from the last checkpoint in ``folder`` where there is one.
+    """Train a denoiser, resuming from the last checkpoint in ``folder``, if any.
 
     Args:
         stream: keyed samples.
@@ -64,55 +66,68 @@ def train(
         ValueError: if no validation score was a number: the training has diverged.
     """
     estimator = estimator or Supervised()
+    norm: Criterion = LOSSES.make(config.loss)
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     net = first_network(network, seed)
     average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
-    start, best = resume(folder / "last.pt", net, average, optimiser, schedule)
+    start, best, losses = resume(folder / "last.pt", net, average, optimiser, schedule)
 
     layout = torch.channels_last if config.channels_last else torch.contiguous_format
     model, optimiser = fabric.setup(net.to(memory_format=layout), optimiser)  # type: ignore[call-overload]
     step_model: Any = torch.compile(model) if config.compile else model
     trained: Any = average.to(fabric.device).module
+    losses = losses.to(fabric.device)
     sampler = StepSampler(start, config.steps, stream.batch, fabric.global_rank, fabric.world_size)
     pinned = fabric.device.type == "cuda"
     loader = DataLoader(stream, batch_sampler=sampler, num_workers=config.workers, pin_memory=pinned)
     journal = Journal(folder, start) if fabric.is_global_zero else None
     began = time.perf_counter()
 
-    bar = tqdm(loader, desc=label, initial=start, total=config.steps, unit="step", disable=journal is None)
+    bar = progress(
+        loader, label=label, unit="step", total=config.steps, initial=start, leave=True, shown=journal is not None
+    )
     for step, batch in enumerate(bar, start=start + 1):
         sample = type(batch)(*(x.to(fabric.device, memory_format=layout) for x in batch))
-        criterion = weighed(LOSSES[config.loss], config.weigh, sample)
-        loss = estimator.loss(step_model, sample, criterion, step / config.steps)
+        loss = estimator.loss(step_model, sample, weighed(norm, config.weigh, sample), step / config.steps)
         optimiser.zero_grad(set_to_none=True)
         fabric.backward(loss)
         if config.clip_norm:
             fabric.clip_gradients(model, optimiser, max_norm=config.clip_norm)
         optimiser.step()
+        learning_rate = schedule.get_last_lr()[0]
         schedule.step()
         average.update_parameters(net) if config.ema else trained.load_state_dict(net.state_dict())
+        losses += torch.stack([loss.detach().float(), losses.new_ones(())])
 
-        rate = (step - start) * stream.batch / (time.perf_counter() - began)
-        if step % config.validate_every == 0 or step == config.steps:
+        looks, saves = (step % n == 0 or step == config.steps for n in (config.validate_every, config.checkpoint_every))
+        if looks or saves:
+            losses = fabric.all_reduce(losses, reduce_op="mean")
+        if looks:
             scores = validate(estimator.corrected(trained), validation, fabric.device)
             if scores["psnr"] > best["psnr"] or not choose:
                 best = {"psnr": scores["psnr"], "step": step, "net": copy.deepcopy(trained.state_dict())}
-            mean_loss = float(fabric.all_reduce(loss.detach(), reduce_op="mean"))
+            row: dict[str, float] = {
+                "loss": float(losses[0] / losses[1]),
+                **scores,
+                "learning_rate": float(learning_rate),
+            }
+            row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
+            losses = torch.zeros_like(losses)
             if journal is not None:
-                journal.log(step, loss=mean_loss, **scores, samples_per_second=rate)
-        if journal is not None and (step % config.checkpoint_every == 0 or step == config.steps):
+                journal.log(step, **row)
+            told = f"loss {row['loss']:.4f}, validation {scores['psnr']:.2f} dB (kept: step {best['step']})"
+            bar.set_postfix_str(f"{row['samples_per_second']:.0f} images/s, {told}", refresh=False)
+        if saves and journal is not None:
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
-            write_atomically({**state, "step": step, "best": best}, folder / "last.pt")
-        told = f"{rate:.0f} images/s, loss {loss.item():.4f}, best {best['psnr']:.2f} dB at {best['step']}"
-        bar.set_postfix_str(told, refresh=False)
+            write_atomically({**state, "step": step, "best": best, "losses": losses.cpu()}, folder / "last.pt")
     if journal is not None:
         journal.close()
     if not math.isfinite(best["psnr"]):
-        raise ValueError(f"{label}: diverged, no validation score is a number; lower train.learning_rate")
+        raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
     trained.load_state_dict(best["net"])
     trained.cpu().to(memory_format=torch.contiguous_format)
     return estimator.corrected(trained).eval()
@@ -123,7 +138,8 @@ def launched(device: str, devices: int, precision: str) -> Any:
 
     All have met here when it returns, so that none looks for a checkpoint before the first has put away an old one.
     """
-    from lightning_fabric import Fabric
+    with extra("train"):
+        from lightning_fabric import Fabric
 
     nodes = 1
     if torch.distributed.is_torchelastic_launched():
@@ -157,14 +173,20 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
 
 
-def resume(path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any) -> tuple[int, dict[str, Any]]:
-    """Load the checkpoint at ``path`` if there is one; the number of steps already done, and the best until then."""
+def resume(
+    path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any
+) -> tuple[int, dict[str, Any], Tensor]:
+    """Load the checkpoint at ``path`` if there is one.
+
+    Returns:
+        The steps already done, the best weights until then, and the sum and the number of losses not yet logged.
+    """
     if not path.is_file():
-        return 0, {"psnr": float("-inf"), "step": 0}
+        return 0, {"psnr": float("-inf"), "step": 0}, torch.zeros(2)
     state = torch.load(path, map_location="cpu", weights_only=True)
     for key, target in {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}.items():
         target.load_state_dict(state[key])
-    return int(state["step"]), state["best"]
+    return int(state["step"]), state["best"], state.get("losses", torch.zeros(2))
 
 
 def write_atomically(state: dict[str, Any], path: Path) -> None:
@@ -174,10 +196,14 @@ def write_atomically(state: dict[str, Any], path: Path) -> None:
 
 
 class Journal:
-    """``log.csv`` and TensorBoard's files of a run, from ``start`` on: what a killed run told beyond it is dropped."""
+    """``log.csv`` and TensorBoard's files of a run from ``start`` on; what a killed run logged beyond it is dropped.
+
+    A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
+    """
 
     def __init__(self, folder: Path, start: int) -> None:
-        from torch.utils.tensorboard.writer import SummaryWriter
+        with extra("train"):
+            from torch.utils.tensorboard.writer import SummaryWriter
 
         self.path = folder / "log.csv"
         if self.path.is_file():

@@ -48,7 +48,7 @@ class NoisyFrame(NamedTuple):
 
 
 def noisy_only(pair: Pair) -> Pair:
-    """The pair without what only a clean frame could tell.
+    """The pair without anything derived from a clean frame.
 
     Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` its development (bilinear demosaic, the
     camera's white balance and matrix, the sRGB curve). A pair without one is a RAW file as shot: it is noisy itself.
@@ -64,15 +64,15 @@ def noisy_frame(pair: Pair, camera: dict[str, float] | None) -> NoisyFrame:
 
     Args:
         pair: as :func:`noisy_only` leaves it.
-        camera: measured ``shot_var`` and ``read_var``, for pairs that do not tell theirs.
+        camera: measured ``shot_var`` and ``read_var``, for pairs without levels of their own.
 
     Raises:
-        ValueError: if neither tells the levels.
+        ValueError: if the levels are unknown.
     """
     if pair.shot_var is not None and pair.read_var is not None:
         return NoisyFrame(pair.name, pair.raw, pair.shot_var, pair.read_var, pair.cfa)
     if camera is None:
-        raise ValueError(f'{pair.name}: the levels of its noise are not known; measure them with noise: "camera"')
+        raise ValueError(f'{pair.name}: has no noise levels; measure them with noise: "camera"')
     return NoisyFrame(pair.name, pair.raw, camera["shot_var"], camera["read_var"], pair.cfa)
 
 
@@ -91,7 +91,7 @@ class FrozenPictures(Sequence[NoisyFrame]):
 
     def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
         if not isinstance(augment.noise, ShotReadModel):
-            raise ValueError("self-supervised training needs noise of known shot_var and read_var, such as a preset's")
+            raise ValueError("self-supervised training needs noise with known shot_var and read_var, such as a preset")
         self.pictures, self.augment, self.seed, self.shots = pictures, augment, seed, shots
         self._kept: dict[int, NoisyFrame] = {}
 
@@ -134,7 +134,7 @@ class NoisyCrops:
         frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
         if len(frame.shots) < self.estimator.shots:
             name, count = type(self.estimator).__name__, len(frame.shots)
-            raise ValueError(f"{frame.name}: {name} needs {self.estimator.shots} shots of a scene, there is {count}")
+            raise ValueError(f"{frame.name}: {name} needs {self.estimator.shots} shots of a scene, got {count}")
         if min(frame.shots.shape[-2:]) < self.crop + 6:
             size = f"{frame.shots.shape[-2]} x {frame.shots.shape[-1]}"
             raise ValueError(f"{frame.name}: a frame of {size} is too small for train.crop={self.crop}")

@@ -1,4 +1,4 @@
-"""The stream of training samples: sample i depends on (seed, i) alone, so any step can be had again.
+"""The stream of training samples: sample i depends on (seed, i) alone, so any step can be repeated.
 
 A batch is part real crops (clean RAW of the few pairs with its captured noise, or with drawn noise where none was
 captured; or of frames that are only known noisy), part RAW made from sRGB pictures.
@@ -108,9 +108,9 @@ class TrainingStream(Dataset[Any]):
         self.pictures = PictureCrops(pictures) if isinstance(pictures, RawPairs) else pictures
         self.from_pictures = round(augmented * batch)
         if self.from_pictures and pictures is None:
-            raise ValueError("this arm is augmented and needs sRGB pictures; set data.pictures")
+            raise ValueError("an augmented arm needs sRGB pictures; set data.pictures")
         if self.from_pictures < batch and real is None:
-            raise ValueError("this arm is trained on real pairs and has none; set data.pairs")
+            raise ValueError("this arm needs real pairs; set data.pairs")
 
     def __getitem__(self, index: int) -> Any:
         source = self.real if index % self.batch >= self.from_pictures else self.pictures

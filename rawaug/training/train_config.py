@@ -1,9 +1,12 @@
-"""The settings of a training: its network and its loop."""
+"""The settings of a training: its network and its loop, and what of them its weights depend on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
+
+from rawaug.files import fingerprint
+from rawaug.registry import LOSSES
 
 
 @dataclass
@@ -11,7 +14,7 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: UNet, DHDN, DnCNN, PMRID or NAFNet.
+        name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
         settings: its constructor's keys.
         start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
             then the file's, unless they are given, and must agree with it. Null starts from nothing.
@@ -30,16 +33,16 @@ class TrainConfig:
         steps: optimiser steps, the same in every arm.
         batch: samples in a step, over all processes.
         crop: side of the mosaic crops in pixels.
-        learning_rate: of Adam at its highest.
+        learning_rate: peak learning rate of Adam.
         warmup: steps of linear warm-up.
         schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
         halve_every: steps.
-        loss: l1, l2 or charbonnier.
-        weigh: how the loss weighs light and shade: linear, stabilised or mixed; see :mod:`rawaug.training.criteria`.
-        ema: decay of the running average of the weights, which is what is validated and saved; 0 switches it off.
-        clip_norm: largest norm of the gradient; 0 switches it off.
-        validate_every: steps between two looks at the validation pairs, the best weights on which are kept.
-        checkpoint_every: steps between two checkpoints (a killed run goes on from the last).
+        loss: l1, l2 or charbonnier, or {name, settings}.
+        weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.
+        ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
+        clip_norm: gradient norm limit; 0 disables it.
+        validate_every: steps between validations; the best weights are kept.
+        checkpoint_every: steps between checkpoints, from which a killed run resumes.
         workers: processes that prepare samples; 0 prepares them in the training process.
         precision: Fabric's, such as 32-true or bf16-mixed.
         channels_last: memory format of the network.
@@ -53,7 +56,7 @@ class TrainConfig:
     warmup: int = 50
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: int = 20000
-    loss: Literal["l1", "l2", "charbonnier"] = "l1"
+    loss: str | dict[str, Any] = "l1"
     weigh: Literal["linear", "stabilised", "mixed"] = "linear"
     ema: float = 0.99
     clip_norm: float = 0.1
@@ -67,8 +70,35 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
             if getattr(self, key) < 1:
-                raise ValueError(f"train.{key} is at least 1, got {getattr(self, key)}")
+                raise ValueError(f"train.{key} must be at least 1, got {getattr(self, key)}")
+        LOSSES.make(self.loss)
         if self.crop < 8 or self.crop % 2:
-            raise ValueError(f"train.crop is even and at least 8, got {self.crop}")
+            raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
         if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:
-            raise ValueError("train: ema is in [0, 1), and warmup, workers and clip_norm are at least 0")
+            raise ValueError("train: ema must be in [0, 1), and warmup, workers and clip_norm at least 0")
+
+
+SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every"})
+"""Keys of :class:`TrainConfig` that change how fast the weights are found, not which."""
+
+
+def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, validation: Any) -> str:
+    """What the weights of a training depend on, as a short hash: files with this key need no new training.
+
+    The device and the number of processes are no part of it, nor is anything that is used after the training.
+
+    Args:
+        network, config: what is trained, and how.
+        samples: identifies the training samples, as a value that JSON can hold.
+        validation: identifies the frames by which weights are chosen; None if those of the end are kept, which makes
+            ``validate_every`` irrelevant too.
+
+    Example:
+        >>> few, more = TrainConfig(workers=0), TrainConfig(workers=8)
+        >>> weights_key(DenoiserConfig(), few, "demo", None) == weights_key(DenoiserConfig(), more, "demo", None)
+        True
+    """
+    left_out = SAME_WEIGHTS if validation is not None else SAME_WEIGHTS | {"validate_every"}
+    settings = {key: value for key, value in asdict(config).items() if key not in left_out}
+    architecture = {key: value for key, value in asdict(network).items() if value is not None}
+    return fingerprint("weights", architecture, settings, samples, validation)

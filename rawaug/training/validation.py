@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+import denoisers
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
@@ -44,7 +45,7 @@ def watched(sample: Sample, pair: Pair, cfa: CFA) -> Watched:
 
 @torch.no_grad()
 def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) -> dict[str, float]:
-    """Mean PSNR in dB.
+    """Mean PSNR in dB, large frames in tiles.
 
     Returns:
         ``psnr`` over all frames; with three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
@@ -53,7 +54,7 @@ def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) ->
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        denoised = net(frame.noisy.to(device), frame.variance.to(device)).cpu()
+        denoised = denoisers.tiled(net, frame.noisy.to(device), frame.variance.to(device)).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
         if frame.develop is not None:
             srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.classical import _HADAMARD, Classical
+from denoisers.block_matching import _HADAMARD
+from denoisers.classical import Classical
 
 SIGMA = 0.03
 OWN = [NonLocalMeans, Wavelet, TotalVariation]
@@ -110,9 +111,9 @@ def test_stabilised_beats_the_mean_level_under_shot_noise() -> None:
     levels = {"shot_var": shot_var, "read_var": read_var}
     denoised = Stabilised(NonLocalMeans(), Root())(noisy, **levels)
     assert mse(denoised, clean) < 0.9 * mse(NonLocalMeans()(noisy, variance), clean)
-    told = read_var.reshape(2, 1, 1, 1) + shot_var.reshape(2, 1, 1, 1) * noisy.clamp(min=0)
-    assert mse(Stabilised(NonLocalMeans(), Root())(noisy, told), denoised) < 1e-4 * mse(denoised, clean)
+    expected_variance = read_var.reshape(2, 1, 1, 1) + shot_var.reshape(2, 1, 1, 1) * noisy.clamp(min=0)
+    assert mse(Stabilised(NonLocalMeans(), Root())(noisy, expected_variance), denoised) < 1e-4 * mse(denoised, clean)
     with pytest.raises(ValueError, match="is not shot_var"):
         Stabilised(NonLocalMeans(), Root())(noisy, torch.rand_like(noisy))
-    with pytest.raises(ValueError, match=r"shot_var must be of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"shot_var must have shape \(2,\)"):
         Stabilised(NonLocalMeans(), Root())(noisy, shot_var=shot_var[:1], read_var=read_var)

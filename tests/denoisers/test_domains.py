@@ -1,4 +1,4 @@
-"""Domains: the inverse, noise of variance 1 in Anscombe's and of one camera in k-sigma's, bounded inputs."""
+"""Domains: a transform and its inverse, unit noise for Anscombe, one camera for k-sigma; bounded inputs."""
 
 from __future__ import annotations
 

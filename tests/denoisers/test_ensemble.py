@@ -38,7 +38,7 @@ def test_identity_to_the_last_bit(cfa: bayer.CFA, views: int, height: int, width
 @pytest.mark.parametrize("cfa", CFAS)
 @pytest.mark.parametrize("view", range(8))
 def test_a_view_shows_the_turned_scene_through_the_same_cfa(cfa: bayer.CFA, view: int) -> None:
-    # A scene whose colours are told apart by their size: red 10, green 20, blue 30, plus small detail.
+    # A scene whose colours differ in size: red 10, green 20, blue 30, plus small detail.
     rgb = torch.tensor([10.0, 20.0, 30.0]).reshape(1, 3, 1, 1) + picture(1, 3, 12, 16)
     seen = to_view(bayer.pack_rgb(rgb, cfa), cfa, view)
     assert torch.equal((seen / 10).round(), torch.tensor([1.0, 2.0, 2.0, 3.0]).reshape(4, 1, 1).expand_as(seen))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-
-if "TRITON_INTERPRET" not in os.environ:  # test_kernels.py runs it, in a process of its own
-    collect_ignore = ["kernels/kernels_interpreted.py"]
 
 XYZ_TO_CAMERA = ((0.80, -0.20, -0.10), (-0.40, 1.20, 0.20), (-0.05, 0.15, 0.60))
 

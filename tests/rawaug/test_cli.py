@@ -60,7 +60,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys
     weights = tmp_path / "fewshot" / "seed0" / "real" / "denoiser.safetensors"
     before = weights.stat().st_mtime_ns
     assert main(command) == 0
-    assert "trained already" in capsys.readouterr().out
+    assert "already trained" in capsys.readouterr().out
     assert weights.stat().st_mtime_ns == before
     assert main([*command, "--train.learning_rate", "0.002"]) == 0
     assert weights.stat().st_mtime_ns != before  # other settings are another run
@@ -69,7 +69,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys
 
 def test_test_frames_must_be_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--data.test", "demo:train"]
-    assert "train_00_astronaut is also among data.pairs" in refused(capsys, *arguments)
+    assert "train_00_astronaut is also in data.pairs" in refused(capsys, *arguments)
 
 
 def test_bad_input_is_one_line(

@@ -1,7 +1,7 @@
 """Built-in data: a few photographs, dead leaves textured from them, and shots of both by the demo camera.
 
 The photographs are files of scikit-image's wheel; nothing is downloaded. The splits share no photograph and no source
-of texture. As for a camera at hand, there are few RAW pairs and many sRGB pictures.
+of texture. As in practice, there are few RAW pairs and many sRGB pictures.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from torch import Tensor
 from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
 from rawaug.data.demo.dead_leaves import dead_leaves
 from rawaug.data.pair import Pair
+from rawaug.extras import extra
 from rawaug.io import read_picture
+from rawaug.registry import DATASETS, PICTURES
 from rawaug.seeding import keyed_generator
 
 PHOTOGRAPHS = {
@@ -89,6 +91,24 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
     return [*photographs[:count], *leaves]
 
 
+@DATASETS.register("demo")
+def open_demo(path: str = "", split: str = "test") -> list[Pair]:
+    """``demo:SPLIT``, or ``demo:`` and the split that is asked for."""
+    return demo_pairs(path or split)
+
+
+@PICTURES.register("demo")
+def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
+    """``demo:``, all of them.
+
+    Raises:
+        ValueError: if a path follows.
+    """
+    if path:
+        raise ValueError(f"demo:{path}: the demo's pictures have no parts; use demo:")
+    return demo_pictures()
+
+
 def _pair(split: str, k: int, seed: int) -> Pair:
     photographs = _photographs(split)
     scenes = list(photographs) if split == "train" else [*photographs, "leaves"]
@@ -119,7 +139,8 @@ def _photographs(split: str) -> dict[str, Tensor]:
 
 @cache
 def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
-    import skimage
+    with extra("train"):
+        import skimage
 
     folder = Path(skimage.__file__).parent / "data"
     return {Path(file).stem: read_picture(folder / file) for file in files}

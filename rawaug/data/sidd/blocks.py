@@ -25,8 +25,9 @@ from rawaug.data.colour import develop_mosaic
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array
 from rawaug.data.pair import Pair
-from rawaug.data.sidd.frames import Colour, colour_of, indexed, noise_level_functions, normalised
+from rawaug.data.sidd.frames import Colour, SiddFrames, colour_of, indexed, noise_level_functions, normalised
 from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
+from rawaug.registry import DATASETS
 
 BLOCKS = 32
 """Blocks of a frame."""
@@ -150,6 +151,29 @@ class SiddBenchmark(Sequence[NoisyBlock]):
 
     def __iter__(self) -> Iterator[NoisyBlock]:
         return (self[index] for index in range(len(self)))
+
+
+@DATASETS.register("sidd")
+def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
+    """The full frames (``train``) or the validation blocks (``test``).
+
+    Raises:
+        ValueError: if ``split`` is another.
+    """
+    if split == "train":
+        return SiddFrames(path)
+    if split == "test":
+        return SiddBlocks(path)
+    raise ValueError(
+        f"sidd:{path}: no split {split}; use train (full frames) or test (validation blocks), "
+        "and another folder, or null, for validation"
+    )
+
+
+@DATASETS.register("siddplus")
+def siddplus_pairs(path: str, split: str) -> Sequence[Pair]:
+    """The validation blocks of SIDD+, whatever the split."""
+    return SiddPlusBlocks(path)
 
 
 def find_file(path: Path, pattern: str) -> Path:

@@ -40,7 +40,7 @@ class SiddScene:
         """From the folder's name.
 
         Raises:
-            ValueError: if it is no such name, or of an unknown phone.
+            ValueError: if it is not a scene instance's name, or the phone is unknown.
 
         Example:
             >>> SiddScene.parse("0052_002_S6_01600_01000_5500_N").cfa

@@ -14,9 +14,7 @@ invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   
 Parameters are those of the reverse pass at the default, published size.
 """
 
-from types import MappingProxyType
-
-from rawaug.isp.baselines.base import ReverseISP
+from rawaug.isp.baselines.base import BaselineISP
 from rawaug.isp.baselines.cycleisp import CycleISP
 from rawaug.isp.baselines.invgrey import InvertibleGrey
 from rawaug.isp.baselines.invisp import InvISP
@@ -24,19 +22,15 @@ from rawaug.isp.baselines.plain_unet import UNetISP
 from rawaug.isp.baselines.training import fit_baseline
 from rawaug.isp.baselines.upi import UPI
 from rawaug.isp.baselines.upi_tuned import TunedUPI
-
-BASELINES: MappingProxyType[str, type[ReverseISP]] = MappingProxyType(
-    {method.name: method for method in (UPI, TunedUPI, UNetISP, CycleISP, InvISP, InvertibleGrey)}
-)
-"""Name to class; each is made without arguments, or with ``cfa`` and its own settings."""
+from rawaug.registry import BASELINES
 
 __all__ = [
     "BASELINES",
     "UPI",
+    "BaselineISP",
     "CycleISP",
     "InvISP",
     "InvertibleGrey",
-    "ReverseISP",
     "TunedUPI",
     "UNetISP",
     "fit_baseline",

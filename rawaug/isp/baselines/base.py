@@ -6,7 +6,7 @@ Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training sees t
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -16,11 +16,12 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.fit.samples import FramePair
+from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.stages import as_float
 
 
-class ReverseISP(nn.Module, ABC):
-    """A way from sRGB to RAW, and back where the method has one.
+class BaselineISP(ReverseISP):
+    """A method that the dictionary ISP is compared with.
 
     Args:
         cfa: pattern of the RAW that it makes and takes.
@@ -28,18 +29,17 @@ class ReverseISP(nn.Module, ABC):
     Attributes:
         name: as in :data:`rawaug.isp.baselines.BASELINES`.
         trainable: whether :func:`rawaug.isp.baselines.fit_baseline` changes anything in it.
-        bidirectional: whether it renders RAW as well: ``model(raw)``.
-        info: how it was fitted.
     """
 
-    name: ClassVar[str]
     trainable: ClassVar[bool]
-    bidirectional: ClassVar[bool] = True
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
-        self.cfa = CFA(cfa)
-        self.info: dict[str, Any] = {}
+        self._cfa = CFA(cfa)
+
+    @property
+    def cfa(self) -> CFA:
+        return self._cfa
 
     @property
     def reverse_network(self) -> nn.Module:
@@ -48,7 +48,6 @@ class ReverseISP(nn.Module, ABC):
 
     @property
     def reverse_parameters(self) -> int:
-        """Number of parameters of the reverse pass."""
         return sum(parameter.numel() for parameter in self.reverse_network.parameters())
 
     @abstractmethod
@@ -58,7 +57,7 @@ class ReverseISP(nn.Module, ABC):
     def render(self, raw: Tensor) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; overridden where the method has it."""
         raise ValueError(
-            f"{self.name} goes from sRGB to RAW only; rawaug.isp.baselines lists the methods that render RAW"
+            f"{self.name} only converts sRGB to RAW; rawaug.isp.baselines lists the methods that also render RAW"
         )
 
     def reverse(self, srgb: Tensor) -> Tensor:
@@ -75,6 +74,9 @@ class ReverseISP(nn.Module, ABC):
         """
         return self.to_mosaic(self.unprocess(checked_srgb(srgb)))
 
+    def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
+        return self.reverse(srgb)
+
     def forward(self, raw: Tensor) -> Tensor:
         """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1].
 
@@ -84,7 +86,6 @@ class ReverseISP(nn.Module, ABC):
         return self.render(checked_raw(raw)).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB to RAW and back, ``(B, 3, H, W)`` in [0, 1]."""
         return self.forward(self.reverse(srgb))
 
     def to_mosaic(self, linear: Tensor) -> Tensor:
@@ -106,7 +107,7 @@ class Crops(NamedTuple):
     white_balance: Tensor
 
 
-class CropTrainedISP(ReverseISP):
+class CropTrainedISP(BaselineISP):
     """A network that learns by gradient descent on random crops."""
 
     trainable = True
@@ -124,18 +125,22 @@ class CropTrainedISP(ReverseISP):
 def checked_srgb(srgb: Tensor) -> Tensor:
     """``(B, 3, H, W)``, uint8 or float, as float in [0, 1]."""
     if srgb.ndim != 4 or srgb.shape[1] != 3:
-        raise ValueError(f"sRGB has shape (B, 3, H, W), got {tuple(srgb.shape)}")
+        raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
     if srgb.dtype != torch.uint8 and not srgb.is_floating_point():
-        raise ValueError(f"sRGB is uint8 or float in [0, 1], got {srgb.dtype}")
+        raise ValueError(f"sRGB must be uint8 or float in [0, 1], got {srgb.dtype}")
     if srgb.shape[2] % 2 or srgb.shape[3] % 2:
-        raise ValueError(f"a Bayer mosaic has even sides, got sRGB of {tuple(srgb.shape[2:])}; crop a row or column")
+        raise ValueError(
+            f"a Bayer mosaic must have even sides, got sRGB of {tuple(srgb.shape[2:])}; crop a row or column"
+        )
     return as_float(srgb)
 
 
 def checked_raw(raw: Tensor) -> Tensor:
     """``(B, 1, H, W)`` with even sides."""
     if raw.ndim != 4 or raw.shape[1] != 1:
-        raise ValueError(f"a mosaic has shape (B, 1, H, W), got {tuple(raw.shape)}")
+        raise ValueError(f"a mosaic must have shape (B, 1, H, W), got {tuple(raw.shape)}")
     if raw.shape[2] % 2 or raw.shape[3] % 2:
-        raise ValueError(f"a Bayer mosaic has even sides, got {tuple(raw.shape[2:])}; crop the last row or column")
+        raise ValueError(
+            f"a Bayer mosaic must have even sides, got {tuple(raw.shape[2:])}; crop the last row or column"
+        )
     return raw

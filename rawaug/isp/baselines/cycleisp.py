@@ -3,7 +3,7 @@ r"""CycleISP: two networks of dual-attention blocks, ``y = mosaic(N_rgb2raw(x))`
 A dual-attention block adds to its input a 1 x 1 merge of two re-weighted copies of ``f = conv(prelu(conv(v)))``: one by
 a map over space, sigmoid(conv([max_c f, mean_c f])), one by a weight a channel, sigmoid of two layers on f's mean. Five
 blocks and a convolution make a recursive residual group, three groups a network of 96 features. RAW has no trace of how
-its picture was coloured, so the way to sRGB is told by a colour branch ``a``: a blurred sRGB picture x' becomes a map
+its picture was coloured, so a colour branch ``a`` guides the way to sRGB: a blurred sRGB picture x' becomes a map
 in (0, 1) that re-weights the features. Loss: ``|y - y^|_1 + |log y - log y^|_1`` to RAW, ``|x - x^|_1`` to sRGB.
 
 Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020; sizes that the text
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
+from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
@@ -104,7 +105,7 @@ class ColourBranch(Trunk):
 
         if min(srgb.shape[-2:]) <= BLUR_SIZE // 2:
             sides = "x".join(map(str, srgb.shape[-2:]))
-            raise ValueError(f"the colour branch needs sides of more than {BLUR_SIZE // 2} pixels, got {sides}")
+            raise ValueError(f"the colour branch needs sides larger than {BLUR_SIZE // 2} pixels, got {sides}")
         blurred = gaussian_blur2d(srgb, BLUR_SIZE, (BLUR_SIGMA, BLUR_SIGMA), border_type="reflect")
         return self.tail(self.body(F.max_pool2d(self.head(blurred), 2)))
 
@@ -123,6 +124,7 @@ class RAW2RGB(Trunk):
         return F.pixel_shuffle(self.tail_rgb(self.tail(features)), 2)
 
 
+@BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
     """CycleISP. To render RAW it needs a picture whose colours it takes: ``model(raw, reference=srgb)``.
 

@@ -22,6 +22,7 @@ from denoisers.network import pad_to_multiple
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP
+from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 
@@ -76,6 +77,7 @@ def decoder(features: int, blocks: int) -> nn.Sequential:
     return nn.Sequential(_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features), last)
 
 
+@BASELINES.register("invgrey")
 class InvertibleGrey(CropTrainedISP):
     """The invertible-greyscale network, one network a direction.
 

@@ -22,6 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
 from rawaug.isp.fit.samples import FramePair
+from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 SCALE_CLAMP = 0.8
@@ -96,6 +97,7 @@ class Flow(nn.Module):
         return x
 
 
+@BASELINES.register("invisp")
 class InvISP(CropTrainedISP):
     """InvISP; both passes take the shot's white balance, or use the geometric mean of the training pairs'.
 
@@ -125,7 +127,7 @@ class InvISP(CropTrainedISP):
     ) -> None:
         super().__init__(cfa)
         if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality is in 1 to 100, got {jpeg_quality}")
+            raise ValueError(f"jpeg_quality must be 1 to 100, got {jpeg_quality}")
         self.jpeg_quality = jpeg_quality
         with initialised_from(derived_seed(seed, "baseline")):
             self.flow = Flow(blocks, growth)

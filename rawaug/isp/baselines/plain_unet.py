@@ -17,8 +17,10 @@ from denoisers.unet import PUBLISHED_WIDTH, UNet
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP
+from rawaug.registry import BASELINES
 
 
+@BASELINES.register("unet")
 class UNetISP(CropTrainedISP):
     """The U-Net baseline; it has no forward pass.
 

@@ -12,19 +12,18 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
-from tqdm.auto import tqdm
 
 from rawaug.bayer import CFA
-from rawaug.isp.baselines.base import Crops, CropTrainedISP, ReverseISP
-from rawaug.isp.baselines.upi_tuned import TunedUPI
+from rawaug.isp.baselines.base import BaselineISP, Crops, CropTrainedISP
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
+from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
-Model = TypeVar("Model", bound=ReverseISP)
+Model = TypeVar("Model", bound=BaselineISP)
 
 CLIP_NORM = 1.0
 """The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
@@ -43,7 +42,7 @@ def fit_baseline(
     seed: int = 0,
     progress: bool = True,
 ) -> Model:
-    """Fit a baseline in place; ``model.info`` tells the steps and seconds it took, and the last loss.
+    """Fit a baseline in place; ``model.info`` records the steps, the seconds and the last loss.
 
     UPI as published has nothing to fit: it comes back as it is, after 0 steps. Tuned UPI is solved in closed form, in
     one step, whatever the budget.
@@ -68,7 +67,7 @@ def fit_baseline(
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
     start = time.perf_counter()
     steps_done, loss = 0, math.nan
-    if isinstance(model, TunedUPI):
+    if isinstance(model, SolvedISP):
         model.tune(frames, seed)
         steps_done = 1
     elif isinstance(model, CropTrainedISP):
@@ -80,6 +79,14 @@ def fit_baseline(
     if not math.isnan(loss):
         model.info["loss"] = loss
     return model.eval()
+
+
+@runtime_checkable
+class SolvedISP(Protocol):
+    """A method that is solved in closed form."""
+
+    def tune(self, pairs: Sequence[FramePair], seed: int = 0) -> Any:
+        """Solve for what it learns from the pairs."""
 
 
 @dataclass(frozen=True)
@@ -113,14 +120,14 @@ class _CropDrawer:
 
     def __post_init__(self) -> None:
         if self.side < 2 or self.side % 2 or self.batch < 1:
-            raise ValueError(f"crop is even and batch at least 1, got crop {self.side}, batch {self.batch}")
+            raise ValueError(f"crop must be even and batch at least 1, got crop {self.side}, batch {self.batch}")
         for frame in self.frames:
             height, width = frame.raw.shape[-2:]
             if not frame.registered:
-                raise ValueError(f"{frame.name}: RAW and sRGB do not meet pixel for pixel; crops need pairs that do")
+                raise ValueError(f"{frame.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
             if min(height, width) < self.side + 2:
                 needed = self.side + 2
-                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; take a smaller crop")
+                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; use a smaller crop")
 
     def __call__(self, step: int, device: torch.device) -> Crops:
         generator = keyed_generator(self.seed, "baseline crops", step)
@@ -151,7 +158,7 @@ def _descend(
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     rate = model.learning_rate if learning_rate is None else learning_rate
     optimiser = torch.optim.Adam(parameters, lr=rate)
-    bar = tqdm(desc=f"fit {model.name}", total=budget.steps, disable=not progress, unit="step", leave=False)
+    bar = progress_bar(label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
     start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
     while spent < 1.0:
         for group in optimiser.param_groups:

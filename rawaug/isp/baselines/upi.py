@@ -18,7 +18,8 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.isp import stages
-from rawaug.isp.baselines.base import ReverseISP, checked_raw, checked_srgb
+from rawaug.isp.baselines.base import BaselineISP, checked_raw, checked_srgb
+from rawaug.registry import BASELINES
 
 GAMMA = 2.2
 XYZ_TO_CAMERA = (
@@ -69,12 +70,12 @@ def camera_matrix(weights: Tensor) -> Tensor:
     return matrix / matrix.sum(dim=2, keepdim=True)
 
 
-class SmoothstepISP(ReverseISP):
+class SmoothstepISP(BaselineISP):
     """UPI's stages with a matrix and gains from wherever; both passes are pure functions of picture and parameters."""
 
     @abstractmethod
     def default_params(self, batch: int) -> UPIParams:
-        """What a pass uses if nothing else is given."""
+        """The defaults of a pass."""
 
     def apply(self, srgb: Any, params: UPIParams | None = None) -> Any:
         """sRGB ``(B, 3, H, W)``, uint8 or float, to the mosaic ``(B, 1, H, W)`` with the given parameters.
@@ -109,6 +110,7 @@ def render_pixels(x: Tensor, params: UPIParams) -> Tensor:
     return smoothstep(stages.gamma_compress(linear, GAMMA))
 
 
+@BASELINES.register("upi")
 class UPI(SmoothstepISP):
     """UPI as published: a random camera a picture, or the mean one.
 
@@ -123,6 +125,10 @@ class UPI(SmoothstepISP):
 
     name = "upi"
     trainable = False
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        mosaic: Tensor = self.apply(srgb, self.sample(len(srgb), generator))
+        return mosaic
 
     def default_params(self, batch: int) -> UPIParams:
         """The published distributions' means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""

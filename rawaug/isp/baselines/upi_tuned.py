@@ -24,6 +24,7 @@ from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.baselines.upi import GAMMA, SmoothstepISP, UPIParams, inverse_smoothstep
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
+from rawaug.registry import BASELINES
 
 Criterion = Literal["log", "mse", "mean"]
 
@@ -34,8 +35,9 @@ PIXELS = 32768
 """Drawn of each frame."""
 
 
+@BASELINES.register("upi-tuned")
 class TunedUPI(SmoothstepISP):
-    """UPI's stages with a matrix and gains of one's own camera; identity until tuned.
+    """UPI's stages with a fitted camera's matrix and gains; identity until tuned.
 
     Args:
         cfa: pattern of the RAW.
@@ -74,7 +76,7 @@ class TunedUPI(SmoothstepISP):
                 product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
         sums = product.sum(1)
         if (sums <= 0.0).any():
-            raise ValueError("tuned UPI: the pairs ask for gains below 0; give frames with more colours")
+            raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
         self.gains.copy_(1.0 / sums)
         self.matrix.copy_(product / sums[:, None])
         return self
@@ -101,7 +103,7 @@ class Moments(NamedTuple):
         x, y, weight = (value[:, :, 0].double() for value in (linear, samples.target, known))
         if (weight.sum(2) < 32).any():
             frame = int((weight.sum(2) < 32).any(1).nonzero()[0])
-            raise ValueError(f"frame {frame}: too few pixels below the highlights; take a better exposed frame")
+            raise ValueError(f"frame {frame}: too few pixels below the highlights; use a better exposed frame")
         weight = weight / weight.sum((1, 2), keepdim=True)
         a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 
 import torch
@@ -95,11 +94,11 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
     """Where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
     errors: dict[float, float] = {}
     for knee in KNEES:
-        isp.config = replace(isp.config, knee=knee)
+        isp.configure(knee=knee)
         predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.place).clamp(0.0, 1.0)
         square = (predicted - samples.target) ** 2 * samples.site
         errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
-    isp.config = replace(isp.config, knee=min(errors, key=lambda knee: errors[knee]))
+    isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
 def set_priors(isp: DictionaryISP, samples: PixelSamples) -> None:
@@ -111,9 +110,9 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples) -> None:
         x = isp.reverse_pixels(samples.srgb, plain, samples.place)
         a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
     weights = best_constants(a, b, 1.0 / isp.gain.channel_gains().detach())
-    for networks in (isp.reverse_networks, isp.forward_networks):
-        networks.colour_encoder.set_prior(colour_weights)
-        networks.gain_encoder.set_prior(weights)
+    for encoders in (isp.reverse_encoders, isp.forward_encoders):
+        encoders.colour.set_prior(colour_weights)
+        encoders.gain.set_prior(weights)
 
 
 def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor) -> Tensor:

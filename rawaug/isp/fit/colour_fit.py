@@ -1,7 +1,7 @@
 r"""Every frame's own colour: ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised.
 
 What a camera's frames have in common shows once the as-shot white balance is taken out: ``M_f`` divided by its row
-sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the file tells the whole truth. Frames of one camera are drawn
+sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the metadata are exact. Frames of one camera are drawn
 together by ``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure) on both: a deviation far beyond tau, such as
 metadata that lie, costs a constant.
 """
@@ -45,7 +45,7 @@ class FrameColour:
     def params(self) -> ISPParams:
         """As the ISP takes them (without weights)."""
         none = self.log_scale.new_empty(len(self.log_scale), 0)
-        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale))
+        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale), none)
 
     def pick(self, frames: Tensor | slice) -> FrameColour:
         """The colours of some frames."""
@@ -92,7 +92,7 @@ def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
     y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
     if (known.sum(2) < FEWEST_PIXELS).any():
         frame = int((known.sum(2) < FEWEST_PIXELS).any(1).nonzero()[0])
-        raise ValueError(f"frame {frame}: too few unclipped pixels to fit; take a better exposed frame or more pixels")
+        raise ValueError(f"frame {frame}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
     moments = torch.einsum("fip,fjp,fcp->fcij", x, x, known)
     cross = torch.einsum("fip,fcp,fcp->fci", x, y, known)
     ridge = 1e-9 * moments.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).double()

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug.files import read_tensors, write_tensors
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
 SAVE_SECONDS = 10.0
@@ -83,7 +83,7 @@ class Descent:
             self._note(stage, 0, watch(), tensors)
         for tensor in tensors.values():
             tensor.requires_grad_()
-        bar = tqdm(range(start, steps), desc=stage, unit="step", leave=False, disable=None if self.progress else True)
+        bar = progress(range(start, steps), label=stage, unit="step", initial=start, total=steps, shown=self.progress)
         saved = time.monotonic()
         for step in bar:
             optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
@@ -92,9 +92,9 @@ class Descent:
             value.backward()
             optimiser.step()
             if (step + 1) % REPORT_STEPS == 0 or step + 1 == steps:
-                told = "" if report is None else report()
-                told += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
-                bar.set_postfix_str(f"loss {value.item():.2e} {told}")
+                scores = "" if report is None else report()
+                scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
+                bar.set_postfix_str(f"loss {value.item():.2e} {scores}", refresh=False)
             if self.path is not None and time.monotonic() - saved > SAVE_SECONDS:
                 self._keep(stage, step + 1, tensors, optimiser)
                 saved = time.monotonic()
@@ -117,7 +117,7 @@ class Descent:
         if stage not in self.watched or score > before.best:
             self.watched[stage] = Watched(before.start, step, score)
             self._tensors |= {f"{stage}, best/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
-        return f"left out {score:.2f} dB"
+        return f"held out {score:.2f} dB"
 
     def _keep(self, stage: str, step: int, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> None:
         assert self.path is not None
@@ -131,7 +131,7 @@ class Descent:
         write_tensors(self._tensors, header, self.path)
 
     def _load(self, path: Path) -> None:
-        header, tensors = read_tensors(path, "delete this state of a stopped fit")
+        header, tensors = read_tensors(path, "delete this state of an interrupted fit")
         if header.get("key") == self.key:
             self._steps = json.loads(header["steps"])
             self.watched = {k: Watched(*values) for k, values in json.loads(header["watched"]).items()}

@@ -31,15 +31,15 @@ CONSISTENCY = 1.0
 def train_encoders(
     isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
 ) -> None:
-    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` tells which."""
+    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` records which."""
     wanted = config.encoders
+    isp.use_encoders(False)
     if wanted == "auto" and len(shots) >= FEWEST_FRAMES:
         gain = _gain_on_frames_left_out(isp, samples, shots, descent)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
         _train(isp, samples, shots, list(range(len(shots))), descent, "encoders")
-    isp.use_encoders(wanted == "on")
 
 
 def _train(
@@ -50,8 +50,8 @@ def _train(
     descent: Descent,
     stage: str,
 ) -> None:
-    isp.use_encoders(True)
-    tensors = {name: p for name, p in isp.named_parameters() if "_encoder.layers" in name}
+    isp.use_encoders(True, descent.seed)
+    tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
         chosen = torch.randint(len(frames), (FRAMES_A_STEP,), generator=generator).tolist()
@@ -98,8 +98,8 @@ def _gain_on_frames_left_out(
         kept = [k for k in range(len(shots)) if k not in out]
         set_priors(isp, samples.pick(torch.arange(samples.srgb.shape[-1]), torch.tensor(kept)))
         _train(isp, samples, shots, kept, descent, f"encoders without part {fold + 1} of {FOLDS}")
-        for enabled, sign in ((True, 1.0), (False, -1.0)):
-            isp.use_encoders(enabled)
-            gain += sign * len(out) * decibels(isp, samples, shots, out)
+        gain += len(out) * decibels(isp, samples, shots, out)
+        isp.use_encoders(False)
+        gain -= len(out) * decibels(isp, samples, shots, out)
         isp.load_state_dict(start)
     return gain / len(shots)

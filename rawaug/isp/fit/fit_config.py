@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.stage import stage_class
 
 _SWITCH = ("auto", "on", "off")
 
@@ -15,7 +16,8 @@ class FitConfig:
     """How an ISP is fitted.
 
     Args:
-        size: "small" has at most 8 atoms in each dictionary and narrow encoders: 0.12 M parameters instead of 0.52 M.
+        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
+            of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
         reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
             digital gain its fourth root) to either side of the frames' mean, so that the hull holds other light as
@@ -23,16 +25,16 @@ class FitConfig:
         steps: refinement steps of each direction.
         pixels: random pixels kept of each frame.
         batch: pixels of each frame in a step.
-        learning_rate: of Adam, falling to 0 by a cosine.
-        shading: "on" fits the lens shading mask, "off" leaves the stage out, "auto" keeps a mask that takes
-            away half of the squared error at least.
+        learning_rate: initial learning rate of Adam, with cosine decay to 0.
+        shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
+            at least half of the squared error.
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
-            and keeps them where they beat the constants on frames left out.
-        joint_steps: steps of a last end-to-end training of everything at once; None takes 1000 from 50 frames upwards
-            and else 0. Kept only as far as frames left out of it gain.
+            and keeps them if they beat the constants on held-out frames.
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
+            else 0. Kept only if held-out frames improve.
         noisy: fit on the captured noisy RAW of the pairs.
-        seed: of the pixels drawn and of the networks' start.
+        seed: random seed of the drawn pixels and initial networks.
         isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
     """
 
@@ -59,13 +61,13 @@ class FitConfig:
     def __post_init__(self) -> None:
         for key in ("atoms", "pixels", "batch"):
             if getattr(self, key) < 1:
-                raise ValueError(f"{key} is at least 1, got {getattr(self, key)}")
+                raise ValueError(f"{key} must be at least 1, got {getattr(self, key)}")
         for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
             if getattr(self, key) not in values:
-                raise ValueError(f"{key} is {' or '.join(values)}, got {getattr(self, key)!r}")
+                raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
-            raise ValueError(f"isp: unknown {sorted(unknown)}; there are {[key.name for key in fields(ISPConfig)]}")
-        if not {"tone", "gamma"} & set(self.isp.get("stages", POINTWISE_STAGES)):
-            raise ValueError("isp: a fit needs the stage tone or gamma")
+            raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
+        if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
+            raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")
         if self.steps < 0 or self.reach < 1:
-            raise ValueError(f"steps is at least 0 and reach at least 1, got {self.steps} and {self.reach}")
+            raise ValueError(f"steps must be at least 0 and reach at least 1, got {self.steps} and {self.reach}")

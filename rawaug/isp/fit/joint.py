@@ -28,12 +28,12 @@ CONSISTENCY = 0.01
 def train_jointly(
     isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
 ) -> None:
-    """Refine everything at once, if ``config.joint_steps`` says so; ``isp.info`` tells what it brought."""
+    """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``."""
     steps = config.joint_steps if config.joint_steps is not None else (STEPS if len(shots) >= MANY_FRAMES else 0)
     if steps == 0:
         return
     if len(shots) < 2:
-        raise ValueError("joint_steps: end-to-end training leaves frames out to watch; give two frames or more")
+        raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
     watched = list(range(0, len(shots), 10))[: max(1, len(shots) // 2)]
     trained = [k for k in range(len(shots)) if k not in watched]
 
@@ -45,8 +45,7 @@ def train_jointly(
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
 
-    tensors = {name: p for name, p in isp.named_parameters() if isp.encoders_in_use or "_encoder.layers" not in name}
-    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=watch)
+    descent.run("end to end", loss, dict(isp.named_parameters()), steps, LEARNING_RATE, watch=watch)
     seen = descent.watched["end to end"]
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 

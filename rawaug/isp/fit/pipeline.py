@@ -17,13 +17,12 @@ makes it hold up with a handful of frames (``docs/fit.md``).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from rawaug._version import __version__
 from rawaug.files import digest
@@ -38,7 +37,10 @@ from rawaug.isp.fit.joint import train_jointly
 from rawaug.isp.fit.losses import cycle_error, reading_error
 from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading
+from rawaug.isp.stage import Stage
 from rawaug.kernels.threads import one_thread
+from rawaug.progress import progress as progress_of
 from rawaug.seeding import derived_seed
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
@@ -64,14 +66,14 @@ def fit_isp(
         pairs: one or more frames, of one or several cameras; read once.
         config: settings; see :class:`FitConfig`.
         progress: show progress bars.
-        state: file that keeps the state of the fit, so that a stopped one goes on; removed at the end.
+        state: file with the state of the fit, to resume it; removed at the end.
         report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
 
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
     """
     config = config or FitConfig()
-    reading = tqdm(pairs, desc="read", unit="frame", leave=False, disable=None if progress else True)
+    reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
     with one_thread():
@@ -112,7 +114,7 @@ def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
     }
     fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
     if not fewest <= settings["gain_atoms"] <= most:
-        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames call for {fewest} to {most}")
+        raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {most}")
     return DictionaryISP(ISPConfig(**settings), derived_seed(config.seed, "isp"))
 
 
@@ -123,47 +125,51 @@ class _Fit:
         self.samples, self.shots, self.config, self.descent = samples, shots, config, descent
         self.isp = new_isp(shots, config)
         self.tie = Tie(shots)
-        self.toe = torch.zeros(())
         self.colour = self._start()
 
     @torch.no_grad()
     def _start(self) -> FrameColour:
         """Least squares under the curve of the standard that fits best."""
         tried = []
-        for gamma, toe in STANDARD_CURVES:
-            self.isp.reverse_networks.gamma.fill_(gamma)
-            self.toe.fill_(toe)
+        for curve in STANDARD_CURVES:
+            self._start_coarse(*curve)
             self.colour = FrameColour.from_product(least_squares(self._curved(self.samples), self.samples))
-            tried.append((self._error(), gamma, toe, self.colour))
-        _, gamma, toe, colour = min(tried, key=lambda one: one[0])
-        self.isp.reverse_networks.gamma.fill_(gamma)
-        self.toe.fill_(toe)
+            tried.append((self._error(), curve, self.colour))
+        _, curve, colour = min(tried, key=lambda one: one[0])
+        self._start_coarse(*curve)
         return colour
+
+    def _start_coarse(self, gamma: float, toe: float) -> None:
+        for stage in self.isp.ordered_stages:
+            stage.start_coarse(gamma, toe)
 
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
     def curve(self) -> None:
         """Stage 1, without the mask and, where the readings fall off towards the corners, with it as well."""
-        wanted = self.config.shading if "shading" in self.isp.config.stages else "off"
-        with_mask = self.isp.config
-        kept = tuple(stage for stage in with_mask.stages if stage != "shading")
-        self.isp.config = without_mask = replace(with_mask, stages=kept)
+        shading = self.isp.find(LensShading)
+        wanted = self.config.shading if shading else "off"
         if wanted != "on":
-            self._descend_on_curve("curve")
-        if wanted == "off":
+            self._descend_on_curve("curve", without=shading)
+        if shading is None or wanted == "off":
+            self._remove(shading)
             return
         mean, precision = fall_off(self._curved(self.samples), self.samples, self.colour.product())
         if wanted == "auto" and not takes_light(mean, precision):
+            self._remove(shading)
             return
-        plain, error = self._few_numbers(), self._error()
-        before = {name: tensor.detach().clone() for name, tensor in plain.items()}
-        self.isp.config = with_mask
-        self.isp.shading.set(mean, precision)
+        error = self._error()
+        before = {name: tensor.detach().clone() for name, tensor in self._few_numbers(without=shading).items()}
+        shading.mask.set(mean, precision)
         self._descend_on_curve("curve and shading")
         if wanted == "auto" and self._error() > SHADING_PAYS * error:
-            self.isp.config = without_mask
-            for name, tensor in plain.items():
+            self._remove(shading)
+            for name, tensor in self._few_numbers().items():
                 tensor.data.copy_(before[name])
+
+    def _remove(self, stage: Stage | None) -> None:
+        if stage is not None:
+            self.isp.configure(stages=tuple(name for name in self.isp.config.stages if name != stage.name))
 
     @torch.no_grad()
     def _error(self) -> float:
@@ -172,13 +178,13 @@ class _Fit:
 
     def _curved(self, part: PixelSamples) -> Tensor:
         """x2 of the curve, times the mask: what a matrix takes to RAW."""
-        kept, x = self.isp.config.stages, part.srgb
-        x = x + self.toe * (1.0 - x) if "tone" in kept else x
-        x = stages.gamma_expand(x, self.isp.reverse_networks.gamma) if "gamma" in kept else x
-        return x * self.isp.shading(part.place) if "shading" in kept else x
+        x = part.srgb
+        for stage in self.isp.ordered_stages:
+            x = stage.coarse(x, part.place)
+        return x
 
-    def _descend_on_curve(self, stage: str) -> None:
-        tensors = self._few_numbers()
+    def _descend_on_curve(self, stage: str, without: Stage | None = None) -> None:
+        tensors = self._few_numbers(without)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
@@ -191,25 +197,28 @@ class _Fit:
 
     def tone(self, report: Callable[[DictionaryISP], str] | None) -> None:
         """Stage 2."""
-        networks = self.isp.reverse_networks
-        networks.tone.start_from(float(self.toe))
-        tensors = self._few_numbers() | named(tone=networks.tone, attention=networks.attention)
-        del tensors["toe"]  # it has gone into the network
+        tensors: dict[str, Tensor] = self._colours()
+        for stage in self.isp.ordered_stages:
+            stage.start_fine()
+            tensors |= stage.parameters_of(forward=False)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
             predicted = self.isp.reverse_pixels(part.srgb, self.colour.pick(frames).params(), part.place)
             return reading_error(predicted, part) + self.tie(self.colour)
 
-        def tell() -> str:
+        def status() -> str:
             return "" if report is None else report(self.snapshot())
 
-        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, tell)
+        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, status)
 
-    def _few_numbers(self) -> dict[str, Tensor]:
-        tensors = named(shading=self.isp.shading) if "shading" in self.isp.config.stages else {}
-        colour = {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
-        return {**tensors, **colour, "toe": self.toe, "gamma": self.isp.reverse_networks.gamma}
+    def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
+        used = [stage for stage in self.isp.ordered_stages if stage is not without]
+        coarse = {f"{stage.name}.{key}": p for stage in used for key, p in stage.coarse_parameters().items()}
+        return coarse | self._colours()
+
+    def _colours(self) -> dict[str, Tensor]:
+        return {"log_scale": self.colour.log_scale, "matrix": self.colour.matrix}
 
     def _draw(self, generator: torch.Generator) -> tuple[Tensor | slice, PixelSamples]:
         """Random frames (all, if few) and pixels of a step."""
@@ -230,9 +239,7 @@ class _Fit:
 
     def snapshot(self) -> DictionaryISP:
         """The ISP as it would be if stage 2 ended now."""
-        isp = new_isp(self.shots, self.config)
-        isp.load_state_dict(self.isp.state_dict())
-        isp.config = self.isp.config
+        isp = deepcopy(self.isp)
         self.atoms(isp)
         return isp.eval()
 
@@ -240,10 +247,10 @@ class _Fit:
 
     def forward(self) -> None:
         """Stage 5."""
-        isp, networks = self.isp, self.isp.forward_networks
-        with torch.no_grad():
-            networks.gamma.copy_(isp.reverse_networks.gamma)
-        tensors = {"gamma": networks.gamma, **named(tone=networks.tone, attention=networks.attention)}
+        isp, tensors = self.isp, dict[str, Tensor]()
+        for stage in isp.ordered_stages:
+            stage.start_forward()
+            tensors |= stage.parameters_of(forward=True)
 
         def loss(generator: torch.Generator) -> Tensor:
             frames, part = self._draw(generator)
@@ -260,8 +267,3 @@ def takes_light(mean: Tensor, precision: Tensor) -> bool:
     corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
     exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)
     return bool((exponent > DIMMEST).any())
-
-
-def named(**modules: torch.nn.Module) -> dict[str, Tensor]:
-    """The parameters of ``modules`` under their names."""
-    return {f"{name}.{key}": p for name, module in modules.items() for key, p in module.named_parameters()}

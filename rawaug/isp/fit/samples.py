@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.extras import extra
 from rawaug.isp.encoder import thumbnail
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.seeding import keyed_generator
@@ -156,7 +157,7 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
     greens = torch.stack([blocks.srgb[1], blocks.raw[1].clamp_min(0.0).sqrt()])[:, ~blocks.clipped]
     likeness = float(torch.corrcoef(greens)[0, 1])
     if likeness < LEAST_LIKENESS:
-        raise ValueError(f"sRGB and RAW hardly resemble each other (correlation {likeness:.2f}); are they of one shot?")
+        raise ValueError(f"sRGB and RAW hardly correlate ({likeness:.2f}); are they from the same shot?")
     index = torch.randint(blocks.clipped.numel(), (pixels,), generator=generator)
     pixel, reading = blocks.srgb.flatten(1)[:, index], blocks.raw.flatten(1)[:, index]
     inside = ~blocks.clipped.flatten()[index] & (pixel.amax(0) < CLIPPED_SRGB)
@@ -207,7 +208,8 @@ def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
 
     By phase correlation of the green, at half the resolution; the nearest integer to a quarter of a pixel there.
     """
-    from skimage.registration import phase_cross_correlation
+    with extra("raw"):
+        from skimage.registration import phase_cross_correlation
 
     green = _colours(raw, cfa)[1].clamp_min(0.0).sqrt()
     height, width = green.shape

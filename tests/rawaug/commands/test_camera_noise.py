@@ -41,7 +41,7 @@ def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) ->
     assert (tmp_path / "noise.png").stat().st_size > 10_000
 
 
-def test_dark_frames_tell_the_read_variance(noisy_pair: Pair, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_dark_frames_set_the_read_variance(noisy_pair: Pair, tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     rng = np.random.default_rng(0)
     dark = rng.normal(512, READ_VAR**0.5 * (16383 - 512), (128, 128)).round().astype(np.uint16)
     bayer_dng(tmp_path / "dark.dng", dark, cfa="GRBG", black=(512,), white=16383)
@@ -69,7 +69,7 @@ def test_noise_that_is_the_same_everywhere_is_refused(noisy_pair: Pair) -> None:
         measure_camera_noise([with_variance(noisy_pair, 0.0, 2e-4, seed) for seed in (2, 3)])
 
 
-def test_what_is_refused_is_told_or_raised_as_is_asked(noisy_pair: Pair) -> None:
+def test_what_is_refused_is_reported_or_raised_as_is_asked(noisy_pair: Pair) -> None:
     pair = with_variance(noisy_pair, -4e-4, 4e-4)
     isp = fit([pair], progress=False, steps=1, pixels=256)
     assert "one line" in isp.info["noise_not_measured"] and "noise" not in isp.info

@@ -78,7 +78,7 @@ def test_what_cannot_be_fitted_together_is_named(
     tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
 ) -> None:
     one, out = shoot("one.dng"), ["--out", tmp_path / "x.safetensors"]
-    assert "demo:train: a known dataset is fitted alone" in refused(capsys, "fit", one, "demo:train", *out)
+    assert "demo:train: a kind:path dataset cannot be combined" in refused(capsys, "fit", one, "demo:train", *out)
     assert "gone.dng" in refused(capsys, "fit", one, tmp_path / "gone.dng", *out)
     assert "gone" in refused(capsys, "fit", one, "--held-out", tmp_path / "gone", *out)
     assert not (tmp_path / "x.safetensors").exists() and not list(tmp_path.glob("*.state"))
@@ -130,7 +130,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     monkeypatch.setattr(Descent, "_keep", stop)
     fit(out, *frames, status=INTERRUPTED)
     assert state.is_file() and not out.exists()
-    assert "the same command goes on from here" in capsys.readouterr().err
+    assert "run the same command again to resume" in capsys.readouterr().err
     stopped = state.read_bytes()
     monkeypatch.setattr(Descent, "_keep", kept)
     monkeypatch.setattr(Descent, "_restore", noted)

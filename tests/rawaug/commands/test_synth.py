@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def others_in_session(session: int) -> list[str]:
     return found
 
 
-def test_the_dngs_tell_the_truth(tmp_path: Path) -> None:
+def test_the_dngs_have_the_right_metadata(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     ramp = torch.linspace(0.1, 0.9, 512)[None, :, None].expand(3, 512, 512)
     write_picture(tmp_path / "in/ramp.png", ramp)
@@ -130,7 +131,7 @@ def test_the_dngs_tell_the_truth(tmp_path: Path) -> None:
 
 def test_lens_shading_comes_as_a_gain_map() -> None:
     isp = DictionaryISP(ISPConfig(attention=False))
-    isp.shading.set(torch.tensor([0.1, -0.2]), torch.eye(2))
+    cast(Any, isp.stages["shading"]).mask.set(torch.tensor([0.1, -0.2]), torch.eye(2))
     augment = RawAugment(isp, noise=(0.0, 0.0))
     srgb = torch.full((3, 64, 96), 0.5)
     pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))
@@ -180,7 +181,7 @@ def test_the_command(tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixtu
     command = ["synth", str(pictures), str(tmp_path / "out"), "--noise", "[0.001, 1e-5]", "--workers", "0"]
     assert main([*command, "--per-image", "2"]) == 0
     text = capsys.readouterr().out
-    assert "pairs made" in text and "broken:" in text and "broken.jpg" in text
+    assert "pairs made" in text and "unreadable:" in text and "broken.jpg" in text
     assert main([*command, "--format", "npz"]) == 2
     assert "made with format dng, not npz" in capsys.readouterr().err
 

@@ -38,10 +38,10 @@ def test_pictures_are_counted_by_size_and_the_broken_ones_named(tmp_path: Path) 
     ]
     (line,) = report.broken
     assert "3.png: cannot be read as a picture" in line
-    assert "pictures: 5, 2 of them examined" in str(check(tmp_path, first=2))
+    assert "pictures: 5, 2 examined" in str(check(tmp_path, first=2))
 
 
-def test_raw_files_tell_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.full((32, 48), 1000, np.uint16)
     bayer_dng(tmp_path / "a.dng", numbers, cfa="GRBG", black=(64,), white=1023)
     bayer_dng(tmp_path / "b.dng", numbers, cfa="BGGR", black=(64,), white=1023)
@@ -101,10 +101,10 @@ def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(
     monkeypatch.setattr(PictureFolder, "read", lambda folder, index: crash())
     write_pictures(tmp_path, 9)
     (part,) = check(tmp_path).parts
-    assert part.examined == 5 and len(part.broken) == 6 and "nothing is read after 5 crashes" in part.broken[-1]
+    assert part.examined == 5 and len(part.broken) == 6 and "stopped after 5 crashes" in part.broken[-1]
 
 
-def test_what_is_unknown_is_told(tmp_path: Path) -> None:
+def test_what_is_unknown_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
         check(tmp_path / "none")
     (tmp_path / "notes.txt").write_text("nothing")

@@ -79,13 +79,13 @@ def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
     dnd = Dnd(folder)
     with pytest.raises(ValueError, match="a submission must have 1000 boxes, got 3"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8)] * 3)
-    with pytest.raises(ValueError, match="box 1: a denoised box is finite"):
+    with pytest.raises(ValueError, match="box 1: a denoised box must be finite"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), torch.full((1, 6, 8), torch.nan)])
     write_dnd_submission(tmp_path / "a", [torch.zeros(1, 8, 6)] * 1000)
-    with pytest.raises(ValueError, match=r"0001\.mat: box 1 is float32 \(6, 8\), got float32 \(8, 6\)"):
+    with pytest.raises(ValueError, match=r"0001\.mat: box 1 must be float32 \(6, 8\), got float32 \(8, 6\)"):
         check_dnd_submission(tmp_path / "a", dnd)
     write_dnd_submission(tmp_path / "a", [torch.full((1, 6, 8), 1.5)] * 1000)
-    with pytest.raises(ValueError, match=r"box 1 runs from 1\.5 to 1\.5; clip it"):
+    with pytest.raises(ValueError, match=r"box 1 has values from 1\.5 to 1\.5; clip it"):
         check_dnd_submission(tmp_path / "a", dnd)
     (tmp_path / "a" / "0050.mat").unlink()
     write_dnd_submission(tmp_path / "b", [crop.noisy for crop in dnd])
@@ -94,7 +94,7 @@ def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
         check_dnd_submission(tmp_path / "b", dnd)
 
 
-def test_what_is_missing_or_wrong_is_told(tmp_path: Path, mat73: Writer) -> None:
+def test_what_is_missing_or_wrong_is_reported(tmp_path: Path, mat73: Writer) -> None:
     with pytest.raises(FileNotFoundError, match=r"info\.mat: no such MATLAB file"):
         Dnd(tmp_path)
     mat73(tmp_path / "info.mat", {"info": [info(0), info(1)]})
@@ -105,7 +105,7 @@ def test_what_is_missing_or_wrong_is_told(tmp_path: Path, mat73: Writer) -> None
     dnd = Dnd(tmp_path)
     with pytest.raises(ValueError, match=r"0001\.mat: Inoisy \(20, 34\) has values from"):
         dnd[0]
-    with pytest.raises(ValueError, match=r"0002\.mat: box 1 of info\.mat leaves the frame of \(5, 34\)"):
+    with pytest.raises(ValueError, match=r"0002\.mat: box 1 of info\.mat extends beyond the frame \(5, 34\)"):
         dnd[20]
     mat73(tmp_path / "info.mat", {"info": [info(0), {**info(1), "nlf": {"a": 1.0}}]})
     with pytest.raises(ValueError, match=r"info\.mat: frame 2 of info is not as published \('b'\)"):

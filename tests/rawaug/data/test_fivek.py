@@ -44,7 +44,7 @@ def test_a_split_is_found_by_number_and_developed(folder: Path) -> None:
         assert pair.srgb.shape == (3, 32, 48)
 
 
-def test_missing_frames_are_told(folder: Path) -> None:
+def test_missing_frames_are_reported(folder: Path) -> None:
     with pytest.raises(
         FileNotFoundError, match=r"126 of the 200 DNGs of fivek canon\+nikon, test, are missing, first a\d{4}-"
     ):
@@ -53,13 +53,13 @@ def test_missing_frames_are_told(folder: Path) -> None:
         open_pairs(f"fivek_nikon:{folder}:train")
     with pytest.raises(ValueError, match="fivek: no split validation; use one of InvISP's: train, test"):
         open_pairs(f"fivek:{folder}", split="validation")
-    with pytest.raises(ValueError, match="fivek: no camera sony; there are canon, nikon"):
+    with pytest.raises(ValueError, match="fivek: no camera sony; use one of canon, nikon"):
         fivek_pairs(folder, "test", ["sony"])
     with pytest.raises(FileNotFoundError, match="no such folder of FiveK"):
         fivek_pairs(folder / "none", "test", CAMERAS)
 
 
-def test_check_tells_how_much_of_each_split_is_there(folder: Path) -> None:
+def test_check_counts_the_files_of_each_split(folder: Path) -> None:
     report = str(check(folder))
     assert "RAW files (FiveK: canon test 1 of 127, nikon test 73 of 73): 74" in report
     assert "sizes: 32 x 48 (74)" in report and "cfas: RGGB (74)" in report and "black 0, white 4095 (74)" in report

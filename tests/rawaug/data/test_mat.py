@@ -40,7 +40,7 @@ def test_the_version_is_that_of_the_header(tmp_path: Path, mat73: Writer) -> Non
     with pytest.raises(ValueError, match=r"older\.mat: is not a MATLAB file of version 5 or 7\.3"):
         mat_version(tmp_path / "older.mat")
     (tmp_path / "empty.mat").touch()
-    with pytest.raises(ValueError, match=r"empty\.mat: is no MATLAB file"):
+    with pytest.raises(ValueError, match=r"empty\.mat: is not a MATLAB file"):
         mat_version(tmp_path / "empty.mat")
     with pytest.raises(FileNotFoundError, match=r"none\.mat: no such MATLAB file"):
         mat_version(tmp_path / "none.mat")
@@ -65,7 +65,7 @@ def test_structs_cells_and_text_become_plain(written: Callable[[dict[str, Any]],
     assert all(np.array_equal(a, b) for a, b in zip(read_value(path, "c"), ARRAY[:2], strict=True))
 
 
-def test_what_is_not_there_is_told_with_what_is(written: Callable[[dict[str, Any]], Path]) -> None:
+def test_what_is_not_there_is_reported_with_what_is(written: Callable[[dict[str, Any]], Path]) -> None:
     path = written({"x": ARRAY, "s": {"a": 1.0}})
     with pytest.raises(ValueError, match=r"a\.mat: has no variable y; its variables are: (x, s|s, x)"):
         read_array(path, "y")

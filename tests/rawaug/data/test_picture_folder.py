@@ -118,7 +118,7 @@ def test_more_than_the_allowed_share_is_an_error_that_names_them(folder: Path) -
     ) as caught:
         pictures[1]
     assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="1 of 3 pictures cannot be used, above the allowed share of 5%"):
+    with pytest.raises(ValueError, match="1 of 3 pictures are unusable, more than allowed_share 5%"):
         PictureFolder(folder)[1]
 
 
@@ -151,7 +151,7 @@ def test_an_epoch_over_a_damaged_folder_completes_and_names_every_file(
     assert all(sum(name in line for line in report) == 1 for name in damaged)
 
 
-def test_each_damage_is_told_for_what_it_is(messy: tuple[Path, set[str]]) -> None:
+def test_each_damage_is_reported_for_what_it_is(messy: tuple[Path, set[str]]) -> None:
     folder, _ = messy
     pictures = PictureFolder(folder)
     for k in range(len(pictures)):
@@ -160,7 +160,7 @@ def test_each_damage_is_told_for_what_it_is(messy: tuple[Path, set[str]]) -> Non
     assert "60000 x 60000 pixels, above the limit" in reasons["x_huge.png"] or "too large" in reasons["x_huge.png"]
     assert "17000 x 17000 pixels, above the limit of 268435456" in reasons["x_wide.png"]
     assert "is an animation" in reasons["x_animated.gif"] and "is an animation" in reasons["x_animated.webp"]
-    assert "is CMYK" in reasons["x_cmyk.jpg"] and "a side below 2" in reasons["x_1x1.png"]
+    assert "is CMYK" in reasons["x_cmyk.jpg"] and "smaller than min_side 2" in reasons["x_1x1.png"]
     assert "no such picture file" in reasons["x_dangling.jpg"] and "no such picture file" in reasons["x_pipe.jpg"]
     assert all("\n" not in reason and name in reason for name, reason in reasons.items())
 
@@ -174,7 +174,7 @@ def test_the_replacement_does_not_depend_on_who_asks_in_which_order(messy: tuple
     assert all(torch.equal(there[k], back[k]) for k in chosen)
 
 
-def test_the_end_of_an_epoch_is_told(messy: tuple[Path, set[str]], caplog: pytest.LogCaptureFixture) -> None:
+def test_the_end_of_an_epoch_is_reported(messy: tuple[Path, set[str]], caplog: pytest.LogCaptureFixture) -> None:
     pictures = PictureFolder(messy[0])
     with caplog.at_level(logging.WARNING):
         for k in range(len(pictures) - 1):
@@ -206,13 +206,13 @@ def test_names_take_two_arrays_however_many_there_are(tmp_path: Path) -> None:
     assert "name is not UTF-8; rename it" in pictures.report()
 
 
-def test_nothing_to_read_is_told_at_once(tmp_path: Path) -> None:
+def test_nothing_to_read_is_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such folder of pictures"):
         PictureFolder(tmp_path / "none")
     with pytest.raises(ValueError, match=r"contains no picture; supported extensions are \.bmp"):
         PictureFolder(tmp_path)
     (tmp_path / "a.png").write_bytes(b"broken")
-    with pytest.raises(ValueError, match=r"1 of 1 pictures cannot be used.*a\.png: cannot be read"):
+    with pytest.raises(ValueError, match=r"1 of 1 pictures are unusable.*a\.png: cannot be read"):
         PictureFolder(tmp_path)[0]
 
 

@@ -60,7 +60,7 @@ def test_a_camera_jpeg_is_turned_into_the_sensors_orientation(tmp_path: Path, ba
     assert RawFolder(tmp_path, camera_jpeg=False)[0].registered
 
 
-def test_a_jpeg_of_another_size_is_not_taken_and_told(tmp_path: Path, bayer_dng: Dng) -> None:
+def test_a_jpeg_of_another_size_is_ignored_with_a_warning(tmp_path: Path, bayer_dng: Dng) -> None:
     path = bayer_dng(tmp_path / "a.dng", NUMBERS)
     write_picture(tmp_path / "a.jpg", torch.zeros(3, 20, 31, dtype=torch.uint8))
     with pytest.warns(UserWarning, match=r"a.jpg: is 20 x 31 but its RAW file is 40 x 62; using LibRaw's"):
@@ -91,7 +91,7 @@ def test_nothing_to_read_is_named(tmp_path: Path) -> None:
         RawFolder(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.dng: no such RAW file"):
         RawFolder(tmp_path / "none.dng")
-    with pytest.raises(ValueError, match="flickr:x: no such kind of data; there are demo:"):
+    with pytest.raises(ValueError, match="flickr:x: unknown kind of data; use demo:"):
         open_pairs("flickr:x")
 
 

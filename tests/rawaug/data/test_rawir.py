@@ -46,13 +46,13 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
 
 
-def test_what_is_wrong_is_told(tmp_path: Path) -> None:
+def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
     write_pair(tmp_path, "a", "jpg", scale=3)
     with pytest.raises(ValueError, match=r"a\.npy: has value 1207, above the white level 1024; pass white="):
         Rawir(tmp_path)[0]
     assert Rawir(tmp_path, white=4095)[0].raw.max().item() == pytest.approx(1207 / 4095)
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 8), np.uint16))
-    with pytest.raises(ValueError, match=r"packed RAW is unsigned \(h, w, 4\), got uint16 \(4, 6, 8\)"):
+    with pytest.raises(ValueError, match=r"packed RAW must be unsigned \(h, w, 4\), got uint16 \(4, 6, 8\)"):
         Rawir(tmp_path)[0]
     np.save(tmp_path / "a.npy", np.array([{"code": "to run"}], object), allow_pickle=True)
     with pytest.raises(OSError, match=r"a\.npy: cannot be read as an array"):

@@ -50,14 +50,14 @@ def test_8_bits_are_a_quarter(tmp_path: Path) -> None:
     assert planes.tolist() == pytest.approx([100, 200, 300, 400], abs=4)
 
 
-def test_what_is_wrong_is_told(folder: Path) -> None:
+def test_what_is_wrong_is_reported(folder: Path) -> None:
     (folder / "train" / "canon" / "2.jpg").unlink()
     with pytest.raises(FileNotFoundError, match=r"2\.jpg: is missing, and 0 others"):
         Zurich(folder)
     Image.fromarray(np.full((4, 4), 5000, np.uint16)).save(folder / "test" / "huawei_raw" / "0.png")
-    with pytest.raises(ValueError, match=r"0\.png: holds 5000, more than 10 bits"):
+    with pytest.raises(ValueError, match=r"0\.png: has value 5000, more than 10 bits"):
         Zurich(folder, "test")[0]
-    with pytest.raises(ValueError, match="zurich: no split validation; there are train and test"):
+    with pytest.raises(ValueError, match="zurich: no split validation; use train or test"):
         open_pairs(f"zurich:{folder}", "validation")
     with pytest.raises(FileNotFoundError, match="no such folder of Zurich"):
         Zurich(folder / "train")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import torch
 
 from rawaug.data import demo_pairs
@@ -13,7 +15,7 @@ from rawaug.isp.model import DictionaryISP
 def test_strips_give_the_whole_mosaic() -> None:
     pair = demo_pairs("validation", count=1)[0]
     isp = DictionaryISP(ISPConfig(cfa="GRBG"))
-    isp.shading.set(torch.zeros(2), torch.eye(2))
+    cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
     assert pair.raw.shape[-2] >= 256
     tall = type(pair)(**{**vars(pair), **{k: torch.cat([getattr(pair, k)] * 2, 1) for k in ("srgb", "raw", "noisy")}})
     with torch.no_grad():

@@ -71,9 +71,9 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     pair = demo_pairs("test", count=1)[0]
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
-    told, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
-    assert torch.equal(measured.noisy, told.noisy)
-    assert (measured.variance / told.variance).mean() == pytest.approx(1.0, abs=0.1)
+    with_levels, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
+    assert torch.equal(measured.noisy, with_levels.noisy)
+    assert (measured.variance / with_levels.variance).mean() == pytest.approx(1.0, abs=0.1)
     levels = frozen_levels(bare, noise, seed=0)
     assert levels is not None
     y = pair.raw.mean().item()
@@ -88,7 +88,7 @@ def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
         assert len(scores["images"]) == 2
     print_scores(result)
-    with pytest.raises(ValueError, match="classical: Median is unknown; use one of NonLocalMeans"):
+    with pytest.raises(ValueError, match="classical filter 'Median' is unknown; use one of BM3D, NonLocalMeans"):
         evaluate(identity, "demo:test", classical=["Median"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 import torch
@@ -27,8 +28,8 @@ def known_camera() -> DictionaryISP:
     with torch.no_grad():
         isp.colour.matrices.copy_(torch.tensor(MATRIX)[None])
         isp.gain.log_gains.copy_(torch.tensor([[1.0, red, blue] for red, _, blue in LIGHTS]).log())
-        isp.reverse_networks.gain_encoder.set_prior(torch.tensor([1.0, 0.0]))
-        isp.shading.set(torch.zeros(2), 1.5 * torch.eye(2))
+        isp.reverse_encoders.gain.set_prior(torch.tensor([1.0, 0.0]))
+        cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), 1.5 * torch.eye(2))
     return isp.requires_grad_(False).eval()
 
 

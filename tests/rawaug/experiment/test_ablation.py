@@ -57,7 +57,7 @@ def test_a_stage_that_is_left_out_repeats_the_one_before(
     stage: str, known_camera: DictionaryISP, frame_of: FrameOf
 ) -> None:
     kept = tuple(s for s in POINTWISE_STAGES if s != stage)
-    known_camera.config = replace(known_camera.config, stages=kept)
+    known_camera.configure(stages=kept)
     rows = stage_psnr(known_camera, frame_of("daylight"), white_balance=False)
     same = {k for k in range(5) if rows[k] == rows[k + 1]}
     assert same == {0, POINTWISE_STAGES.index(stage)}
@@ -119,10 +119,10 @@ def test_each_frame_is_measured_by_fits_on_the_others(
     shapes = {given: (len(rows), {len(row) for row in rows}) for given, rows in result["stages"].items()}
     assert shapes == {"blind": (len(TITLES), {len(SPACES)}), "as-shot gains": (len(TITLES), {len(SPACES)})}
     assert result["stages"]["as-shot gains"][5][0] > result["stages"]["blind"][5][0] + 3.0
-    _told_in_full(result, tmp_path / "ablation", capsys.readouterr().out)
+    _reported_in_full(result, tmp_path / "ablation", capsys.readouterr().out)
 
 
-def _told_in_full(result: dict[str, Any], folder: Path, said: str) -> None:
+def _reported_in_full(result: dict[str, Any], folder: Path, said: str) -> None:
     """File, picture and text have what was returned."""
     stored = json.loads((folder / "ablation.json").read_text())
     assert stored == json.loads(json.dumps(result)) and stored["settings"]["seed"] == 4
@@ -137,7 +137,7 @@ def _told_in_full(result: dict[str, Any], folder: Path, said: str) -> None:
 
 def test_one_frame_leaves_none_to_fit(monkeypatch: pytest.MonkeyPatch, frame_of: FrameOf) -> None:
     monkeypatch.setattr(ablation, "open_pairs", lambda spec, split: [frame_of("a")])
-    with pytest.raises(ValueError, match="data: lonely has 1 frame; leaving one out needs two or more"):
+    with pytest.raises(ValueError, match="data: lonely has 1 frame; leave-one-out needs two or more"):
         ablate(Ablation(data="lonely"))
 
 

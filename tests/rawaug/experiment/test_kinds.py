@@ -58,7 +58,7 @@ def test_the_commands_of_a_header_can_be_given(name: str) -> None:
         assert not quick or kind.smoke(recipe).name.endswith("-smoke")
 
 
-def test_the_reconstruction_header_tells_the_methods_rows_and_budgets_that_there_are() -> None:
+def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
     head = header("reconstruction")
     (named,) = re.findall(r"--methods '\[(.*?)\]'", head)
     assert set(named.split(", ")) <= set(FAMILIES) and {"dictionary", "dictionary-encoders"} < set(named.split(", "))
@@ -70,23 +70,29 @@ def test_the_reconstruction_header_tells_the_methods_rows_and_budgets_that_there
     assert set(re.findall(r"`(\w+)`", find_recipe("reconstruction").read_text())) <= keys
 
 
-def test_the_ablation_header_tells_how_coarse_the_blocks_are() -> None:
+def test_the_ablation_header_gives_the_block_size() -> None:
     assert f"at {BLOCK} times lower resolution" in header("ablation")
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
-        (b"experiment: reconstruktion\n", "experiment 'reconstruktion' is none of training, reconstruction, ablation"),
-        (b"experiment: [ablation]\n", r"experiment \['ablation'\] is none of training, reconstruction, ablation"),
-        (b"experiment:\n", "experiment None is none of training, reconstruction, ablation"),
+        (
+            b"experiment: reconstruktion\n",
+            "unknown experiment 'reconstruktion'; use one of training, reconstruction, ablation",
+        ),
+        (
+            b"experiment: [ablation]\n",
+            r"unknown experiment \['ablation'\]; use one of training, reconstruction, ablation",
+        ),
+        (b"experiment:\n", "unknown experiment None; use one of training, reconstruction, ablation"),
         (b"experiment: [ablation\n", "not a YAML file .*see the recipes"),
         (b"\xff\xfe\x00\x81", "not a YAML file .*see the recipes"),
     ],
 )
-def test_what_names_no_kind_is_refused_by_the_files_name(content: bytes, told: str, tmp_path: Path) -> None:
+def test_what_names_no_kind_is_refused_by_the_files_name(content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_bytes(content)
-    with pytest.raises(ValueError, match=r"(?s)mine\.yaml: " + told):
+    with pytest.raises(ValueError, match=r"(?s)mine\.yaml: " + message):
         kind_of(tmp_path / "mine.yaml")
 
 

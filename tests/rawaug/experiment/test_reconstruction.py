@@ -174,17 +174,17 @@ def test_frames_that_cannot_make_a_table_are_refused(
     laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     laboratory.frames = 1
-    with pytest.raises(ValueError, match="data: known has 1 frame; leaving one out needs two"):
+    with pytest.raises(ValueError, match="data: known has 1 frame; leave-one-out needs two"):
         compare(settings(tmp_path))
     laboratory.frames = 3
     pairs = laboratory.open_pairs("", "")
-    for odd, told in (
+    for odd, message in (
         (replace(pairs[1], registered=False), "f1 is not registered pixel by pixel; unet cannot share"),
-        (replace(pairs[1], cfa=CFA.BGGR), "f1 has another CFA"),
+        (replace(pairs[1], cfa=CFA.BGGR), "f1 has a different CFA"),
         (replace(pairs[1], name="f0"), "several frames are named f0"),
     ):
         monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             compare(settings(tmp_path, methods=["unet"]))
     assert laboratory.folds == []
 
@@ -227,18 +227,18 @@ def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
     for pair, _ in seen:
         assert pair.noisy is not None and 1e-4 < (pair.noisy - pair.raw).std() < 0.1
     assert all(torch.equal(pair.raw, clean[int(pair.name[1])].raw) for pair in scored)
-    with pytest.raises(ValueError, match="only the dictionary ISP is fitted to noisy frames"):
+    with pytest.raises(ValueError, match="only the dictionary ISP can be fitted to noisy frames"):
         Comparison(noise="cycleisp_sidd")
 
 
 def test_settings_that_cannot_be_are_refused() -> None:
-    for wrong, told in (
+    for wrong, message in (
         ({"methods": ["unett"]}, r"methods: \['unett'\]; choose from dictionary, .*invgrey"),
         ({"methods": []}, "methods: none; choose from"),
-        ({"seeds": 0}, "seeds is at least 1, got 0"),
-        ({"patches": 0}, "patches is at least 1, or null for all, got 0"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"patches": 0}, "patches must be at least 1, or null for all, got 0"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             Comparison(**wrong)
 
 

@@ -23,7 +23,7 @@ MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 WHITE_BALANCE = (2.1, 1.0, 1.4)
 
 
-def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int, **told: object) -> RawFrame:
+def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int, **fields: object) -> RawFrame:
     """The frame whose digital numbers are ``numbers`` ``(H, W)``."""
     levels = np.zeros((2, 2))
     for site, level in zip(cfa.sites, black, strict=True):
@@ -40,7 +40,7 @@ def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int,
         "orientation": 0,
         "name": "a",
     }
-    return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **told})  # type: ignore[arg-type]
+    return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **fields})  # type: ignore[arg-type]
 
 
 def numbers_in(path: Path) -> np.ndarray:
@@ -120,7 +120,7 @@ def test_a_raw_developer_shows_the_colours_that_were_meant(tmp_path: Path, cfa: 
     assert (shown - expected)[:, inner].abs().max() < 0.02
 
 
-def test_what_a_source_tells_is_kept(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+def test_metadata_of_a_source_are_kept(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.random.default_rng(0).integers(0, 4096, (32, 48)).astype(np.uint16)
     matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     extra = [(50940, 11, 4, (0.0, 0.0, 1.0, 1.0), True), (50936, 2, 0, "Vivid", True), (51111, 1, 16, bytes(16), True)]
@@ -163,7 +163,7 @@ def test_directories_are_copied_in_either_byte_order(tmp_path: Path) -> None:
         assert tiff.byteorder == ">" and "MakerNote" not in tiff.pages.first.tags["ExifTag"].value
 
 
-def test_any_camera_name_and_exposure_can_be_told(tmp_path: Path) -> None:
+def test_any_camera_name_and_exposure_can_be_written(tmp_path: Path) -> None:
     numbers = np.full((32, 32), 900, np.uint16)
     shot = Exposure(5000.0, 2.8, 35.0, "2020:02:29 12:00:00")
     frame = a_frame(numbers, CFA.RGGB, (0, 0, 0, 0), 1023, camera="Möller Kamera", exposure=shot)
@@ -189,7 +189,7 @@ def test_what_16_bits_cannot_hold_is_refused(tmp_path: Path) -> None:
         write_dng(tmp_path / "a.dng", noisy)
     with pytest.raises(ValueError, match=r"a\.dng: levels must satisfy 0 <= black < white <= 65535"):
         write_dng(tmp_path / "a.dng", dataclasses.replace(frame, white=65536.0))
-    with pytest.raises(ValueError, match=r"a\.dng: a mosaic to write is \(1, H, W\) with even sides"):
+    with pytest.raises(ValueError, match=r"a\.dng: the mosaic must be \(1, H, W\) with even sides"):
         write_dng(tmp_path / "a.dng", dataclasses.replace(frame, mosaic=torch.zeros(1, 5, 4)))
     assert not list(tmp_path.iterdir())
 
@@ -218,16 +218,16 @@ def test_an_iso_beyond_16_bits_is_the_recommended_exposure_index(
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"orientation": 9}, "orientation"),
         ({"white_balance": (0.0, 1.0, 1.5)}, "positive"),
         ({"color_matrix": torch.zeros(3, 3)}, "singular"),
     ],
 )
-def test_what_no_dng_can_tell_is_refused(
-    tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], told: str
+def test_what_no_dng_can_store_is_refused(
+    tmp_path: Path, bayer_dng: Callable[..., Path], change: dict[str, Any], message: str
 ) -> None:
     frame = read_raw(bayer_dng(tmp_path / "a.dng", np.arange(64 * 96, dtype=np.uint16).reshape(64, 96) % 4096))
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         write_dng(tmp_path / "b.dng", dataclasses.replace(frame, **change))

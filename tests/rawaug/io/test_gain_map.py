@@ -11,7 +11,7 @@ from rawaug.io.gain_map import GainMap, gains_at_sites, opcode_list, parse_gain_
 
 
 def a_map(**changes: object) -> GainMap:
-    told = {
+    defaults = {
         "area": (0, 0, 8, 12),
         "pitch": (1, 1),
         "planes": (0, 1),
@@ -19,7 +19,7 @@ def a_map(**changes: object) -> GainMap:
         "spacing": (0.5, 0.25),
         "gains": torch.rand(1, 3, 5, generator=torch.Generator().manual_seed(0)) + 1,
     }
-    return GainMap(**{**told, **changes})  # type: ignore[arg-type]
+    return GainMap(**{**defaults, **changes})  # type: ignore[arg-type]
 
 
 def by_the_specification(m: GainMap, row: int, column: int, height: int, width: int) -> float:
@@ -63,9 +63,14 @@ def test_without_maps_there_is_no_correction() -> None:
 def test_opcode_lists_go_there_and_back() -> None:
     maps = a_map(), a_map(area=(1, 1, 8, 12), pitch=(2, 2), gains=torch.rand(2, 4, 3))
     opcodes = opcode_list(maps)
-    for told, read in zip(maps, parse_gain_maps(opcodes, on_mosaic=True), strict=True):
-        assert torch.equal(told.gains, read.gains)
-        assert (told.area, told.pitch, told.planes, told.spacing) == (read.area, read.pitch, read.planes, read.spacing)
+    for written, read in zip(maps, parse_gain_maps(opcodes, on_mosaic=True), strict=True):
+        assert torch.equal(written.gains, read.gains)
+        assert (written.area, written.pitch, written.planes, written.spacing) == (
+            read.area,
+            read.pitch,
+            read.planes,
+            read.spacing,
+        )
     other = struct.pack(">4I", 1, 0x01030000, 0, 8) + bytes(8)  # another opcode in front
     assert len(parse_gain_maps(struct.pack(">I", 3) + other + opcodes[4:], on_mosaic=True)) == 2
 
@@ -74,8 +79,8 @@ def test_what_is_cut_short_is_refused() -> None:
     opcodes = opcode_list([a_map()])
     with pytest.raises(ValueError, match="is incomplete"):
         parse_gain_maps(opcodes[:-4], on_mosaic=True)
-    with pytest.raises(ValueError, match="cut short"):
+    with pytest.raises(ValueError, match="truncated"):
         parse_gain_maps(opcodes[:10], on_mosaic=True)
     for nonsense in (a_map(spacing=(0.0, 0.25)), a_map(gains=torch.full((1, 3, 5), torch.nan))):
-        with pytest.raises(ValueError, match="is no map"):
+        with pytest.raises(ValueError, match="is invalid"):
             parse_gain_maps(opcode_list([nonsense]), on_mosaic=True)

@@ -68,7 +68,7 @@ def test_values_outside_the_unit_range_are_refused(tmp_path: Path) -> None:
     write_with_oiio(tmp_path / "bright.exr", np.full((4, 4, 3), 1.7, np.float32), "float")
     with pytest.raises(ValueError, match=r"bright\.exr: has values from 1\.7 to 1\.7, expected \[0, 1\]"):
         read_picture(tmp_path / "bright.exr")
-    with pytest.raises(ValueError, match="not in"):
+    with pytest.raises(ValueError, match="expected"):
         write_picture(tmp_path / "nan.png", torch.full((3, 4, 4), float("nan")))
 
 
@@ -172,7 +172,7 @@ def test_a_grey_profile_is_applied(tmp_path: Path) -> None:
     assert error[SRGB[:1].expand_as(error) >= 12].max() <= 2
 
 
-def test_a_damaged_profile_is_told(tmp_path: Path) -> None:
+def test_a_damaged_profile_is_reported(tmp_path: Path) -> None:
     profile = bytearray(icc_profile(b"RGB ", {b"wtpt": b"XYZ " + bytes(4) + s15_fixed16(0.9642, 1, 0.8249)}))
     Image.fromarray(PIXELS).save(tmp_path / "a.tif", icc_profile=bytes(profile))
     with pytest.raises(ValueError, match=r"a\.tif: its ICC profile cannot be used .*; convert the picture to sRGB"):

@@ -38,7 +38,7 @@ def test_every_row_of_the_table_is_kept_or_counted() -> None:
     cameras = published_cameras()
     assert len(cameras.names) == len(cameras.xyz_to_camera)
     assert len(cameras.names) + sum(cameras.rejected.values()) == 1459
-    assert cameras.rejected["sensor of four colours"] == 23
+    assert cameras.rejected["four-colour sensor"] == 23
     assert cameras.xyz_to_camera.isfinite().all() and torch.linalg.det(cameras.xyz_to_camera).abs().min() > 1e-4
     assert 500 < len(cameras.distinct()) < len(cameras.names)
 

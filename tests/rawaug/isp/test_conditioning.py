@@ -102,7 +102,7 @@ def test_a_digital_gain_is_that_of_grey(fitted: DictionaryISP, exact_pairs: list
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"white_balance": (2.0, 1.0)}, r"white_balance is \(3,\)"),
+        ({"white_balance": (2.0, 1.0)}, r"white_balance must be \(3,\)"),
         ({"white_balance": torch.ones(2, 3)}, "white_balance"),
         ({"digital_gain": torch.ones(2)}, "digital_gain"),
         ({"raw_samples": torch.zeros(1, 4)}, "row, column, value"),

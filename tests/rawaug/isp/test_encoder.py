@@ -11,16 +11,16 @@ def images() -> torch.Tensor:
     return torch.rand(2, 3, 3, 16, 16, generator=torch.Generator().manual_seed(0))
 
 
-def test_a_disabled_encoder_gives_its_constant() -> None:
-    encoder = Encoder(3, (4, 4, 4))
+def test_without_layers_an_encoder_gives_its_constant() -> None:
+    encoder = Encoder(3)
     encoder.set_prior(torch.tensor([0.2, 0.3, 0.5]))
     torch.testing.assert_close(encoder(images()), torch.tensor([[0.2, 0.3, 0.5]] * 2))
 
 
-def test_an_enabled_one_starts_from_its_constant_and_then_looks_at_the_picture() -> None:
-    encoder = Encoder(3, (4, 4, 4))
+def test_one_with_layers_starts_from_its_constant_and_then_looks_at_the_picture() -> None:
+    encoder = Encoder(3)
     encoder.set_prior(torch.tensor([0.2, 0.3, 0.5]))
-    encoder.enabled = True
+    encoder.add_layers((4, 4, 4))
     torch.testing.assert_close(encoder(images()), torch.tensor([[0.2, 0.3, 0.5]] * 2))
     with torch.no_grad():
         for parameter in encoder.parameters():
@@ -31,7 +31,7 @@ def test_an_enabled_one_starts_from_its_constant_and_then_looks_at_the_picture()
 
 
 def test_an_atom_of_no_weight_can_come_back() -> None:
-    encoder = Encoder(2, (4, 4, 4))
+    encoder = Encoder(2)
     encoder.set_prior(torch.tensor([1.0, 0.0]))
     weights = encoder(images()[:, :2])
     assert (weights[:, 1] > 0).all() and (weights[:, 1] < 1e-5).all()

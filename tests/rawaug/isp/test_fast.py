@@ -9,6 +9,7 @@ from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading, ToneMap
 from rawaug.isp.stages import place_in_frame
 from rawaug.isp.unbaked import UnbakedISP, reverse_pass
 from rawaug.kernels import compiled
@@ -21,9 +22,12 @@ def curved_isp(**settings: object) -> DictionaryISP:
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings))  # type: ignore[arg-type]
     with torch.no_grad():
         isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-        for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):
-            list(network.parameters())[-2].normal_(std=0.05, generator=generator)
-    isp.shading.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+        if tone := isp.find(ToneMap):
+            list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
+        if lens := isp.find(LensShading):
+            lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+            if lens.reverse_attention:
+                list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
     return isp
 
 
@@ -92,7 +96,7 @@ def test_choice_is_that_of_the_isp(looks: bool) -> None:
     generator = torch.Generator().manual_seed(2)
     isp = curved_isp(encoders=looks)
     with torch.no_grad():
-        for encoder in (isp.reverse_networks.colour_encoder, isp.reverse_networks.gain_encoder):
+        for encoder in (isp.reverse_encoders.colour, isp.reverse_encoders.gain) if looks else ():
             list(encoder.parameters())[-2].normal_(std=5.0, generator=generator)
     srgb = torch.randint(256, (3, 3, 150, 200), generator=generator, dtype=torch.uint8)
     chosen, expected = BakedISP(isp).choose(srgb), isp.choose(srgb)
@@ -116,7 +120,7 @@ def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
     baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
     with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
         baked(torch.zeros(2, 3, 8, 7), params)
-    with pytest.raises(ValueError, match="matrix is for 2 pictures, the batch has 3"):
+    with pytest.raises(ValueError, match="matrix is for 2 pictures, but the batch has 3"):
         baked(torch.zeros(3, 3, 8, 8), params)
     with pytest.raises(ValueError, match="place is for 1 pictures"):
         baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))

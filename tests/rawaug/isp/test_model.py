@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
 
+from rawaug.files import WEIGHTS, read_tensors, write_tensors
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import place_in_frame
@@ -24,8 +29,8 @@ def count(isp: DictionaryISP) -> int:
 
 
 def test_sizes_stay_within_the_published_ones() -> None:
-    assert 0.45e6 < count(DictionaryISP()) <= 0.59e6
-    assert count(DictionaryISP(SMALL)) <= 0.2e6
+    assert 0.45e6 < count(DictionaryISP(ISPConfig(encoders=True))) <= 0.59e6
+    assert count(DictionaryISP(replace(SMALL, encoders=True))) <= 0.2e6
 
 
 def test_reverse_gives_a_mosaic_and_the_intermediates(srgb: torch.Tensor) -> None:
@@ -77,7 +82,7 @@ def test_a_few_raw_samples_give_the_gains(srgb: torch.Tensor) -> None:
 
 def test_shading_depends_on_the_place_in_the_frame(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
-    isp.shading.set(torch.zeros(2), torch.eye(2))
+    cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
     centre = isp.reverse(srgb, place=place_in_frame(32, 48, (1000, 1500), (2032, 3048))).raw
     corner = isp.reverse(srgb, place=place_in_frame(32, 48, (0, 0), (2032, 3048))).raw
     assert 0.55 < (corner.mean() / centre.mean()).item() < 0.65  # exp(-1/2) at the corner
@@ -87,18 +92,30 @@ def test_stages_can_be_left_out(srgb: torch.Tensor) -> None:
     kept = tuple(stage for stage in POINTWISE_STAGES if stage != "gains")
     result = DictionaryISP(ISPConfig(stages=kept)).reverse(srgb, intermediates=True)
     assert list(result.intermediates) == ["x1", "x2", "x3", "x5"]
-    with pytest.raises(ValueError, match="bogus"):
-        ISPConfig(stages=("tone", "bogus"))
+    with pytest.raises(ValueError, match="'bogus' is unknown; choose of tone gamma colour gains shading"):
+        DictionaryISP(ISPConfig(stages=("tone", "bogus")))
 
 
 def test_encoders_look_at_the_picture_only_when_enabled(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
-    with torch.no_grad():
-        for parameter in isp.reverse_networks.gain_encoder.layers[-1].parameters():
-            parameter.normal_(generator=torch.Generator().manual_seed(0))
     assert torch.equal(*isp.choose(srgb).gain_weights)
     isp.use_encoders(True)
+    layers = isp.reverse_encoders.gain.layers
+    assert layers is not None
+    with torch.no_grad():
+        for parameter in layers[-1].parameters():
+            parameter.normal_(generator=torch.Generator().manual_seed(0))
     assert not torch.equal(*isp.choose(srgb).gain_weights)
+    isp.use_encoders(False)
+    assert torch.equal(*isp.choose(srgb).gain_weights)
+
+
+def test_what_is_off_is_neither_in_the_module_nor_in_the_file(tmp_path: Path) -> None:
+    isp = DictionaryISP(ISPConfig(stages=("tone", "gamma", "colour", "gains"), attention=False))
+    assert not [name for name in isp.state_dict() if "shading" in name or ("encoders" in name and "prior" not in name)]
+    assert count(isp) < 6000
+    isp.save(tmp_path / "camera.safetensors")
+    assert (tmp_path / "camera.safetensors").stat().st_size < 40_000
 
 
 @pytest.mark.parametrize("shape", [(3, 32, 32), (1, 4, 32, 32)])
@@ -119,55 +136,115 @@ def test_a_file_holds_the_whole_isp(tmp_path: Path, srgb: torch.Tensor) -> None:
 
 
 def test_files_that_are_not_isps_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nobody: no such weights.*universal"):
+    with pytest.raises(FileNotFoundError, match=r"nobody: not found.*universal"):
         DictionaryISP.from_pretrained("nobody")
     (tmp_path / "cut.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(ValueError, match=r"cut\.safetensors"):
         DictionaryISP.from_pretrained(tmp_path / "cut.safetensors")
 
 
+OLD = {
+    "stages.shading.mask.": "shading.",
+    "stages.tone.{}_network.": "{}_networks.tone.",
+    "stages.gamma.{}_gamma": "{}_networks.gamma",
+    "stages.shading.{}_attention.": "{}_networks.attention.",
+    "{}_encoders.colour.": "{}_networks.colour_encoder.",
+    "{}_encoders.gain.": "{}_networks.gain_encoder.",
+}
+"""Beginnings of names now, and in files of version 0.1."""
+
+
+def old_file(isp: DictionaryISP, path: Path) -> None:
+    """Write ``isp`` as version 0.1 did: what is off is in the file, untrained, and the names are others."""
+    whole = DictionaryISP(replace(isp.config, stages=POINTWISE_STAGES, attention=True, encoders=True), seed=9)
+    state = {}
+    for key, value in (whole.state_dict() | isp.state_dict()).items():
+        names = {new.format(d): old.format(d) for new, old in OLD.items() for d in ("reverse", "forward")}
+        begins = next((new for new in names if key.startswith(new)), None)
+        state[key if begins is None else names[begins] + key.removeprefix(begins)] = value
+    write_tensors(state, {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(isp.config))}, path)
+
+
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    "settings",
+    [
+        {},
+        {"stages": ("tone", "gamma", "colour", "gains"), "attention": False},
+        {"encoders": True, "attention": False},
+        {"stages": ("gamma", "gains", "colour")},
+    ],
+)
+def test_older_files_load_without_what_is_off(tmp_path: Path, srgb: torch.Tensor, settings: dict[str, Any]) -> None:
+    isp = DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=5, encoder_widths=(4, 4, 4), **settings), seed=1)
+    with torch.no_grad():
+        for parameter in isp.parameters():
+            parameter.add_(0.02 * torch.rand(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    old_file(isp, tmp_path / "old.safetensors")
+    loaded = DictionaryISP.from_pretrained(tmp_path / "old.safetensors")
+    assert loaded.state_dict().keys() == isp.state_dict().keys()
+    raw = isp.reverse(srgb).raw
+    assert torch.equal(loaded.reverse(srgb).raw, raw)
+    assert torch.equal(loaded.forward(raw).srgb, isp.forward(raw).srgb)
+    loaded.save(tmp_path / "new.safetensors")
+    assert torch.equal(DictionaryISP.from_pretrained(tmp_path / "new.safetensors").reverse(srgb).raw, raw)
+
+
+def test_the_shipped_isps_are_small_and_hold_only_what_is_on() -> None:
+    files = sorted(WEIGHTS.glob("*.safetensors"))
+    assert len(files) == 4 and sum(file.stat().st_size for file in files) < 400_000
+    for file in files:
+        assert set(read_tensors(file, "")[1]) == set(DictionaryISP.from_pretrained(file).state_dict())
+
+
+def test_loading_an_isp_does_not_import_the_compiler() -> None:
+    code = "import sys; from rawaug import DictionaryISP; import torch; before = set(sys.modules); "
+    code += "DictionaryISP.from_pretrained('universal'); print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not [name for name in done.stdout.split() if name.startswith(("torch._dynamo", "torch._decomp"))]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
     [
         ('"colour_atoms\\": 3', '"colour_atoms\\": 9', "tensor colour.* does not fit its configuration"),
         ('"gain_atoms\\": 5,', '"gain_atomz\\": 5,', "its configuration is damaged .*gain_atomz"),
         ('"cfa\\": \\"RGGB', '"cfa\\": \\"RGGG', "its configuration is damaged"),
-        ("reverse_networks.gamma", "reverse_networks.gumma", "tensor reverse_networks.gamma does not fit"),
+        ("stages.gamma.reverse_gamma", "stages.gamma.reverse_gumma", "tensor stages.gamma.reverse_gamma does not fit"),
     ],
 )
-def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, told: str) -> None:
+def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, message: str) -> None:
     path = tmp_path / "camera.safetensors"
     DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=5, encoder_widths=(4, 4, 4))).save(path)
     content = path.read_bytes()
     assert before.encode() in content
     path.write_bytes(content.replace(before.encode(), after.encode()))
-    with pytest.raises(ValueError, match=told) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         DictionaryISP.from_pretrained(path)
     assert "camera.safetensors" in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
-        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance is positive"),
-        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance is positive"),
-        ({"digital_gain": 0.0}, "digital_gain is positive"),
+        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
+        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance must be positive"),
+        ({"digital_gain": 0.0}, "digital_gain must be positive"),
         ({"raw_samples": torch.zeros(2, 0, 3)}, "row, column, value"),
-        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "not a number"),
+        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "NaN"),
     ],
 )
-def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         DictionaryISP().reverse(srgb, **given)
 
 
 def test_pictures_out_of_range_and_parameters_of_others_are_refused(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
-    with pytest.raises(ValueError, match="a float picture is in"):
+    with pytest.raises(ValueError, match="a float picture must be in"):
         isp.reverse(255.0 * srgb)
-    with pytest.raises(ValueError, match="uint8, or float32"):
+    with pytest.raises(ValueError, match="uint8 or float32"):
         isp.reverse(srgb.double())
-    with pytest.raises(ValueError, match="the parameters are those of 1 pictures, the batch has 2"):
+    with pytest.raises(ValueError, match="the parameters are for 1 pictures, but the batch has 2"):
         isp.reverse(srgb, isp.choose(srgb[:1]))
 
 
@@ -187,15 +264,15 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"stages": ("tone", "tone")}, "at most once"),
         ({"stages": ()}, "stages: none"),
-        ({"encoder_widths": (8, 8)}, "are three"),
-        ({"knee": 1.0}, "knee is in"),
+        ({"encoder_widths": (8, 8)}, "must be three"),
+        ({"knee": 1.0}, "knee must be in"),
         ({"gain_atoms": 0}, "at least 1"),
     ],
 )
-def test_impossible_configurations_are_refused(settings: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_impossible_configurations_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         ISPConfig(**settings)

@@ -1,16 +1,18 @@
-"""Run by test_kernels.py in a process of its own, where Triton's kernels are taken step by step on the CPU."""
+"""Run by test_fallback.py as a script, with TRITON_INTERPRET=1: Triton's kernels step by step on the CPU."""
 
 from __future__ import annotations
 
 import os
+from itertools import product
 from typing import Any
+from unittest import mock
 
-import pytest
 import torch
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import LensShading, ToneMap
 from rawaug.kernels import fallback, noise_numba, raw_torch
 from rawaug.kernels import noise_triton as noise_kernel
 from rawaug.kernels import raw_triton as raw_kernel
@@ -25,16 +27,17 @@ def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
     generator = torch.Generator().manual_seed(0)
     isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings)).requires_grad_(False)
     isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-    for network in (isp.reverse_networks.tone, isp.reverse_networks.attention):
-        list(network.parameters())[-2].normal_(std=0.05, generator=generator)
-    isp.shading.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+    if tone := isp.find(ToneMap):
+        list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
+    if lens := isp.find(LensShading):
+        lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
+        if lens.reverse_attention:
+            list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
     return BakedISP(isp)._camera(srgb, isp.choose(srgb), place)
 
 
-@pytest.mark.parametrize("settings", [{}, {"attention": False}, {"stages": ("tone", "colour", "gains")}])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_the_raw_is_that_of_pytorch(settings: dict[str, Any], dtype: torch.dtype) -> None:
+def check_raw(settings: dict[str, Any], dtype: torch.dtype) -> None:
     srgb = torch.randint(256, (2, 3, 18, 34), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     srgb = srgb if dtype == torch.uint8 else srgb / 255.0
     camera = camera_of(srgb, **settings)
@@ -43,8 +46,7 @@ def test_the_raw_is_that_of_pytorch(settings: dict[str, Any], dtype: torch.dtype
     assert raw.max() == torch.tensor(0.3)
 
 
-@pytest.mark.parametrize("white", [1.0, float("inf")])
-def test_the_noise_is_that_of_the_cpu(white: float) -> None:
+def check_noise(white: float) -> None:
     clean = 1.3 * torch.rand(2, 4, 40, 70, generator=torch.Generator().manual_seed(0)) - 0.1
     levels, keys = torch.tensor([[1e-2, 1e-3], [1e-3, 0.0]]), [2**64 - 5, 123456789012345]
     ours = noise_kernel.shot_read(clean, levels, keys, white, True)
@@ -53,7 +55,7 @@ def test_the_noise_is_that_of_the_cpu(white: float) -> None:
     assert noise_kernel.shot_read(clean, levels, keys, white, False)[1].numel() == 0
 
 
-def test_noise_and_raw_take_the_kernels_where_they_are_usable(monkeypatch: pytest.MonkeyPatch) -> None:
+def check_kernels_are_used() -> None:
     model, clean = ShotReadNoise(FixedLevels(1e-3, 1e-5)), torch.rand(1, 4, 8, 8)
     isp, srgb = BakedISP(DictionaryISP()), torch.rand(1, 3, 16, 16)
     params, chosen = model.sample(1, torch.Generator().manual_seed(0)), isp.choose(srgb)
@@ -64,7 +66,19 @@ def test_noise_and_raw_take_the_kernels_where_they_are_usable(monkeypatch: pytes
         asked.append(image.shape)
         return True
 
-    monkeypatch.setattr(fallback, "usable", usable)
-    torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
+    with mock.patch.object(fallback, "usable", usable):
+        torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
     assert asked == [clean.shape, srgb.shape] and not fallback._refused
+
+
+if __name__ == "__main__":
+    cameras: list[dict[str, Any]] = [{}, {"attention": False}, {"stages": ("tone", "colour", "gains")}]
+    for settings, dtype in product(cameras, (torch.uint8, torch.float32)):
+        check_raw(settings, dtype)
+        print("raw")
+    for white in (1.0, float("inf")):
+        check_noise(white)
+        print("noise")
+    check_kernels_are_used()
+    print("used")

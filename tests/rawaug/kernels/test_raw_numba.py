@@ -12,17 +12,18 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.kernels import raw_numba
-from rawaug.kernels.raw_torch import Camera, frame_of, look_up, unprocess
+from rawaug.kernels.raw_torch import Camera, frame_of, look_up, through_curves, unprocess
 
 NODES = 9
 
 
-def camera(batch: int, attention: bool, shading: bool, seed: int = 0) -> Camera:
+def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0) -> Camera:
     generator = torch.Generator().manual_seed(seed)
     table = torch.rand(NODES, NODES, NODES, 4, generator=generator)
     frames = [frame_of([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
     return Camera(
-        table=table,
+        table=torch.empty(0, 0, 0, 4) if entries else table,
+        curves=torch.rand(batch, entries, generator=generator).sort(dim=1).values,
         attention=2.0 * table.flip(0) if attention else torch.empty(0, 0, 0, 4),
         colour=torch.rand(batch, 6, 3, generator=generator),
         knee=0.9,
@@ -52,6 +53,39 @@ def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float)
         torch.testing.assert_close(
             raw_numba.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0
         )
+
+
+@pytest.mark.parametrize("entries", [256, 2041])
+@pytest.mark.parametrize("all_stages", [False, True])
+def test_curves_by_picture_are_the_same_pass(entries: int, all_stages: bool) -> None:
+    srgb, setting = pictures(3, 3, 6, 1100), camera(3, all_stages, all_stages, entries=entries)
+    for x in (srgb, srgb / 255.0):
+        expected = unprocess(x, setting, 0.9)
+        torch.testing.assert_close(raw_numba.unprocess(x, setting, 0.9), expected, atol=1e-5, rtol=0)
+        assert torch.equal(
+            raw_numba.unprocess(x[1:2], one_of(setting, 1), 0.9)[0], raw_numba.unprocess(x, setting, 0.9)[1]
+        )
+
+
+def test_a_curve_has_every_code_of_a_byte() -> None:
+    curve = torch.linspace(0.0, 1.0, 2041)[None] ** 2
+    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16)
+    torch.testing.assert_close(through_curves(curve[:, ::8], codes).flatten(), curve[0, ::8], atol=0, rtol=0)
+    torch.testing.assert_close(through_curves(curve, codes).flatten(), curve[0, ::8])
+    between = through_curves(
+        curve,
+        torch.tensor(
+            [
+                [[[0.0, 100.25 / 2040]]],
+            ]
+        ),
+    )
+    torch.testing.assert_close(between.flatten()[1], curve[0, 100] + 0.25 * (curve[0, 101] - curve[0, 100]))
+
+
+def one_of(setting: Camera, picture: int) -> Camera:
+    own = slice(picture, picture + 1)
+    return setting._replace(curves=setting.curves[own], colour=setting.colour[own], frame=setting.frame[own])
 
 
 @settings(max_examples=20, deadline=None)

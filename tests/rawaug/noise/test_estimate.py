@@ -111,7 +111,7 @@ def test_levels_too_near_white_are_left_out() -> None:
 
 
 def test_smoothed_levels_are_left_out() -> None:
-    """A codec that smooths the blue plane: the others tell the noise."""
+    """A codec that smooths the blue plane: the others show the noise."""
     packed = shoot(scene(2), 1e-3, 1e-5, 2)
     planes = packed.clone()
     blue = planes[..., 1::2, 0::2]  # of GRBG
@@ -130,7 +130,7 @@ def test_known_read_noise_is_kept() -> None:
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
 
 
-def test_dark_frames_tell_banding_black_level_and_ignore_hot_pixels() -> None:
+def test_dark_frames_show_banding_black_level_and_ignore_hot_pixels() -> None:
     def dark(seed: int) -> Tensor:
         clean = torch.tensor([1e-3, 2e-3, -1e-3, 0.0])[None, :, None, None].expand(1, 4, 512, 256)
         for model in (ShotReadNoise(FixedLevels(0, 1e-5)), RowNoise(2e-6), DefectPixels(0, 1e-3), Quantisation(14)):
@@ -152,13 +152,13 @@ def test_dark_frames_tell_banding_black_level_and_ignore_hot_pixels() -> None:
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        (torch.rand(1, 3, 64, 64), "a mosaic has shape"),
-        (torch.rand(2, 1, 64, 64), "a mosaic has shape"),
+        (torch.rand(1, 3, 64, 64), "a mosaic must have shape"),
+        (torch.rand(2, 1, 64, 64), "a mosaic must have shape"),
         (torch.rand(1, 8, 8), "too small"),
         (torch.rand(1, 32, 32), "too few blocks"),
         (torch.ones(1, 512, 512), "too few blocks"),
         (torch.zeros(1, 512, 512), "too few"),
-        (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "all of one brightness"),
+        (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "of the same brightness"),
     ],
 )
 def test_frames_without_the_answer_are_refused(frame: Tensor, message: str) -> None:
@@ -187,7 +187,7 @@ def test_gopro_file_agrees_with_its_noise_profile(camera_files: Path) -> None:
     """The codec smooths: most of B, and the highlights of all colours, are left out; G and R lie 12 % below the tag.
 
     The tag's read variance is shot_var / 3200 in every GoPro file, not a measurement; the estimate is 1.8 times that.
-    Its bound is loose, as the file does not tell it: the codec's steps are twice the noise, and the halves of the frame
+    Its bound is loose, as the file lacks it: the codec's steps are twice the noise, and the halves of the frame
     give 0.5 to 4.9 times the tag.
     """
     path = camera_files / "raw" / "gopro" / "hero6_0024.dng"

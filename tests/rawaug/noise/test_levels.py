@@ -54,7 +54,7 @@ def test_presets_follow_their_published_law(name: str) -> None:
     assert stats.kstest((residual / sigma).numpy(), "norm").pvalue > 1e-3
 
 
-def test_natural_and_base_10_logarithms_are_told_apart() -> None:
+def test_natural_and_base_10_logarithms_are_reported_apart() -> None:
     """The same constants in base 10 give 10^1.2 / e^1.2 = 4.8 times the read variance, at the median."""
     (_, upi), (_, dnd) = draw(Preset("upi")), draw(Preset("cycleisp_dnd"))
     assert dnd.median() / upi.median() == pytest.approx(10**1.2 / math.e**1.2, rel=0.05)
@@ -125,6 +125,8 @@ def test_an_iso_outside_the_measured_range_is_refused(name: str) -> None:
 
 def test_noise_by_name() -> None:
     known = noise_names()
+    models, known = known[:2], known[2:]
+    assert models == ["EldNoise", "SensorNoise"]
     assert camera_names() == known[4:15] and known[15] == "any camera" and len(known) == 4 + 5 + 1 + 5 + 1 + 369
     for name in known[:20]:
         assert type(noise_model(name)) is ShotReadNoise

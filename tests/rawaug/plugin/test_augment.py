@@ -89,19 +89,19 @@ def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
 def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
     with pytest.raises(ValueError, match="convex, perturb, chosen"):
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="lowest and the highest in stops"):
+    with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
         RawAugment(isp, exposure=(1.0, -1.0))
 
 
 def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
-    with pytest.raises(ValueError, match="3 pictures, the batch has 2"):
+    with pytest.raises(ValueError, match="3 pictures, but the batch has 2"):
         augment.apply(srgb[:2], augment.sample(srgb))
 
 
 def test_module_apply_still_visits_modules(augment: RawAugment) -> None:
     seen: list[nn.Module] = []
     nn.Sequential(augment).apply(seen.append)
-    assert augment.isp in seen
+    assert augment in seen and augment.isp in seen
 
 
 @pytest.mark.parametrize("form", ["nhwc", "numpy", "list", "pil list"])
@@ -203,3 +203,37 @@ def test_any_order_of_stages_makes_pairs(srgb: Tensor) -> None:
 def test_a_negative_index_names_the_pictures_too(augment: RawAugment, srgb: Tensor, key: int) -> None:
     labels, pair = augment((["a", "b"], srgb), key=key)
     assert labels == ["a", "b"] and isinstance(pair, RawPair)
+
+
+def test_the_caller_s_isp_stays_as_it_is() -> None:
+    isp = DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)).train()
+    augment = RawAugment(isp)
+    assert isp.training and all(p.requires_grad for p in isp.parameters())
+    assert not augment.isp.training and not any(t.requires_grad for t in [*augment.parameters(), *augment.buffers()])
+    srgb = torch.full((1, 3, 8, 8), 0.5)
+    before = augment(srgb, torch.Generator().manual_seed(0)).clean
+    with torch.no_grad():
+        isp.colour.matrices.mul_(torch.tensor([1.0, 2.0, 3.0]))
+    assert torch.equal(augment(srgb, torch.Generator().manual_seed(0)).clean, before)
+
+
+@pytest.mark.parametrize("order", [("tone", "gamma", "colour", "gains", "shading"), ("gamma", "gains", "colour")])
+def test_an_augmentation_adds_nothing_to_the_state_of_a_network(srgb: Tensor, order: tuple[str, ...]) -> None:
+    isp = DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3, stages=order))
+    network = nn.ModuleDict({"augment": RawAugment(isp), "layer": nn.Linear(2, 2)})
+    own = {"layer.weight", "layer.bias"}
+    assert set(network.state_dict()) == own == {name for name, _ in network.named_parameters()}
+    plain = {f"layer.{key}": value for key, value in nn.Linear(2, 2).state_dict().items()}
+    network.load_state_dict(plain, strict=True)
+    before = network["augment"](srgb, torch.Generator().manual_seed(0)).clean
+    older = {f"augment.{part}.{key}": v + 1 for part in ("isp", "baked") for key, v in isp.state_dict().items()}
+    network.load_state_dict(plain | older, strict=True)  # of a version that kept the ISP
+    assert torch.equal(network["augment"](srgb, torch.Generator().manual_seed(0)).clean, before)
+    with pytest.raises(RuntimeError, match=r"augment\.other"):
+        network.load_state_dict({**plain, "augment.other": torch.zeros(1)}, strict=True)
+
+
+def test_it_follows_the_network_to_a_device() -> None:
+    augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
+    assert nn.Sequential(augment).to("meta") and augment.device.type == "meta"
+    assert {t.device.type for t in augment.buffers()} == {"meta"}

@@ -149,7 +149,7 @@ def test_the_neighbours_loss_of_the_identity() -> None:
 
 def test_impossible_settings_are_refused() -> None:
     for make in (Noisier, R2R):
-        with pytest.raises(ValueError, match="alpha is positive"):
+        with pytest.raises(ValueError, match="alpha must be positive"):
             make(0.0)
     with pytest.raises(ValueError, match="gamma"):
         Neighbor2Neighbor(-1.0)

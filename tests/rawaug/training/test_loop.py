@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from rawaug.evaluation.scores import frozen_sample
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.training import loop
+from rawaug.training.estimators import Supervised
 from rawaug.training.stream import RealCrops, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.validation import Watched, validate
@@ -49,34 +51,65 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
     noisy = psnr(validation[0].noisy, validation[0].clean).item()
     assert validate(net, validation, torch.device("cpu"))["psnr"] > noisy + 2.0
-    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,samples_per_second"
+    assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,learning_rate,samples_per_second"
 
 
 def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
-    stream: TrainingStream, validation: list[Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path
 ) -> None:
     whole = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "whole", device="cpu")
 
     class Killed(Exception):
         pass
 
-    steps = 0
-    plain = loop.LOSSES["l1"]
+    class Dying(Supervised):
+        steps = 0
 
-    def dies(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        nonlocal steps
-        steps += 1
-        if steps == 8:  # after the checkpoint of step 5
-            raise Killed
-        return plain(a, b)
+        def loss(self, *arguments: Any) -> torch.Tensor:
+            self.steps += 1
+            if self.steps == 8:  # after the checkpoint of step 5
+                raise Killed
+            return super().loss(*arguments)
 
-    monkeypatch.setattr(loop, "LOSSES", {"l1": dies})
     with pytest.raises(Killed):
-        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
-    monkeypatch.setattr(loop, "LOSSES", {"l1": plain})
+        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu", estimator=Dying())
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path
+) -> None:
+    losses = []
+
+    class Noting(Supervised):
+        def loss(self, *arguments: Any) -> torch.Tensor:
+            losses.append(super().loss(*arguments))
+            return losses[-1]
+
+    for steps in (8, 12):  # the second run goes on from step 8, in the middle of a row
+        config = replace(CONFIG, steps=steps, schedule="step")
+        loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu", estimator=Noting(), choose=False)
+    rows = [line.split(",") for line in (tmp_path / "log.csv").read_text().splitlines()[1:]]
+    assert [int(row[0]) for row in rows] == [6, 8, 12]
+    for row, part in zip(rows, (losses[:6], losses[6:8], losses[8:]), strict=True):
+        assert float(row[1]) == pytest.approx(float(torch.stack(part).detach().mean()), rel=1e-4)
+        assert float(row[3]) == pytest.approx(3e-3)
+
+
+def test_a_large_validation_frame_is_seen_in_tiles() -> None:
+    seen = []
+
+    class Note(torch.nn.Module):
+        def forward(self, noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+            seen.append(max(noisy.shape[-2:]))
+            return noisy
+
+    frame = torch.rand(1, 4, 1500, 2000, generator=torch.Generator().manual_seed(0))  # 12 Mpix
+    sample = Watched(frame + 0.1, frame, torch.full_like(frame, 1e-3))
+    assert validate(Note(), [sample], torch.device("cpu"))["psnr"] == pytest.approx(20.0, abs=1e-3)
+    assert len(seen) > 1 and max(seen) <= 1536
 
 
 @pytest.mark.parametrize("choose", [True, False])
@@ -121,8 +154,8 @@ def test_torchrun_s_processes_count(tmp_path: Path) -> None:
         subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
         for rank in (0, 1)
     ]
-    told = "".join(node.communicate(timeout=120)[0] for node in nodes)
-    assert sorted(re.findall(r"\d of \d", told)) == [f"{rank} of 4" for rank in range(4)]
+    said = "".join(node.communicate(timeout=400)[0] for node in nodes)
+    assert sorted(re.findall(r"\d of \d", said)) == [f"{rank} of 4" for rank in range(4)]
 
 
 def test_the_rate_warms_up_and_falls() -> None:

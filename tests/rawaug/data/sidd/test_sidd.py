@@ -142,7 +142,7 @@ def test_small_has_no_number_in_its_names_and_what_is_held_back_is_left_out(tmp_
     assert SiddFrames(tmp_path).names == ["0001_001_IP_00100_00060_3200_L_010"]
 
 
-def test_incomplete_and_damaged_frames_are_told(tmp_path: Path, mat73: Writer) -> None:
+def test_incomplete_and_damaged_frames_are_reported(tmp_path: Path, mat73: Writer) -> None:
     name = "0001_001_IP_00100_00060_3200_L"
     write_scene(tmp_path, mat73, name, ("010",))
     gt = tmp_path / name / "0001_GT_RAW_010.MAT"
@@ -230,15 +230,15 @@ def test_wrong_submissions_are_refused(tmp_path: Path) -> None:
     block = torch.full((1, SIDE, SIDE), 0.5)
     with pytest.raises(ValueError, match="a submission must have 1280 blocks, got 3"):
         write_submission(tmp_path / "a.csv", [block] * 3, SIDE)
-    with pytest.raises(ValueError, match=r"block 1: a block has shape \(1, 256, 256\), got \(1, 8, 8\)"):
+    with pytest.raises(ValueError, match=r"block 1: must have shape \(1, 256, 256\), got \(1, 8, 8\)"):
         write_submission(tmp_path / "a.csv", [torch.zeros(1, 256, 256), block])
-    with pytest.raises(ValueError, match="block 0: holds values that are not finite"):
+    with pytest.raises(ValueError, match="block 0: has values that are not finite"):
         write_submission(tmp_path / "a.csv", [block * float("nan")], SIDE)
-    with pytest.raises(ValueError, match=r"is a \.csv or a \.mat file"):
+    with pytest.raises(ValueError, match=r"must be a \.csv or \.mat file"):
         write_submission(tmp_path / "a.npz", [block], SIDE)
     path = tmp_path / "a.csv"
     write_submission(path, [block * 3] * 1280, SIDE)
-    with pytest.raises(ValueError, match=r"values run from 1\.5 to 1\.5; clip them"):
+    with pytest.raises(ValueError, match=r"has values from 1\.5 to 1\.5; clip them"):
         check_submission(path, SIDE)
     write_submission(path, [block] * 1280, SIDE)
     lines = path.read_text().splitlines()
@@ -271,7 +271,7 @@ def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer
     assert len(open_pairs(f"sidd:{tmp_path}", split="train")) == 1 == len(open_pairs(f"sidd:{tmp_path}:train"))
     with pytest.raises(ValueError, match=r"no split validation; use train \(full frames\)"):
         open_pairs(f"sidd:{tmp_path}", split="validation")
-    with pytest.raises(FileNotFoundError, match=r"holds no ValidationGtBlocksRaw\.mat"):
+    with pytest.raises(FileNotFoundError, match=r"contains no ValidationGtBlocksRaw\.mat"):
         open_pairs(f"sidd:{tmp_path}")
-    with pytest.raises(ValueError, match="sidd:: say where the data are, sidd:PATH"):
+    with pytest.raises(ValueError, match="sidd:: has no path; write sidd:PATH"):
         open_pairs("sidd:")

@@ -8,7 +8,10 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.isp.baselines import BASELINES, CycleISP, InvertibleGrey, InvISP, ReverseISP, UNetISP
+from rawaug.isp.baselines import BASELINES, BaselineISP, CycleISP, InvertibleGrey, InvISP, UNetISP
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.reverse import ReverseISP
 
 SMALL: dict[str, dict[str, Any]] = {
     "upi": {},
@@ -20,7 +23,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-def small(name: str, cfa: CFA | str = "RGGB") -> ReverseISP:
+def small(name: str, cfa: CFA | str = "RGGB") -> BaselineISP:
     return BASELINES[name](cfa, **SMALL[name])
 
 
@@ -32,7 +35,7 @@ def test_every_method_is_covered() -> None:
 @pytest.mark.parametrize(
     ("method", "millions"), [(UNetISP, 11.77), (CycleISP, 3.14), (InvISP, 1.41), (InvertibleGrey, 0.74)]
 )
-def test_published_number_of_parameters(method: type[ReverseISP], millions: float) -> None:
+def test_published_number_of_parameters(method: type[BaselineISP], millions: float) -> None:
     with torch.device("meta"):
         assert method().reverse_parameters / 1e6 == pytest.approx(millions, abs=0.02)
 
@@ -67,19 +70,34 @@ def test_bad_pictures_are_refused(name: str) -> None:
             model.reverse(torch.rand(shape))
     with pytest.raises(ValueError, match=r"torch\.int32"):
         model.reverse(torch.zeros(1, 3, 8, 8, dtype=torch.int32))
-    with pytest.raises(ValueError, match="RAW only" if name == "unet" else "mosaic|reference"):
+    with pytest.raises(ValueError, match="only converts sRGB to RAW" if name == "unet" else "mosaic|reference"):
         model(torch.rand(1, 3, 8, 8) if name != "unet" else torch.rand(1, 1, 8, 8))
 
 
 def test_the_unet_says_that_it_does_not_render() -> None:
-    with pytest.raises(ValueError, match=r"unet goes from sRGB to RAW only; rawaug\.isp\.baselines lists"):
+    with pytest.raises(ValueError, match=r"unet only converts sRGB to RAW; rawaug\.isp\.baselines lists"):
         small("unet")(torch.rand(1, 1, 8, 8))
 
 
 @pytest.mark.parametrize("name", ["unet", "cycleisp", "invisp", "invgrey"])
 def test_weights_come_from_the_seed_alone(name: str) -> None:
     before = torch.get_rng_state()
-    first, same, other = (BASELINES[name](seed=seed, **SMALL[name]) for seed in (1, 1, 2))  # type: ignore[call-arg]
+    first, same, other = (BASELINES[name](seed=seed, **SMALL[name]) for seed in (1, 1, 2))
     assert torch.equal(before, torch.get_rng_state())
     states = [torch.cat([value.flatten() for value in model.state_dict().values()]) for model in (first, same, other)]
     assert torch.equal(states[0], states[1]) and not torch.equal(states[0], states[2])
+
+
+@pytest.mark.parametrize("name", ["dictionary", *BASELINES])
+def test_every_method_makes_raw_through_one_interface(name: str) -> None:
+    model = DictionaryISP(ISPConfig(cfa="GBRG")) if name == "dictionary" else small(name, "GBRG")
+    srgb = torch.rand(2, 3, 16, 20, generator=torch.Generator().manual_seed(0))
+    assert isinstance(model, ReverseISP) and model.name == name and model.cfa == CFA("GBRG") and model.info == {}
+    with torch.no_grad():
+        made = model.make(srgb)
+        drawn = [model.draw(srgb, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+        assert made.shape == drawn[0].shape == (2, 1, 16, 20)
+        assert torch.equal(drawn[0], drawn[1])
+        assert torch.equal(drawn[0], drawn[2]) == (name not in ("dictionary", "upi"))
+        if model.bidirectional:
+            assert model.cycle(srgb).shape == srgb.shape

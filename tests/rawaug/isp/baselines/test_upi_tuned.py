@@ -68,7 +68,7 @@ def test_no_round_raises_the_sum_of_logarithms() -> None:
     assert all(later <= earlier + 1e-9 for earlier, later in pairwise(losses))
 
 
-def test_the_moments_tell_the_error() -> None:
+def test_the_moments_give_the_error() -> None:
     samples, _ = sample_pixels([shot(0)], 4096, 0)
     moments = Moments.of(samples)
     product = torch.diag(1.0 / (1.3 * GAINS)) @ MATRIX

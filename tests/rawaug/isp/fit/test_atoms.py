@@ -58,7 +58,7 @@ def test_reach_atoms_are_corners_of_a_box_tetrahedron_first() -> None:
     torch.testing.assert_close(corners[:4].log().sum(0), torch.zeros(3))  # every four are about the mean
 
 
-def test_two_cameras_in_one_fit_are_told_apart_by_their_light(
+def test_two_cameras_in_one_fit_are_reported_apart_by_their_light(
     exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
 ) -> None:
     first = [exact_pair(f"a{k}", (1.5 + 0.05 * k, 1.0, 2.0 - 0.05 * k), k, camera="A") for k in range(3)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -50,8 +51,8 @@ def test_two_numbers_go_towards_the_curves_of_the_standards(
     """gamma 2.4 and toe 0.055 / 1.055 of sRGB, 1 / 0.45 and 0.099 / 1.099 of BT.709, along a flat valley."""
     pairs = [exact_pair(f"shot{k}", WB, k, curve=curve) for k in range(2)]
     isp = fit_isp(pairs, CURVE, progress=False)
-    toe = isp.reverse_networks.tone(torch.zeros(1, 3, 1, 1)).flatten()
-    assert gammas[0] < isp.reverse_networks.gamma < gammas[1]
+    toe = cast(Any, isp.stages["tone"]).reverse(torch.zeros(1, 3, 1, 1)).flatten()
+    assert gammas[0] < cast(Any, isp.stages["gamma"]).reverse_gamma < gammas[1]
     assert (toe > toes[0]).all() and (toe < toes[1]).all()
     assert error_db(isp, exact_pair("unseen", WB, 9, curve=curve)) > 55.0
 
@@ -83,7 +84,9 @@ def test_a_mask_is_kept_where_there_is_fall_off(exact_pair: Callable[..., Pair])
     with_mask = fit_isp(pairs, CURVE, progress=False)
     without = fit_isp(pairs, replace(CURVE, shading="off"), progress=False)
     assert "shading" in with_mask.config.stages and "shading" not in without.config.stages
-    torch.testing.assert_close(with_mask.shading.precision.diagonal(), torch.full((2,), 0.8), atol=0.1, rtol=0)
+    torch.testing.assert_close(
+        cast(Any, with_mask.stages["shading"]).mask.precision.diagonal(), torch.full((2,), 0.8), atol=0.1, rtol=0
+    )
     assert error_db(with_mask, unseen) > error_db(without, unseen) + 6.0
 
 
@@ -95,11 +98,13 @@ def test_content_that_goes_with_the_place_feigns_no_fall_off(exact_pair: Callabl
         colours = 0.7 + 0.3 * torch.rand(3, 96, 128, generator=torch.Generator().manual_seed(k))
         pairs.append(exact_pair(f"shot{k}", WB, k, curve=s_curve, picture=light * colours))
     on = fit_isp(pairs, replace(CURVE, shading="on"), progress=False)
-    assert on.shading.precision.diagonal().max() > 0.02  # it would take up what the curve cannot
+    assert cast(Any, on.stages["shading"]).mask.precision.diagonal().max() > 0.02
     auto = fit_isp(pairs, CURVE, progress=False)
     assert "shading" not in auto.config.stages
     off = fit_isp(pairs, replace(CURVE, shading="off"), progress=False)
-    assert torch.equal(auto.reverse_networks.gamma, off.reverse_networks.gamma)  # nothing of the trial is left
+    assert torch.equal(
+        cast(Any, auto.stages["gamma"]).reverse_gamma, cast(Any, off.stages["gamma"]).reverse_gamma
+    )  # nothing of the trial is left
 
 
 def test_a_tie_is_within_a_camera_and_bounded(exact_pairs: list[Pair], camera_matrix: torch.Tensor) -> None:

@@ -74,7 +74,7 @@ def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
     for damage in (b"", b"\x00" * 20, b"no state at all"):
         (tmp_path / "camera.state").write_bytes(damage)
         with pytest.raises(
-            ValueError, match=r"camera\.state: not a readable safetensors file.*delete this state of a stopped fit"
+            ValueError, match=r"camera\.state: not a readable safetensors file.*delete this state of an interrupted fit"
         ):
             Descent(tmp_path / "camera.state", "key", 0, False)
 

@@ -30,20 +30,20 @@ def config(wanted: str) -> FitConfig:
     return FitConfig(atoms=2, reach=1.0, steps=0, pixels=512, batch=64, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
 
 
-def frames(exact_pair: Callable[..., Pair], count: int, telling: bool) -> list[Pair]:
-    """Tiny frames in one of two lights. Brightness tells which, or says the contrary every other time."""
+def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:
+    """Tiny frames in one of two lights. Brightness shows which, or misleads every other time."""
     pairs = []
     for k in range(count):
         colours = torch.rand(3, 4, 4, generator=torch.Generator().manual_seed(k)).repeat_interleave(4, 1)
         light = k // 2 % 2
-        bright = light if telling or k % 2 else 1 - light
+        bright = light if informative or k % 2 else 1 - light
         picture = colours.repeat_interleave(4, 2) * 0.4 + (0.45 if bright else 0.15)
         pairs.append(exact_pair(f"shot{k}", LIGHTS[light], k, picture=picture))
     return pairs
 
 
 def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
-    pairs = frames(exact_pair, 4, telling=True)
+    pairs = frames(exact_pair, 4, informative=True)
     isp = fit_isp(pairs, config("on"), progress=False)
     assert isp.encoders_in_use and isp.config.encoders
     dark, bright = (isp.choose(pairs[k].srgb[None]).gains[0] for k in (0, 2))
@@ -53,17 +53,17 @@ def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
 
 
 def test_auto_leaves_the_constants_to_few_frames(exact_pair: Callable[..., Pair]) -> None:
-    isp = fit_isp(frames(exact_pair, 4, telling=True), config("auto"), progress=False)
+    isp = fit_isp(frames(exact_pair, 4, informative=True), config("auto"), progress=False)
     assert not isp.encoders_in_use and "encoders_gain_db" not in isp.info
 
 
-def test_auto_keeps_them_where_the_picture_tells_the_light(exact_pair: Callable[..., Pair]) -> None:
-    isp = fit_isp(frames(exact_pair, 12, telling=True), config("auto"), progress=False)
+def test_auto_keeps_them_where_the_picture_shows_the_light(exact_pair: Callable[..., Pair]) -> None:
+    isp = fit_isp(frames(exact_pair, 12, informative=True), config("auto"), progress=False)
     assert isp.encoders_in_use and isp.info["encoders_gain_db"] > 1.0
 
 
 def test_auto_drops_them_where_it_does_not(exact_pair: Callable[..., Pair]) -> None:
-    pairs = frames(exact_pair, 12, telling=False)
+    pairs = frames(exact_pair, 12, informative=False)
     isp = fit_isp(pairs, config("auto"), progress=False)
     assert not isp.encoders_in_use and isp.info["encoders_gain_db"] < -0.2
     off = fit_isp(pairs, config("off"), progress=False)

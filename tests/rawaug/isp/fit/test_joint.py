@@ -36,9 +36,9 @@ def test_the_watched_frame_gains(frames: list[Pair], monkeypatch: pytest.MonkeyP
     samples, shots = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
     before = decibels(isp, samples, shots, [0])
     joint.train_jointly(isp, samples, shots, replace(CONFIG, joint_steps=20), descent.Descent(None, "", 0, False))
-    gain, told = decibels(isp, samples, shots, [0]) - before, isp.info["joint"]
-    assert gain > 3.0 and told["gain_db"] == pytest.approx(gain, abs=0.006)
-    assert told["steps"] == 20 and told["kept_step"] in (5, 10, 15, 20)
+    gain, info = decibels(isp, samples, shots, [0]) - before, isp.info["joint"]
+    assert gain > 3.0 and info["gain_db"] == pytest.approx(gain, abs=0.006)
+    assert info["steps"] == 20 and info["kept_step"] in (5, 10, 15, 20)
 
 
 def test_where_every_step_is_worse_the_start_remains(frames: list[Pair], monkeypatch: pytest.MonkeyPatch) -> None:

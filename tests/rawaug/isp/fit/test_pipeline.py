@@ -44,7 +44,7 @@ def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -
     assert psnr(rendered, pair.srgb[None] / 255.0).item() > 33.0  # gamma alone: 25
 
 
-def test_the_isp_tells_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
+def test_the_isp_records_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
     assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0}
     assert str(fitted.cfa) == "GRBG" and not fitted.training
 
@@ -127,5 +127,5 @@ def test_settings_that_cannot_be_are_refused(exact_pairs: list[Pair]) -> None:
     for settings in ({"atoms": 0}, {"pixels": 0}, {"steps": -1}, {"reach": 0.9}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             FitConfig(**settings)
-    with pytest.raises(ValueError, match="gain_atoms is 20, but these frames call for 1 to 9"):
+    with pytest.raises(ValueError, match="gain_atoms is 20, but these frames need 1 to 9"):
         fit_isp(exact_pairs[:1], replace(TINY, isp={"gain_atoms": 20}), progress=False)

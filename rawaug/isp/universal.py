@@ -1,0 +1,175 @@
+"""The universal ISP, from published figures alone: ``python -m rawaug.isp.universal --out universal.safetensors``.
+
+Colour atoms are chosen greedily among the published cameras (:mod:`rawaug.isp.hull`), so that their hull holds as many
+of all of them as it can on the colours of the package's photographs. Tone atoms are the published curves, or as many of
+them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a picture's
+setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and light.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug.camera_names import spelled
+from rawaug.isp.camera_sampling import plausible
+from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.dictionary import CameraDictionary
+from rawaug.isp.hull import colour_coordinates, greedy_atoms, nearest_in_hull, psnr
+from rawaug.isp.light import sample_lights
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.tone_curves import STEPS, tone_names, tone_tables
+from rawaug.seeding import keyed_generator
+
+COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 0.0503))
+"""Second moment of linear sRGB: mean of the six photographs of :mod:`rawaug.data.demo`, every fourth row and column."""
+LIGHTS = 400
+"""Draws of camera and light that the gain atoms are chosen for."""
+STAGES = ("curve", "colour", "gains")
+
+
+class Choice(NamedTuple):
+    """Atoms among points: their indices, and weights whose mixture is nearest the points' mean."""
+
+    atoms: list[int]
+    typical: Tensor
+
+
+def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_atoms: int = 16) -> DictionaryISP:
+    """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB.
+
+    Args:
+        colour_atoms: N, cameras.
+        tone_atoms: K, curves; all that are published by default.
+        gain_atoms: M.
+    """
+    cameras, names, tables = published_cameras(), tone_names(), tone_tables()
+    distinct = cameras.distinct()
+    points = camera_points(distinct)
+    colour = chosen_atoms(points, colour_atoms)
+    tone = chosen_atoms(tone_points(tables), len(names) if tone_atoms is None else tone_atoms)
+    inverse = inverse_gains_in_any_light(distinct)
+    gain = chosen_atoms(inverse / 3**0.5, gain_atoms)
+    isp = DictionaryISP(
+        ISPConfig(
+            colour_atoms=len(colour.atoms),
+            gain_atoms=len(gain.atoms),
+            stages=STAGES,
+            tone_atoms=len(tone.atoms),
+            cameras=len(distinct),
+        )
+    )
+    assert isinstance(isp.colour, CameraDictionary) and isp.tone is not None
+    isp.colour.set_cameras(distinct[colour.atoms], nearest_in_hull(points, points[colour.atoms])[0])
+    isp.tone.curves.copy_(tables[tone.atoms])
+    isp.tone.typical.copy_(tone.typical)
+    with torch.no_grad():
+        isp.gain.log_gains.copy_(_triplets(1.0 / inverse[gain.atoms]).log())
+    for encoders in (isp.reverse_encoders, isp.forward_encoders):
+        encoders.colour.set_prior(isp.colour.typical)
+        encoders.gain.set_prior(gain.typical)
+    isp.info |= {
+        "cameras": [_name_of(distinct[index], cameras.names, cameras.xyz_to_camera) for index in colour.atoms],
+        "tones": [names[index] for index in tone.atoms],
+        "holds": {
+            "cameras": held(camera_points(cameras.xyz_to_camera), points[colour.atoms]),
+            "gains": held(inverse / 3**0.5, inverse[gain.atoms] / 3**0.5),
+            "tones": held(tone_points(tables), tone_points(tables[tone.atoms])),
+        },
+    }
+    return isp.eval()
+
+
+@torch.no_grad()
+def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
+    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones.
+
+    Raises:
+        ValueError: if one is not listed, or the ISP's atoms are no cameras.
+
+    Example:
+        >>> universal = DictionaryISP.from_pretrained("universal")
+        >>> len(of_cameras(universal, "Nikon D750").colour.atoms())
+        1
+    """
+    if not isinstance(isp.colour, CameraDictionary):
+        raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
+    listed = published_cameras()
+    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
+    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
+    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
+    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
+    narrowed.load_state_dict(kept | own)
+    assert isinstance(narrowed.colour, CameraDictionary)
+    narrowed.colour.set_cameras(listed.named(known), torch.eye(len(known)))
+    narrowed.info = {**isp.info, "cameras": known}
+    return narrowed.to(isp.colour.matrices.device).eval()
+
+
+def camera_points(xyz_to_camera: Tensor) -> Tensor:
+    """Cameras as points ``(N, 9)`` whose squared distance is the error of their linear colour on photographs."""
+    return colour_coordinates(colour_matrix(xyz_to_camera), torch.tensor(COLOURS))
+
+
+def tone_points(tables: Tensor) -> Tensor:
+    """Curves ``(K, 2041)`` as points ``(K, 256)`` whose squared distance is the mean squared error over all codes."""
+    return tables[:, ::STEPS].double() / 16.0
+
+
+def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gains") -> Tensor:
+    """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``."""
+    generator = keyed_generator(key)
+    camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (LIGHTS,), generator=generator)]
+    balance = white_balance(camera, sample_lights(LIGHTS, generator))
+    balance = balance[plausible(balance)]
+    return balance.amin(dim=1, keepdim=True) / balance
+
+
+def chosen_atoms(points: Tensor, count: int) -> Choice:
+    """As many atoms of ``points`` ``(P, D)``."""
+    atoms = list(range(len(points))) if count >= len(points) else greedy_atoms(points, count)
+    typical = nearest_in_hull(points.mean(dim=0, keepdim=True), points[atoms])[0][0]
+    return Choice(atoms, typical.float())
+
+
+def held(points: Tensor, atoms: Tensor, decibel: float = 45.0) -> float:
+    """Share of ``points`` within ``decibel`` of the hull of ``atoms``, to four digits."""
+    return round((psnr(nearest_in_hull(points, atoms)[1]) >= decibel).double().mean().item(), 4)
+
+
+def _of_colour(key: str) -> bool:
+    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
+
+
+def _triplets(gains: Tensor) -> Tensor:
+    """Channel gains ``(M, 3)`` as digital, red and blue gain."""
+    return torch.stack([gains[:, 1], gains[:, 0] / gains[:, 1], gains[:, 2] / gains[:, 1]], dim=1).float()
+
+
+def _name_of(matrix: Tensor, names: Sequence[str], matrices: Tensor) -> str:
+    """The first camera that has this matrix."""
+    return names[int((matrices == matrix).flatten(1).all(dim=1).nonzero()[0])]
+
+
+def main() -> None:
+    """Write the ISP and print what its hulls hold."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", required=True, help="the .safetensors file to write")
+    parser.add_argument("--atoms", type=int, default=10, help="colour atoms")
+    parser.add_argument("--tones", type=int, help="tone atoms; all curves by default")
+    parser.add_argument("--gains", type=int, default=16, help="gain atoms")
+    options = parser.parse_args()
+    isp = universal_isp(options.atoms, options.tones, options.gains)
+    isp.save(options.out)
+    for what, share in isp.info["holds"].items():
+        print(f"{what}: {share:.1%} within 45 dB")
+
+
+if __name__ == "__main__":
+    main()

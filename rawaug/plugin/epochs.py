@@ -1,0 +1,190 @@
+"""The epoch that a draw belongs to, where nobody announces it.
+
+A DataLoader does not say to its Dataset that a new pass begins, neither in the main process nor in workers. So draws
+are counted where they are made:
+
+- of a picture with an index, ``epoch = number of earlier visits of this picture`` (:class:`Visits`). In a pass that
+  visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order;
+- of a stream, ``epoch = number of earlier passes``, of which each worker counts its own beginnings (:class:`Passes`).
+
+The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
+by the one worker that has the picture, so no lock is needed, which no two start methods would share. ``pin`` replaces the count by a fixed epoch: a draw
+is then a pure function of (seed, epoch, index).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rawaug.plugin.shares import world_size
+from rawaug.seeding import rank_key
+
+_COUNTED = -1
+"""The pinned epoch, where none is pinned."""
+
+MAX_WORKERS = 128
+"""Workers of a loader whose passes can be counted."""
+
+
+class _Epochs:
+    """Counts in shared memory, and an epoch that may be pinned instead."""
+
+    def __init__(self, *shape: int) -> None:
+        self._pinned = torch.full((1,), _COUNTED).share_memory_()
+        self._counts = torch.zeros(shape, dtype=torch.int32).share_memory_()
+        self._rank: tuple[int, ...] = ()
+
+    @property
+    def pinned(self) -> int | None:
+        """The pinned epoch, None while epochs are counted."""
+        epoch = int(self._pinned)
+        return None if epoch == _COUNTED else epoch
+
+    def pin(self, epoch: int) -> None:
+        """All draws belong to ``epoch`` from now on.
+
+        Raises:
+            ValueError: if the epoch is negative.
+        """
+        if epoch < 0:
+            raise ValueError(f"an epoch is at least 0, got {epoch}")
+        self._pinned[0] = epoch
+
+    def rank(self) -> tuple[int, ...]:
+        """:func:`rawaug.seeding.rank_key`; in a spawned worker, which is no part of the process group, the parent's."""
+        return rank_key() or self._rank
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_rank": self.rank()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for value in state.values():
+            if isinstance(value, Tensor):
+                value.share_memory_()  # an unpickled copy is not shared with its own workers; in a worker it is already
+
+    def _check(self, state: dict[str, Any], *names: str) -> None:
+        if set(state) != {"epoch", *names}:
+            raise ValueError(f"a state has epoch, {', '.join(names)}; got {', '.join(map(str, state)) or 'nothing'}")
+        self._pinned[0] = _COUNTED if state["epoch"] is None else state["epoch"]
+
+
+class Visits(_Epochs):
+    """Epochs of pictures that are asked for by index.
+
+    A picture that is drawn with replacement counts each time. Which of two workers is first is then left to chance, and
+    at the same moment both may read the same count. A pass that is broken off counts what its workers had fetched
+    ahead. In a distributed run the processes take turns with a picture, so counted draws also have the rank as a key.
+
+    Args:
+        size: number of pictures.
+
+    Example:
+        >>> visits = Visits(3)
+        >>> [visits.key(i) for i in (0, 1, 0)]
+        [(0, 0), (0, 1), (1, 0)]
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+
+    def key(self, index: int) -> tuple[int, ...]:
+        """Count a visit of picture ``index``; epoch, index and rank, which key its draw."""
+        if self.pinned is not None:
+            return (self.pinned, index)
+        if index >= len(self._counts):
+            raise ValueError(
+                f"the dataset has grown from {len(self._counts)} pictures since RawPairs was made of it; make it anew"
+            )
+        visit = int(self._counts[index])
+        self._counts[index] = visit + 1
+        return (visit, index, *self.rank())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The pinned epoch, and the visits of each picture.
+
+        Processes of a distributed run share one checkpoint, so there each picture has the number of passes.
+        """
+        return {"epoch": self.pinned, "visits": self._shared_by_ranks(self._counts.clone())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state``.
+
+        Raises:
+            ValueError: if it is none, or that of another number of pictures.
+        """
+        visits = torch.as_tensor(state.get("visits", ()))
+        if "visits" in state and visits.shape != self._counts.shape:
+            raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
+        self._check(state, "visits")
+        self._counts.copy_(visits)
+
+    @staticmethod
+    def _shared_by_ranks(visits: Tensor) -> Tensor:
+        world = world_size()
+        if world == 1 or not len(visits):
+            return visits
+        return torch.full_like(visits, math.ceil(world * int(visits.sum()) / len(visits)))
+
+
+class Passes(_Epochs):
+    """Epochs of a stream: its passes, and where a resumed one goes on.
+
+    Worker w of W has a count of its own, in row W; the passes with other numbers of workers are those that their first
+    worker has begun. Row 0 is the main process.
+
+    Example:
+        >>> passes = Passes()
+        >>> [passes.begin(0, 0), passes.begin(2, 0), passes.begin(2, 1), passes.begin(0, 0)]
+        [(0, 0), (1, 0), (1, 0), (2, 0)]
+    """
+
+    def __init__(self) -> None:
+        super().__init__(MAX_WORKERS + 1, MAX_WORKERS)
+        self._resumed = torch.tensor([-1, 0]).share_memory_()  # a pass, and the number of its first sample
+        self._running: tuple[int, int] | None = None  # in this process: the pass, and the number of the next sample
+
+    def begin(self, workers: int, worker: int) -> tuple[int, int]:
+        """Count a pass of a worker; its epoch, and the number of the first sample."""
+        if workers > MAX_WORKERS:
+            raise ValueError(f"a stream counts the passes of at most {MAX_WORKERS} workers, got {workers}")
+        started = int(self._counts[workers, worker] + self._counts[:, 0].sum() - self._counts[workers, 0])
+        self._counts[workers, worker] += 1
+        resumed, first = self._resumed.tolist()
+        start = first if started == resumed else 0
+        self._running = (started, start)
+        return (started if self.pinned is None else self.pinned), start
+
+    def at(self, number: int) -> None:
+        """The sample that comes next in this process."""
+        if self._running is not None:
+            self._running = (self._running[0], number)
+
+    def end(self) -> None:
+        """The pass of this process is over."""
+        self._running = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """The pinned epoch, the passes that are over, and the number of the next sample.
+
+        Within a pass of this process it goes on with that sample. Of a pass that workers are in the middle of, the main
+        process does not know how far it has come: the state is then that of the next one.
+        """
+        started, position = self._running or (int(self._counts[:, 0].sum()), 0)
+        return {"epoch": self.pinned, "passes": started, "position": position}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state``.
+
+        Raises:
+            ValueError: if it is none.
+        """
+        self._check(state, "passes", "position")
+        self._counts.zero_()
+        self._counts[0, 0] = state["passes"]
+        self._resumed.copy_(torch.tensor([state["passes"], state["position"]]))
+        self._running = None

@@ -1,0 +1,225 @@
+"""What one file adds: networks, filters, noise, datasets, estimators, losses, baselines and commands, by name.
+
+A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name;
+so is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
+when a name is first asked for, an entry point when its own name is: importing this module loads nothing.
+
+Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import pkgutil
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+_PLAIN: dict[str, tuple[type, ...]] = {"bool": (bool,), "int": (int,), "float": (int, float), "str": (str,)}
+
+
+class UnknownName(ValueError, KeyError):
+    """A name that nothing is registered under."""
+
+    __str__ = Exception.__str__  # KeyError's is the repr
+
+
+Spec = str | Mapping[str, Any]
+"""A name, or ``{"name": ..., "settings": {...}}``."""
+
+
+def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
+    """Both parts of a spec; a bare name has no settings.
+
+    Raises:
+        ValueError: if it has no name, or another key.
+
+    Example:
+        >>> name_and_settings({"name": "r2r", "settings": {"alpha": 0.5}})
+        ('r2r', {'alpha': 0.5})
+    """
+    if isinstance(spec, str):
+        return spec, {}
+    settings = spec.get("settings") or {}
+    if not isinstance(spec.get("name"), str) or not isinstance(settings, Mapping) or spec.keys() - {"name", "settings"}:
+        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {dict(spec)}")
+    return spec["name"], dict(settings)
+
+
+def checked_settings(
+    label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Keyword arguments for ``function``: lists, which is what YAML and JSON have, become tuples.
+
+    Args:
+        label: opens the messages.
+        function: or class, whose signature says what it takes.
+        settings: the keyword arguments to check.
+        given: arguments that the caller passes besides.
+
+    Raises:
+        ValueError: if one is unknown, missing, or not of the plain type that the signature names.
+    """
+    parameters = inspect.signature(function).parameters
+    takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    for key in settings:
+        if key not in takes:
+            raise ValueError(
+                f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{nearest(key, takes)}"
+            )
+    for key in takes:
+        if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
+            raise ValueError(f"{label} needs the setting {key!r}")
+    return {key: _of_type(value, parameters[key], f"{label}: {key}") for key, value in settings.items()}
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """``" (nearest: UNet)"`` for a name that is nearly known, else nothing."""
+    by_key = {candidate.casefold(): candidate for candidate in known}
+    near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
+    return f" (nearest: {by_key[near[0]]})" if near else ""
+
+
+class Registry(Mapping[str, Any]):
+    """Things of one kind by name, in alphabetical order.
+
+    Args:
+        kind: what one of them is called in messages.
+        group: of the entry points of other packages.
+        package: whose modules register the built-in ones.
+
+    Example:
+        >>> filters = Registry("filter", "rawaug.filters", "denoisers")
+        >>> @filters.register("Identity")
+        ... class Identity:
+        ...     def __init__(self, strength: float = 1.0) -> None:
+        ...         self.strength = strength
+        >>> filters.make({"name": "Identity", "settings": {"strength": 0.5}}).strength
+        0.5
+        >>> filters.make({"name": "Identity", "settings": {"strenght": 0.5}})
+        Traceback (most recent call last):
+        ValueError: filter Identity has no setting 'strenght'; it has strength (nearest: strength)
+    """
+
+    def __init__(self, kind: str, group: str, package: str) -> None:
+        self.kind, self.group, self.package = kind, group, package
+        self._things: dict[str, Any] = {}
+        self._complete = False
+
+    def register(self, name: str) -> Callable[[T], T]:
+        """Decorator: the class or function is found by ``name`` from now on.
+
+        Raises:
+            ValueError: if another thing has the name.
+        """
+
+        def add(thing: T) -> T:
+            known = self._things.get(name, thing)
+            if known is not thing and _path(known) != _path(thing):  # a module may be run again, as in a notebook
+                raise ValueError(f"{self.kind} {name!r} is {_path(known)} already; give {_path(thing)} another name")
+            self._things[name] = thing
+            return thing
+
+        return add
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._things:
+            self._import_builtin()
+        if name not in self._things:
+            if name not in self._entry_points:
+                raise UnknownName(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}")
+            self._things[name] = self._loaded(name)
+        return self._things[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._things or name in set(self)
+
+    def __iter__(self) -> Iterator[str]:
+        self._import_builtin()
+        return iter(sorted({*self._things, *self._entry_points}, key=str.casefold))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def name_of(self, thing: Any) -> str | None:
+        """The name that a thing is registered under, or None."""
+        return next((name for name in (*self._things, *self) if self[name] is thing), None)
+
+    def make(self, spec: Spec, **defaults: Any) -> Any:
+        """A new one, with its settings as keyword arguments; ``defaults`` stand where these say nothing.
+
+        Raises:
+            ValueError: if the name or a setting is unknown, one is missing, or of the wrong type; the class itself
+                may refuse a value too.
+        """
+        name, settings = name_and_settings(spec)
+        return self[name](**{**defaults, **checked_settings(f"{self.kind} {name}", self[name], settings, defaults)})
+
+    def _import_builtin(self) -> None:
+        if self._complete:
+            return
+        package = import_module(self.package)
+        for module in pkgutil.walk_packages(package.__path__, f"{self.package}."):
+            import_module(module.name)
+        self._complete = True
+
+    @cached_property
+    def _entry_points(self) -> dict[str, Any]:
+        from importlib.metadata import entry_points
+
+        found: dict[str, Any] = {}
+        for point in entry_points(group=self.group):
+            if point.name in found or point.name in self._things:
+                warnings.warn(f"{point.value} is ignored: there is a {self.kind} {point.name!r} already", stacklevel=2)
+            else:
+                found[point.name] = point
+        return found
+
+    def _loaded(self, name: str) -> Any:
+        point = self._entry_points[name]
+        try:
+            return point.load()
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"{self.kind} {name!r}: the entry point {point.value} cannot be loaded: {error}") from None
+
+
+def _path(thing: Any) -> str:
+    thing = getattr(thing, "func", thing)  # of functools.partial
+    return f"{thing.__module__}.{thing.__qualname__}"
+
+
+def _of_type(value: Any, parameter: inspect.Parameter, label: str) -> Any:
+    """The value if it is of the parameter's type; only plain types are checked here."""
+    hint, default = parameter.annotation, parameter.default
+    expected = _PLAIN.get(hint if isinstance(hint, str) else getattr(hint, "__name__", ""))
+    value = tuple(value) if isinstance(value, list) else value
+    if expected is None and isinstance(default, tuple):
+        expected = (tuple,)
+    if expected is not None and (not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected)):
+        raise ValueError(f"{label} must be {expected[-1].__name__}, got {value!r}")
+    return value
+
+
+DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
+"""Networks: subclasses of :class:`denoisers.Denoiser`."""
+FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
+"""Subclasses of :class:`denoisers.classical.Classical`."""
+NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
+"""Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.by_name`."""
+DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
+"""``reader(path, split) -> Sequence[Pair]``; what ``kind:path`` opens as pairs."""
+PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
+"""``reader(path, min_side) -> sequence of sRGB (3, H, W)``; what ``kind:path`` opens as pictures."""
+ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training.estimators")
+"""Subclasses of :class:`rawaug.training.estimators.Supervised`: what a training step learns from."""
+LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
+"""Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
+BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.isp.baselines")
+"""Subclasses of :class:`rawaug.isp.baselines.base.BaselineISP`."""
+COMMANDS = Registry("command", "rawaug.commands", "rawaug.commands")
+"""Functions behind ``rawaug NAME``: arguments and help are those of the signature and the docstring."""

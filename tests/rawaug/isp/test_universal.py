@@ -1,0 +1,97 @@
+"""The universal ISP as shipped: what its hulls hold, and that tone curves go both ways."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rawaug import bayer
+from rawaug.isp.cameras import published_cameras
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.dictionary import CameraDictionary
+from rawaug.isp.fast import BakedISP
+from rawaug.isp.hull import colour_coordinates, nearest_in_hull, psnr
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.tone_curves import to_code, to_linear, tone_tables
+from rawaug.isp.universal import STAGES, camera_points, held, inverse_gains_in_any_light
+from rawaug.metrics import psnr as image_psnr
+
+
+@pytest.fixture(scope="module")
+def universal() -> DictionaryISP:
+    return DictionaryISP.from_pretrained("universal")
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize(("name", "least"), [("universal", 0.97), ("universal-small", 0.9)])
+def test_the_hull_holds_the_published_cameras(name: str, least: float) -> None:
+    isp = DictionaryISP.from_pretrained(name)
+    assert isinstance(isp.colour, CameraDictionary)
+    atoms = isp.colour.xyz_to_camera(torch.eye(isp.config.colour_atoms))
+    share = held(camera_points(published_cameras().xyz_to_camera), camera_points(atoms))
+    assert share >= least
+    assert share == pytest.approx(isp.info["holds"]["cameras"], abs=0.002)
+
+
+def test_every_known_camera_is_the_mixture_of_atoms_that_its_weights_say(universal: DictionaryISP) -> None:
+    assert isinstance(universal.colour, CameraDictionary)
+    made = camera_points(universal.colour.xyz_to_camera(universal.colour.known))
+    error = (made - camera_points(published_cameras().distinct())).square().sum(dim=1)
+    assert (psnr(error) > 45).double().mean() > 0.97
+
+
+def test_gain_atoms_hold_lights_that_they_were_not_chosen_for(universal: DictionaryISP) -> None:
+    atoms = 1.0 / universal.gain.channel_gains().detach().double()
+    others = inverse_gains_in_any_light(published_cameras().xyz_to_camera[::7], "test")
+    assert (psnr(nearest_in_hull(others / 3**0.5, atoms / 3**0.5)[1]) > 45).double().mean() > 0.93
+
+
+def test_curves_go_both_ways() -> None:
+    tables = tone_tables()
+    code = torch.rand(len(tables), 3, 8, 8, generator=generator())
+    there = to_linear(code, tables)
+    torch.testing.assert_close(to_linear(to_code(there, tables), tables), there, atol=1e-5, rtol=0)
+    assert torch.equal(to_code(torch.tensor([[[[-1.0, 2.0]]]]), tables[:1]), torch.tensor([[[[0.0, 1.0]]]]))
+
+
+def test_forward_undoes_reverse(universal: DictionaryISP) -> None:
+    srgb = 0.1 + 0.6 * torch.rand(3, 3, 16, 16, generator=generator())
+    setting = universal.draw_setting(3, generator(1))
+    back = universal.forward_pixels(universal.reverse_pixels(srgb, setting), setting)
+    assert (back - srgb).abs().quantile(0.95) < 1e-3
+
+
+def test_baked_is_the_isp_above_75_db(universal: DictionaryISP) -> None:
+    srgb = torch.randint(256, (4, 3, 32, 48), generator=generator(), dtype=torch.uint8)
+    setting = universal.draw_setting(4, generator(1))
+    expected = bayer.pack(universal.reverse(srgb, setting).raw, universal.cfa)
+    baked = BakedISP(universal)
+    assert image_psnr(baked(srgb, setting), expected).min() > 75
+    assert image_psnr(baked(srgb / 255.0, setting), expected).min() > 75
+
+
+def test_readings_find_tone_and_camera_as_well(universal: DictionaryISP) -> None:
+    srgb = torch.rand(1, 3, 32, 32, generator=generator()) * 0.85
+    truth = universal.draw_setting(1, generator(3))
+    raw = universal.reverse(srgb, truth).raw
+    place = torch.randint(32, (1, 64, 2), generator=generator(4))
+    value = raw[0, 0, place[0, :, 0], place[0, :, 1]]
+    given = torch.cat([place.float(), value[None, :, None]], dim=2)
+    known, blind = universal.reverse(srgb, raw_samples=given).raw, universal.reverse(srgb).raw
+    assert image_psnr(known, raw) > image_psnr(blind, raw) + 15
+    assert image_psnr(known, raw) > 42
+
+
+def test_a_curve_stands_in_place_of_tone_and_gamma() -> None:
+    with pytest.raises(ValueError, match="in place of tone and gamma"):
+        DictionaryISP(ISPConfig(stages=("tone", "curve"), tone_atoms=2))
+    with pytest.raises(ValueError, match="with the stage curve"):
+        ISPConfig(stages=STAGES)
+
+
+def test_points_of_cameras_are_errors_of_colour() -> None:
+    assert camera_points(published_cameras().distinct()[:2]).shape == (2, 9)
+    assert colour_coordinates(torch.eye(3)[None], torch.eye(3)).square().sum().item() == pytest.approx(1.0)

@@ -1,0 +1,65 @@
+"""Names: what is registered is found, what is not is refused with the nearest name, and old recipes still load."""
+
+from __future__ import annotations
+
+import pytest
+
+from rawaug.experiment.arms import estimator_of
+from rawaug.experiment.recipe import ArmConfig
+from rawaug.noise import EldNoise, SensorNoise, noise_model
+from rawaug.registry import BASELINES, COMMANDS, DATASETS, ESTIMATORS, FILTERS, LOSSES, Registry, name_and_settings
+from rawaug.training.estimators import R2R, Noisier
+
+
+def test_every_kind_finds_the_things_in_its_package() -> None:
+    assert {"NonLocalMeans", "Wavelet", "TotalVariation", "BM3D"} == set(FILTERS)
+    assert {"demo", "dnd", "fivek", "rawir", "sidd", "siddplus", "zurich"} <= set(DATASETS)
+    assert {"supervised", "noisier", "noise2noise", "r2r", "neighbor2neighbor"} == set(ESTIMATORS)
+    assert {"l1", "l2", "charbonnier"} == set(LOSSES)
+    assert {"fit", "evaluate", "synth", "denoise", "preview", "info", "data check"} <= set(COMMANDS)
+    assert {name: method.name for name, method in BASELINES.items()} == {name: name for name in BASELINES}
+
+
+def test_a_name_is_given_once_and_a_module_may_run_again() -> None:
+    kinds = Registry("thing", "rawaug.things", "denoisers")
+    kinds.register("a")(R2R)
+    assert kinds.register("a")(R2R) is R2R and kinds["a"] is R2R and kinds.name_of(R2R) == "a"
+    with pytest.raises(ValueError, match=r"thing 'a' is .*r2r\.R2R already; give .*Noisier another name"):
+        kinds.register("a")(Noisier)
+
+
+def test_unknown_names_settings_and_types_are_refused_with_the_nearest() -> None:
+    for spec, message in (
+        ("r3r", r"estimator 'r3r' is unknown; use one of .*\(nearest: r2r\)$"),
+        ({"name": "r2r", "settings": {"alhpa": 1.0}}, r"estimator r2r has no setting 'alhpa'; .*\(nearest: alpha\)$"),
+        ({"name": "r2r", "settings": {"alpha": "big"}}, "r2r: alpha must be float, got 'big'"),
+        ({"name": "noisier", "settings": {"correct": 1}}, "noisier: correct must be bool, got 1"),
+        ({"nmae": "r2r"}, "expected a name or {name: ..., settings"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ArmConfig(estimator=spec)
+    with pytest.raises(ValueError, match="noise EldNoise needs the setting 'camera'"):
+        noise_model("EldNoise")
+    with pytest.raises(KeyError, match="unknown"):
+        DATASETS["nowhere"]
+
+
+def test_noise_has_settings_by_name() -> None:
+    sensor = noise_model({"name": "SensorNoise", "settings": {"levels": "upi", "row_var": [1e-7, 1e-5], "bits": 10}})
+    assert isinstance(sensor, SensorNoise) and len(sensor.models) == 3
+    eld = noise_model({"name": "EldNoise", "settings": {"camera": "SonyA7S2", "iso": 800}})
+    assert isinstance(eld, EldNoise) and eld.law.iso == (800.0, 800.0)
+    with pytest.raises(ValueError, match=r"ISO 1000000\.0 is outside"):
+        noise_model({"name": "Google Pixel", "settings": {"iso": 1e6}})
+    with pytest.raises(ValueError, match="has no setting 'isso'; it has iso, poisson"):
+        noise_model({"name": "Google Pixel", "settings": {"isso": 100}})
+
+
+def test_recipes_of_the_release_before_still_load() -> None:
+    arm = ArmConfig(0.5, estimator="noisier", alpha=0.7, correct=True)
+    assert arm == ArmConfig(0.5, estimator={"name": "noisier", "settings": {"alpha": 0.7, "correct": True}})
+    estimator = estimator_of(arm)
+    assert isinstance(estimator, Noisier) and (estimator.alpha, estimator.correct) == (0.7, True)
+    assert name_and_settings(ArmConfig().estimator) == ("supervised", {})
+    with pytest.raises(ValueError, match="supervised has no setting 'alpha'"):
+        ArmConfig(alpha=0.5)

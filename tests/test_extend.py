@@ -1,0 +1,122 @@
+"""Another package brings a network and a noise model by entry points, and a recipe trains with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import denoisers
+from rawaug.cli import main
+from rawaug.registry import DENOISERS, LOSSES, NOISE
+
+ROOT = Path(__file__).parents[1]
+
+PACKAGE = """
+from denoisers.network import PACKED, Denoiser, conv
+from rawaug.noise import Compose, RowNoise, ShotReadNoise, noise_levels
+
+
+class Shallow(Denoiser):
+    def __init__(self, width=16, channels=PACKED, variance_map=True, deviation=True, domain="linear", seed=0):
+        super().__init__(channels, variance_map, deviation, 1, {"width": width}, domain)
+        self.first, self.last = conv(self.inputs, width), conv(width, channels)
+        self.initialise(seed, self.last)
+
+    def residual(self, features):
+        return self.last(self.first(features).relu())
+
+
+class Banded(Compose):
+    def __init__(self, levels="cycleisp_sidd", row_var=1e-6):
+        super().__init__([ShotReadNoise(noise_levels(levels)), RowNoise(row_var)])
+"""
+ENTRY_POINTS = """
+[rawaug.denoisers]
+Shallow = abroad:Shallow
+[rawaug.noise]
+Banded = abroad:Banded
+[rawaug.losses]
+gone = abroad:Missing
+"""
+RECIPE = """
+name: abroad
+camera: universal
+data: {pairs: null, validation: null, test: "demo:validation", test_count: 1}
+denoiser: {name: Shallow, settings: {width: 4}}
+noise: {name: Banded, settings: {row_var: 1.0e-4}}
+train: {steps: 3, batch: 2, crop: 32, validate_every: 2, checkpoint_every: 2, loss: {name: charbonnier}}
+arms: {pictures: {augmented: 1.0}}
+device: cpu
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as pip leaves it: the package and its metadata."""
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "abroad.py").write_text(PACKAGE)
+    metadata = folder / "abroad-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: abroad\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(ENTRY_POINTS)
+    return folder
+
+
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The package can be imported in this process, and nothing of it is left afterwards."""
+    kinds = (DENOISERS, NOISE, LOSSES)
+    monkeypatch.syspath_prepend(str(site))
+    for kind in kinds:
+        monkeypatch.setattr(kind, "_things", dict(kind._things))
+        vars(kind).pop("_entry_points", None)
+    yield
+    sys.modules.pop("abroad", None)
+    for kind in kinds:
+        vars(kind).pop("_entry_points", None)
+
+
+def test_a_recipe_trains_with_what_another_package_brings(site: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(RECIPE)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(site)]), "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, "-m", "rawaug.cli", "run", "mine.yaml"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    results = json.loads((tmp_path / "runs" / "abroad" / "results.json").read_text())
+    assert 20.0 < results["results"]["pictures"][0]["plain"]["psnr"] < 60.0
+    assert results["recipe"]["noise"] == {"name": "Banded", "settings": {"row_var": 1e-4}}
+    weights = tmp_path / "runs" / "abroad" / "seed0" / "pictures" / "denoiser.safetensors"
+    with pytest.raises(ValueError, match="denoiser 'Shallow' is unknown; use one of DHDN"):
+        denoisers.load(weights)  # the package is not installed in this process
+
+
+@pytest.mark.usefixtures("installed")
+def test_weights_of_its_network_are_saved_and_loaded(tmp_path: Path) -> None:
+    model = denoisers.build("Shallow", width=4)
+    denoisers.save(model, tmp_path / "x.safetensors", {})
+    assert type(denoisers.load(tmp_path / "x.safetensors")[0]) is type(model)
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("width: 4", "widht: 4"), "denoiser Shallow has no setting 'widht'; it has width, channels.*nearest: width"),
+        (("name: Banded", "name: Bandet"), r"noise 'Bandet' is unknown: .*\(nearest: Banded\)"),
+        (("name: charbonnier", "name: gone"), "loss 'gone': the entry point abroad:Missing cannot be loaded"),
+    ],
+)
+def test_what_is_wrong_with_it_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], message: str
+) -> None:
+    (tmp_path / "mine.yaml").write_text(RECIPE.replace(*change))
+    assert main(["run", str(tmp_path / "mine.yaml"), "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(message, line), line
