@@ -1,11 +1,13 @@
-"""What training a network costs, with and without augmentation, and what its self-ensemble costs.
+"""What a network costs: parameters, GMAC and seconds a mosaic megapixel, training steps, and PSNR for equal minutes.
 
-    python -m benchmarks.networks [--networks UNet DHDN DnCNN] [--width 16] [--batch 16] [--crop 128] [--quick]
-    python -m benchmarks.networks --device cuda --width 128 --networks DHDN --crop 256     (bf16)
+    python -m benchmarks.networks [--networks UNet PMRID] [--batch 16] [--crop 128] [--quick]
+    python -m benchmarks.networks --device cuda --networks NAFNet --crop 256     (bf16)
+    python -m benchmarks.networks --minutes 20 --pictures PHOTOS --validation RAW_DIR     hours: every network trained
 
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
-with it, RawAugment makes it of sRGB first. Each network runs in its own process, whose peak memory is reported; steps
-are timed in turn, and the fastest counts.
+with it, RawAugment makes it of sRGB first. Each network runs in a process of its own, whose peak memory is reported;
+steps are timed in turn, and the fastest counts. With ``--minutes`` each network, in the form of :data:`SIZES`, is
+trained for the same time on what ``recipes/pretrain.yaml`` describes, and scored on the validation frames.
 """
 
 from __future__ import annotations
@@ -14,20 +16,96 @@ import argparse
 import json
 import multiprocessing
 import resource
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 import denoisers
 import rawaug
 from benchmarks.loader import fastest
 
+SIZES: dict[str, dict[str, Any]] = {
+    "UNet": {"width": 16, "scales": 4},
+    "DHDN": {"width": 16},
+    "DnCNN": {"width": 32, "depth": 12},
+    "PMRID": {"variance_map": True},
+    "NAFNet": {"width": 16, "encoder": [1, 1, 2], "middle": 4, "decoder": [1, 1, 1]},
+}
+"""The networks in sizes for a CPU."""
+
+SIDE = 512
+"""Packed pixels on the side of the picture that inference is timed on: a mosaic megapixel."""
+
+
+def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str, float]:
+    """GMAC and seconds a mosaic megapixel; on a CPU on one and on two threads."""
+    noisy = torch.rand(1, 4, SIDE, SIDE, device=args.device)
+    inputs = [x.contiguous(memory_format=torch.channels_last) for x in (noisy, 1e-3 * noisy + 1e-5)]
+    megapixels, figures = 4 * SIDE**2 / 1e6, dict[str, float]()
+    with torch.inference_mode():
+        with FlopCounterMode(display=False) as counter:
+            network(*inputs)
+        figures["GMAC/Mpix"] = counter.get_total_flops() / 2e9 / megapixels
+        before = torch.get_num_threads()
+        for threads in (1, 2) if args.device.type == "cpu" else (before,):
+            torch.set_num_threads(threads)
+            seconds = fastest({"one": lambda: network(*inputs)}, args.repeats, args.device)["one"]
+            figures[f"s/Mpix, {threads} thread(s)"] = seconds / megapixels
+        torch.set_num_threads(before)
+    return figures
+
+
+def trained(name: str, args: argparse.Namespace) -> dict[str, float]:
+    """PSNR on validation, in RAW and sRGB, after ``args.minutes`` of training; steps are fitted to the time."""
+    import time
+
+    from rawaug.data import open_pairs, open_pictures
+    from rawaug.evaluation.scores import frozen_sample
+    from rawaug.noise import noise_model
+    from rawaug.training.loop import train
+    from rawaug.training.stream import PictureCrops, TrainingStream
+    from rawaug.training.train_config import DenoiserConfig, TrainConfig
+    from rawaug.training.validation import validate, watched
+
+    noise = noise_model(["any camera", "cycleisp_sidd"])
+    pictures = open_pictures(args.pictures, min_side=args.crop + 6)
+    augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
+    crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
+    cfa = augment.isp.cfa
+    middles = [pair.middle(SIDE) for pair in open_pairs(args.validation, split="validation")]
+    frames = [watched(frozen_sample(pair, noise, cfa, 0), pair, cfa) for pair in middles]
+    stream = TrainingStream(None, crops, args.batch, 1.0, seed=0)
+    config = TrainConfig(batch=args.batch, crop=args.crop, learning_rate=1e-3, weigh="stabilised", clip_norm=1.0)
+    network = DenoiserConfig(name, SIZES[name] | ({} if name == "PMRID" else {"domain": "ksigma"}))
+
+    def run(steps: int) -> tuple[denoisers.Denoiser, float]:
+        config.steps, config.validate_every, config.checkpoint_every = steps, steps, steps
+        config.ema = 0.999 if steps > 5000 else 0.99
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.perf_counter()
+            model = train(stream, frames, network, config, Path(folder), device=args.device.type, label=name)
+            return model, time.perf_counter() - began
+
+    _, probe = run(30)
+    steps = max(30, round(30 * 60.0 * args.minutes / probe))
+    model, seconds = run(steps)
+    scores = validate(model, frames, torch.device("cpu"))
+    return {"minutes": seconds / 60, "steps": steps, "psnr": scores["psnr"], "psnr_srgb": scores["psnr_srgb"]}
+
 
 def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
     """Of one network."""
     torch.set_num_threads(args.threads)
-    network = getattr(denoisers, name)(width=args.width).to(args.device, memory_format=torch.channels_last)
+    if args.minutes:
+        return trained(name, args)
+    network = denoisers.build(name, **SIZES[name] | ({"width": args.width} if args.width else {}))
+    network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    costs = inference(network.eval(), args)
+    network.train()
     optimizer = torch.optim.Adam(network.parameters())
     augment = rawaug.RawAugment.from_pretrained("universal").to(args.device)
     shape = (args.batch, 3, args.crop, args.crop)
@@ -55,6 +133,7 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
+        **costs,
         "images/s": args.batch / steps["ready"],
         "images/s, augmented": args.batch / steps["made"],
         "share of augmentation": 1 - steps["ready"] / steps["made"],
@@ -65,8 +144,11 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--networks", nargs="+", default=["UNet", "DHDN", "DnCNN"])
-    parser.add_argument("--width", type=int, default=16, help="features; published: U-Net 32, DHDN 128, DnCNN 64")
+    parser.add_argument("--networks", nargs="+", choices=list(SIZES), default=list(SIZES))
+    parser.add_argument("--width", type=int, help="features, in place of those for a CPU")
+    parser.add_argument("--minutes", type=float, default=0.0, help="train each for so long, and score it")
+    parser.add_argument("--pictures", default="demo:", help="sRGB pictures of --minutes")
+    parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--crop", type=int, default=128, help="side of the sRGB crops")
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
@@ -78,7 +160,7 @@ def main() -> None:
     if args.quick:
         args.batch, args.repeats = 4, 1
     shape = f"{args.batch} x {args.crop} x {args.crop}"
-    print(f"batches of {shape}, width {args.width} ({args.device}, {args.threads} threads, torch {torch.__version__})")
+    print(f"batches of {shape} ({args.device}, {args.threads} threads, torch {torch.__version__})")
     figures = {}
     for name in args.networks:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as own:

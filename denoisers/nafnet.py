@@ -100,12 +100,13 @@ class NAFNet(Denoiser):
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
         super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]
-        self.intro, self.ending = conv(self.inputs, width), conv(width, channels)
+        self.intro = conv(self.inputs, width)
         self.encoder = nn.ModuleList(_blocks(c, n) for c, n in zip(sizes, encoder, strict=False))
         self.downs = nn.ModuleList(conv(c, 2 * c, 2, stride=2, padding=0) for c in sizes[:-1])
         self.middle = _blocks(sizes[-1], middle)
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_blocks(c, n) for c, n in zip(reversed(sizes[:-1]), decoder, strict=True))
+        self.ending = conv(width, channels)
         self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:

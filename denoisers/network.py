@@ -53,9 +53,9 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
     for axis in (-2, -1):
         size = image.shape[axis]
         padding = -size % stride
-        if padding:
-            period = 2 * (size - 1)
-            place = torch.arange(size + padding, device=image.device) % period
+        if torch.compiler.is_compiling() or padding:  # an exported network pads whatever size it is given
+            period = torch.scalar_tensor(2 * (size - 1), dtype=torch.int64, device=image.device)
+            place = torch.remainder(torch.arange(size + padding, device=image.device), period)
             image = image.index_select(axis, torch.minimum(place, period - place))
     return image
 

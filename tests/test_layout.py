@@ -130,8 +130,8 @@ def test_no_circles() -> None:
         ("import denoisers", set()),
         ("import rawaug.registry", {"registry"}),
         ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "registry"}),
-        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "registry"}),
-        ("from rawaug import DictionaryISP", {"bayer", "seeding", "files", "isp", "kernels", "camera_names"}),
+        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "registry"}),
+        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels"}),
     ],
 )
 def test_importing_one_part_loads_no_other(code: str, allowed: set[str]) -> None:

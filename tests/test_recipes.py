@@ -37,6 +37,7 @@ def test_the_recipes_are_all_there() -> None:
     assert {"fewshot", "unsupervised", "synthetic", "sidd/full", "sidd/fewshot", "sidd/unsupervised"} <= set(NAMES)
     assert {name: kind for name, kind in ALL.items() if kind != "training"} == {
         "ablation": "ablation",
+        "denoisers": "denoisers",
         "reconstruction": "reconstruction",
     }
 
@@ -81,7 +82,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
 ) -> None:
     quick = [
         "--train.validate_every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test_count", "1",
-        "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]",
+        "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]", "--untouched", "[]",
     ]  # fmt: skip
     command = ["run", "synthetic", "--seed", "3", "--seeds", "2", "--steps", "2", "--device", "cpu", *quick]
     command += ["--out", str(tmp_path)]

@@ -15,7 +15,17 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.evaluation.scores import Score, require_classical, row_of, score_classical, score_denoiser, summary
+from rawaug.evaluation.scores import (
+    Score,
+    classical_method,
+    installed_classical,
+    label_of,
+    network_method,
+    row_of,
+    score_classical,
+    score_denoiser,
+    summary,
+)
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, sha256, write_json
 from rawaug.isp.model import DictionaryISP
@@ -86,7 +96,7 @@ def evaluate(
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
             is for denoisers and the file is an ISP's.
     """
-    require_classical(classical)
+    classical = installed_classical(classical)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = open_pairs(data, split="test")
@@ -106,8 +116,10 @@ def evaluate(
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
+            methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
+            methods["denoised"] = network_method(model, cfa)
             for pair in shown_on_page(pairs):
-                page.add_frame(row_of({"denoised": model}, pair, levels, cfa, seed), cfa)
+                page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
 

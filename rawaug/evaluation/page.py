@@ -12,6 +12,7 @@ import html
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -87,14 +88,32 @@ class Page:
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """The file, with ``settings`` at its end."""
-        shown = html.escape(json.dumps(settings, indent=1))
-        body = "\n".join([*self.parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
-        title = f"<title>{html.escape(self.title)}</title>"
-        head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width">{title}'
-        path.parent.mkdir(parents=True, exist_ok=True)
-        text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
-        path.write_text(f"{text}</body></html>\n", encoding="utf-8")
-        return path
+        return _write(path, self.title, self.parts, settings)
+
+
+def write_figure_page(
+    path: Path,
+    title: str,
+    png: bytes,
+    head: Sequence[str],
+    rows: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Any],
+) -> Path:
+    """A page of one figure and one table."""
+    parts = [f"<h1>{html.escape(title)}</h1>", f"<p>{_picture(png, title)}</p>", _table(head, rows)]
+    return _write(path, title, parts, settings)
+
+
+def _write(path: Path, title: str, parts: Sequence[str], settings: Mapping[str, Any]) -> Path:
+    shown = html.escape(json.dumps(settings, indent=1))
+    body = "\n".join([*parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
+    head = (
+        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
+    path.write_text(f"{text}</body></html>\n", encoding="utf-8")
+    return path
 
 
 def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:
@@ -124,21 +143,29 @@ def encode_png(srgb: Tensor) -> bytes:
 
 
 def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
-    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm."""
+    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm.
+
+    Thin lines are the thirds of the validation frames with least (dotted), middling and most noise (dash-dotted).
+    """
     with extra("train"):
         from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    axes = dict(zip(("loss", "psnr"), figure.subplots(1, 2), strict=True))
+    lines = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
+    figure = Figure(figsize=(15, 3.6), layout="constrained")
+    axes = dict(zip(("loss", "psnr", "psnr_srgb"), figure.subplots(1, 3), strict=True))
     for colour, (arm, paths) in enumerate(logs.items()):
         for k, path in enumerate(paths):
             with path.open(newline="") as file:
                 rows = list(csv.DictReader(file))
-            for key, axis in axes.items():
-                points = ([int(row["step"]) for row in rows], [float(row[key]) for row in rows])
-                axis.plot(*points, color=f"C{colour % 10}", linewidth=1.2, label=None if k else arm)
+            for key, part in product(axes, lines):
+                points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
+                width, label = (0.7, None) if part else (1.4, None if k else arm)
+                style = {"color": f"C{colour % 10}", "linestyle": lines[part], "linewidth": width, "label": label}
+                if points:
+                    axes[key].plot(*zip(*points, strict=True), **style)
     axes["loss"].set(xlabel="step", ylabel="loss", yscale="log")
-    axes["psnr"].set(xlabel="step", ylabel="validation PSNR (dB)")
+    axes["psnr"].set(xlabel="step", ylabel="validation PSNR, RAW (dB)")
+    axes["psnr_srgb"].set(xlabel="step", ylabel="validation PSNR, sRGB (dB)")
     axes["psnr"].legend(fontsize=8)
     file_like = io.BytesIO()
     figure.savefig(file_like, dpi=110)

@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 import denoisers
 from denoisers.network import Denoiser
@@ -62,12 +64,24 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
 
 
 @torch.inference_mode()
-def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool) -> Tensor:
+def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool, own: CFA | None = None) -> Tensor:
     """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
+
+    Args:
+        cfa: of the sample's mosaic.
+        own: the pattern that the model was trained for, if another: the mosaic is continued by a mirrored line on the
+            sides where the patterns differ, and the result cropped.
 
     Returns:
         The same shape, on the CPU.
     """
+    if own is not None and own != cfa:
+        rows, columns = cfa.shift_to(own)
+        mosaics = (F.pad(bayer.unpack(x, cfa), (columns, columns, rows, rows), mode="reflect") for x in sample)
+        shifted = Sample(*(bayer.pack(mosaic, own) for mosaic in mosaics))
+        mosaic = bayer.unpack(denoise(model, shifted, own, self_ensemble), own)
+        height, width = mosaic.shape[-2:]
+        return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
     run: Any = partial(denoisers.tiled, model)
     if self_ensemble:
         run = denoisers.SelfEnsemble(run, cfa, views=8)
@@ -87,18 +101,24 @@ def score_method(
         yield Score(pair.name, *values), pair, sample, denoised
 
 
+def network_method(model: Denoiser, cfa: CFA, own: CFA | None = None, self_ensemble: bool = False) -> Method:
+    """A network as something to score; ``cfa`` and ``own`` as in :func:`denoise`."""
+    return lambda _, sample: denoise(model, sample, cfa, self_ensemble, own)
+
+
 def score_denoiser(
     model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, self_ensemble: bool, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
     """:func:`score_method` of a network."""
-    return score_method(lambda _, sample: denoise(model, sample, cfa, self_ensemble), pairs, noise, cfa, seed, label)
+    method = network_method(model, cfa, self_ensemble=self_ensemble)
+    return score_method(method, pairs, noise, cfa, seed, label)
 
 
-def row_of(models: Mapping[str, Denoiser], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
-    """Panels of a frame: noisy, denoised by each model, clean."""
+def row_of(methods: Mapping[str, Method], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
+    """Panels of a frame: noisy, denoised by each method, clean."""
     row = Row(pair, {}, {})
-    for name, model in models.items():
-        score, _, sample, denoised = next(score_denoiser(model, [pair], noise, cfa, seed, False, f"picture, {name}"))
+    for name, method in methods.items():
+        score, _, sample, denoised = next(score_method(method, [pair], noise, cfa, seed, f"picture, {name}"))
         row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
         row.panels[name] = denoised
         row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", name: f"{score.psnr:.2f} dB"}
@@ -123,6 +143,21 @@ def require_classical(specs: Sequence[Spec]) -> None:
     """
     for spec in specs:
         FILTERS.make(spec)
+
+
+def installed_classical(specs: Sequence[Spec]) -> list[Spec]:
+    """The classical denoisers without BM3D where its wheel is missing, which is then printed.
+
+    Raises:
+        ValueError: if a name is unknown.
+    """
+    require_classical(specs)
+    if find_spec("bm3d") is not None:
+        return list(specs)
+    kept = [spec for spec in specs if name_and_settings(spec)[0] != "BM3D"]
+    if len(kept) < len(specs):
+        print("classical: BM3D is left out; it needs the bm3d wheel, which is for non-commercial use: pip install bm3d")
+    return kept
 
 
 def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
@@ -153,14 +188,15 @@ def score_classical(
     specs: Sequence[Spec], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
 ) -> dict[str, dict[str, Any]]:
     """The summary of each classical denoiser, by name, with its settings where it has some."""
-    methods = {_label(spec): classical_method(spec, noise, seed) for spec in specs}
+    methods = {label_of(spec): classical_method(spec, noise, seed) for spec in specs}
     return {
         name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
         for name, method in methods.items()
     }
 
 
-def _label(spec: Spec) -> str:
+def label_of(spec: Spec) -> str:
+    """A classical denoiser's name in tables."""
     name, settings = name_and_settings(spec)
     return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
+from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.model import DictionaryISP
@@ -18,6 +19,7 @@ from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
+from rawaug.training.validation import Watched, watched
 
 WATCHED = 16
 """Samples made from pictures on which a training without validation pairs is watched."""
@@ -32,6 +34,15 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     """
     estimator: Supervised = ESTIMATORS.make(arm.estimator)
     return estimator
+
+
+def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
+    """The ISP of the same camera behind another CFA, a copy."""
+    if isp.cfa == cfa:
+        return isp
+    other = copy.deepcopy(isp)
+    other.configure(cfa=str(cfa))
+    return other
 
 
 def training_stream(
@@ -80,7 +91,7 @@ def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: Dictionar
 
 def validation_samples(
     recipe: Recipe, pairs: Sequence[Pair], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-) -> list[Sample]:
+) -> list[Watched]:
     """The frozen samples by which weights are chosen, the same in every arm and run.
 
     Args:
@@ -89,10 +100,12 @@ def validation_samples(
     augment = RawAugment(isp, noise)
     if recipe.self_supervised:
         frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
-        return held_out(frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED], isp.cfa)
+        frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
+        return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
     if pairs:
         side = recipe.data.validation_crop
-        return [frozen_sample(pair.middle(side) if side else pair, noise, isp.cfa, seed=0) for pair in pairs]
+        middles = (pair.middle(side) if side else pair for pair in pairs)
+        return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in middles]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
-    return [Sample(*(x[None] for x in sample)) for sample in drawn]
+    return [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]

@@ -16,6 +16,7 @@ import torch
 
 import denoisers
 from denoisers.network import Denoiser
+from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
@@ -24,14 +25,17 @@ from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
-    require_classical,
+    Method,
+    classical_method,
+    installed_classical,
+    label_of,
+    network_method,
     row_of,
-    score_classical,
-    score_denoiser,
+    score_method,
     summary,
 )
 from rawaug.evaluation.tables import Row, draw, print_table
-from rawaug.experiment.arms import estimator_of, training_stream, validation_samples
+from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
 from rawaug.extras import extra
 from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
@@ -40,6 +44,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
+from rawaug.training.start import first_network, start_of
 from rawaug.training.train_config import weights_key
 
 SHOWN = 3
@@ -63,10 +68,13 @@ class _Run:
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.data = recipe, recipe.data
         self.folder = Path(recipe.out) / recipe.name
-        require_classical(recipe.classical)
+        self.classical = installed_classical(recipe.classical)
         if recipe.noise != "camera":
             noise_model(recipe.noise)
-        denoisers.build(recipe.denoiser.name, **recipe.denoiser.settings)
+        for arm in recipe.arms:
+            first_network(recipe.network_of(arm), seed=0)
+        self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
+        self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
         self.test = _first(open_pairs(self.data.test), self.data.test_count)
         source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
         self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
@@ -85,14 +93,18 @@ class _Run:
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
             for arm in recipe.arms:
-                models[arm] = self.trained(arm, isp, noise, seed)
+                models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
                 if _leads():
-                    results[arm].append(self.evaluated(arm, models[arm], noise, isp.cfa, seed))
+                    results[arm].append(self.evaluated(arm, models[arm], noise, isp, seed))
         if not _leads():
             return results
-        classical = score_classical(recipe.classical, self.test, noise, isp.cfa, seed=0)
-        self.reported(results, classical, models, noise, isp.cfa)
+        self.reported(results, models, noise, isp)
         return results
+
+    def pattern(self, arm: str, isp: DictionaryISP) -> CFA:
+        """The CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
+        start = self.starts[arm]
+        return isp.cfa if start is None else start.cfa
 
     def fitted_isp(self, seed: int) -> DictionaryISP:
         """The ISP of the few pairs, or the recipe's own."""
@@ -119,7 +131,7 @@ class _Run:
         """The denoiser of one arm."""
         recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
         path = place / "denoiser.safetensors"
-        config, network = recipe.train, recipe.denoiser
+        config, network, start = recipe.loop_of(arm), recipe.network_of(arm), self.starts[arm]
         key = self.weights_key(arm, isp, seed)
         if path.is_file():
             model, info = denoisers.load(path)
@@ -137,6 +149,7 @@ class _Run:
             return model
         levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
         denoisers.save(model, path, info)
         (place / "last.pt").unlink(missing_ok=True)
@@ -144,13 +157,15 @@ class _Run:
 
     def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
         """What the weights of an arm depend on."""
-        recipe, data = self.recipe, self.data
+        recipe, data, start = self.recipe, self.data, self.starts[arm]
         pictures = (data.pictures, len(self.pictures))
-        samples = (isp.info["key"], recipe.noise, asdict(recipe.arms[arm]), data.pairs, stamps(self.pairs), pictures)
+        settings = _settings(recipe.arms[arm])
+        samples = [isp.info["key"], recipe.noise, settings, data.pairs, stamps(self.pairs), pictures]
+        samples += [] if start is None else [start.sha256]
         validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
-        return weights_key(recipe.denoiser, recipe.train, (seed, *samples), validation)
+        return weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *samples), validation)
 
-    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, cfa: CFA, seed: int) -> dict[str, Any]:
+    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
         digest = sha256(place / "denoiser.safetensors")
@@ -162,22 +177,27 @@ class _Run:
         result: dict[str, Any] = {}
         model.to(_device(self.recipe.device))
         for kind in ("plain", "self_ensemble"):
-            label, ensemble = f"evaluate {arm}, {kind}", kind == "self_ensemble"
-            scored = score_denoiser(model, self.test, noise, cfa, 0, ensemble, label)
+            method = network_method(model, isp.cfa, self.pattern(arm, isp), kind == "self_ensemble")
+            scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
         write_json({"key": key, **result}, path)
         return result
 
-    def reported(
-        self,
-        results: Results,
-        classical: dict[str, dict[str, Any]],
-        models: dict[str, Denoiser],
-        noise: NoiseModel,
-        cfa: CFA,
-    ) -> None:
+    def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
+        """What the arms are compared with: classical denoisers, and trained ones as they are."""
+        methods = {label_of(spec): classical_method(spec, noise, seed=0) for spec in self.classical}
+        for name, (model, info) in self.untouched.items():
+            methods[name] = network_method(model.to(_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
+        return methods
+
+    def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
-        recipe = self.recipe
+        recipe, cfa = self.recipe, isp.cfa
+        others = self.untrained(noise, cfa)
+        classical = {
+            name: summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
+            for name, method in others.items()
+        }
         everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
         write_json(everything, self.folder / "results.json")
         settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
@@ -187,10 +207,12 @@ class _Run:
         page.add_curves(
             draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
         )
-        for model in models.values():
-            model.to(_device(recipe.device))
+        hidden = [label_of(spec) for spec in self.classical[1:]]
+        methods = {name: method for name, method in others.items() if name not in hidden}
+        for arm, model in models.items():
+            methods[arm] = network_method(model.to(_device(recipe.device)), cfa, self.pattern(arm, isp))
         for pair in shown_on_page(self.test):
-            row = row_of(models, pair, noise, cfa, seed=0)
+            row = row_of(methods, pair, noise, cfa, seed=0)
             page.add_frame(row, cfa)
             shown += [row] if len(shown) < SHOWN else []
         picture = draw(shown, cfa, self.folder / "picture.png")
@@ -199,6 +221,12 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
+
+
+def _settings(part: Any) -> dict[str, Any]:
+    """Of a part of the recipe; keys that came later are left out where they are null: older runs stay what they are."""
+    later = ("start", "denoiser", "learning_rate")
+    return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
 
 
 def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:

@@ -30,6 +30,7 @@ from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched
 
 WATCHED = 16
 """Samples made from the pictures on which training is watched."""
@@ -75,7 +76,8 @@ def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConf
     noise, cfa = noise_model(config.noise), CFA(model.cfa)
     crops = _crops(model, pictures, noise, config)
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
-    watched = [Sample(*(x[None] for x in crops.draw(keyed_generator("watched", k)))) for k in range(WATCHED)]
+    drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
+    watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
     net = train(
         stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
+from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
 from rawaug.experiment.denoising import run
 from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
@@ -30,6 +31,7 @@ KINDS = {
     "training": Kind(Recipe, run, smoke),
     "reconstruction": Kind(Comparison, compare, smoke_comparison),
     "ablation": Kind(Ablation, ablate, smoke_ablation),
+    "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep),
 }
 
 

@@ -52,6 +52,8 @@ class ArmConfig:
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
+        learning_rate: in place of ``train.learning_rate``; null takes that one.
     """
 
     augmented: float = 0.0
@@ -63,6 +65,8 @@ class ArmConfig:
     alpha: float | None = None
     correct: bool | None = None
     gamma: float | None = None
+    denoiser: DenoiserConfig | None = None
+    learning_rate: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
@@ -98,6 +102,8 @@ class Recipe:
         train: the loop.
         arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
+            BM3D is left out, with a line that says so, where its wheel is not installed.
+        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
         seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
@@ -115,6 +121,7 @@ class Recipe:
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str | dict[str, Any]] = field(default_factory=list)
+    untouched: list[str] = field(default_factory=list)
     steps: int | None = None
     seed: int = 0
     seeds: int = 1
@@ -138,6 +145,15 @@ class Recipe:
                 "arms: supervised and self-supervised arms cannot be mixed; the latter must not see clean frames"
             )
 
+    def network_of(self, arm: str) -> DenoiserConfig:
+        """The arm's network, else the recipe's."""
+        return self.arms[arm].denoiser or self.denoiser
+
+    def loop_of(self, arm: str) -> TrainConfig:
+        """How the arm is trained."""
+        rate = self.arms[arm].learning_rate
+        return self.train if rate is None else replace(self.train, learning_rate=rate)
+
     @property
     def self_supervised(self) -> bool:
         """Whether noisy frames are all that may be seen."""
@@ -145,7 +161,10 @@ class Recipe:
 
 
 def smoke(recipe: Recipe) -> Recipe:
-    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU."""
+    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU.
+
+    No trained denoiser is read: what would continue from one starts from nothing.
+    """
     name = recipe.denoiser.name
     few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=4, checkpoint_every=2, workers=0)
     return replace(
@@ -159,6 +178,8 @@ def smoke(recipe: Recipe) -> Recipe:
         isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
         denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
+        arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
+        untouched=[],
         steps=None,
         seeds=1,
         device="cpu",

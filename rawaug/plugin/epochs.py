@@ -8,8 +8,8 @@ are counted where they are made:
 - of a stream, ``epoch = number of earlier passes``, of which each worker counts its own beginnings (:class:`Passes`).
 
 The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
-by the one worker that has the picture, so there is nothing to lock. ``pin`` replaces the count by a fixed epoch: a draw
-is then a pure function of (seed, epoch, index).
+by the one worker that has the picture, so no lock is needed, which no two start methods would share. ``pin`` replaces
+the count by a fixed epoch: a draw is then a pure function of (seed, epoch, index).
 """
 
 from __future__ import annotations
@@ -76,10 +76,9 @@ class _Epochs:
 class Visits(_Epochs):
     """Epochs of pictures that are asked for by index.
 
-    Two draws of a picture never share an epoch. Pictures that are drawn with replacement count up singly; which of two
-    workers is first with the same picture is then left to chance. A pass that is broken off counts what its workers had
-    fetched ahead. In a distributed run the processes take turns with a picture, so counted draws also have the rank as
-    a key.
+    A picture that is drawn with replacement counts each time. Which of two workers is first is then left to chance, and
+    at the same moment both may read the same count. A pass that is broken off counts what its workers had fetched
+    ahead. In a distributed run the processes take turns with a picture, so counted draws also have the rank as a key.
 
     Args:
         size: number of pictures.

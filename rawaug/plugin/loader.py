@@ -167,7 +167,7 @@ class WrappedLoader:
         return stacked(patches), torch.stack(places)
 
     def __getattr__(self, name: str) -> Any:
-        if name in ("loader", "_share"):  # asked for before they are set, by copy and pickle
+        if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
             raise AttributeError(name)
         return getattr(self.share, name)
 

@@ -20,24 +20,22 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-import denoisers
 from denoisers.network import Denoiser
-from rawaug.data.sample import Sample
 from rawaug.extras import extra
 from rawaug.files import replacing
-from rawaug.metrics import psnr
 from rawaug.progress import progress
 from rawaug.registry import LOSSES
-from rawaug.seeding import derived_seed
 from rawaug.training.criteria import Criterion, weighed
 from rawaug.training.estimators import Supervised
+from rawaug.training.start import first_network
 from rawaug.training.stream import StepSampler, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched, validate
 
 
 def train(
     stream: TrainingStream,
-    validation: Sequence[Sample],
+    validation: Sequence[Watched],
     network: DenoiserConfig,
     config: TrainConfig,
     folder: Path,
@@ -55,7 +53,7 @@ def train(
         validation: frozen crops ``(1, 4, h, w)``, looked at every ``validate_every`` steps.
         network, config: what is trained, and how.
         folder: gets ``last.pt`` (all that a resume needs), ``log.csv`` and TensorBoard's files.
-        seed: of the network's start.
+        seed: of the initial weights.
         device, devices: Fabric's accelerator and number of devices; torchrun's processes count instead where it runs.
         label: heads the progress bar.
         estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
@@ -71,7 +69,7 @@ def train(
     norm: Criterion = LOSSES.make(config.loss)
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
-    net = denoisers.build(network.name, **{"seed": derived_seed(seed, "network") % 2**31, **network.settings})
+    net = first_network(network, seed)
     average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
     optimiser = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_factor(step, config))
@@ -108,20 +106,20 @@ def train(
         if looks or saves:
             losses = fabric.all_reduce(losses, reduce_op="mean")
         if looks:
-            score = validate(estimator.corrected(trained), validation, fabric.device)
-            if score > best["psnr"] or not choose:
-                best = {"psnr": score, "step": step, "net": copy.deepcopy(trained.state_dict())}
+            scores = validate(estimator.corrected(trained), validation, fabric.device)
+            if scores["psnr"] > best["psnr"] or not choose:
+                best = {"psnr": scores["psnr"], "step": step, "net": copy.deepcopy(trained.state_dict())}
             row: dict[str, float] = {
                 "loss": float(losses[0] / losses[1]),
-                "psnr": score,
+                **scores,
                 "learning_rate": float(learning_rate),
             }
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             losses = torch.zeros_like(losses)
             if journal is not None:
                 journal.log(step, **row)
-            scores = f"loss {row['loss']:.4f}, validation {score:.2f} dB (kept: step {best['step']})"
-            bar.set_postfix_str(f"{row['samples_per_second']:.0f} images/s, {scores}", refresh=False)
+            told = f"loss {row['loss']:.4f}, validation {scores['psnr']:.2f} dB (kept: step {best['step']})"
+            bar.set_postfix_str(f"{row['samples_per_second']:.0f} images/s, {told}", refresh=False)
         if saves and journal is not None:
             parts = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
             state = {key: part.state_dict() for key, part in parts.items()}
@@ -175,18 +173,6 @@ def learning_rate_factor(step: int, config: TrainConfig) -> float:
     return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
 
 
-@torch.no_grad()
-def validate(net: nn.Module, samples: Sequence[Sample], device: torch.device) -> float:
-    """Mean PSNR in dB over frozen samples, large ones in tiles."""
-    net.eval()
-    scores = []
-    for sample in samples:
-        noisy, clean, variance = (x.to(device) for x in (sample.noisy, sample.clean, sample.variance))
-        scores.append(psnr(denoisers.tiled(net, noisy, variance), clean))
-    net.train()
-    return torch.cat(scores).mean().item()
-
-
 def resume(
     path: Path, net: nn.Module, average: nn.Module, optimiser: Any, schedule: Any
 ) -> tuple[int, dict[str, Any], Tensor]:
@@ -228,11 +214,14 @@ class Journal:
 
     def log(self, step: int, **values: float) -> None:
         """One row in the CSV file and one point in each TensorBoard curve."""
-        new = not self.path.is_file() or self.path.stat().st_size == 0
+        head = ["step", *values]
+        known = self.path.read_text().splitlines() if self.path.is_file() else []
+        if known and known[0] != ",".join(head):  # begun by a version with other columns
+            write_rows(self.path, head, list(csv.DictReader(known)))
         with self.path.open("a", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
-            if new:
-                rows.writerow(["step", *values])
+            if not known:
+                rows.writerow(head)
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
@@ -240,3 +229,11 @@ class Journal:
     def close(self) -> None:
         """Write what is left."""
         self.writer.close()
+
+
+def write_rows(path: Path, head: Sequence[str], rows: Sequence[dict[str, str]]) -> None:
+    """A CSV file with the columns ``head``; what a row lacks is empty, what ``head`` lacks is left out."""
+    with replacing(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, head, restval="", extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

@@ -16,10 +16,13 @@ class DenoiserConfig:
     Args:
         name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
         settings: its constructor's keys.
+        start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
+            then the file's, unless they are given, and must agree with it. Null starts from nothing.
     """
 
     name: str = "UNet"
     settings: dict[str, Any] = field(default_factory=dict)
+    start: str | None = None
 
 
 @dataclass
@@ -97,4 +100,5 @@ def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, vali
     """
     left_out = SAME_WEIGHTS if validation is not None else SAME_WEIGHTS | {"validate_every"}
     settings = {key: value for key, value in asdict(config).items() if key not in left_out}
-    return fingerprint("weights", asdict(network), settings, samples, validation)
+    architecture = {key: value for key, value in asdict(network).items() if value is not None}
+    return fingerprint("weights", architecture, settings, samples, validation)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import islice
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +82,7 @@ def test_pairs_are_the_same_however_they_are_loaded(
 
 def test_patches_are_cropped_then_turned_as_the_parameters_say(augment: RawAugment, pictures: list[Tensor]) -> None:
     pairs = RawPairs(pictures, augment, crop=16)
+    pairs.set_epoch(0)
     views = set()
     for i in range(COUNT):
         top, left, height, width, view = pairs[i].params.place.tolist()
@@ -96,6 +99,7 @@ def test_another_epoch_or_seed_is_another_draw(augment: RawAugment, pictures: li
     pairs = RawPairs(pictures, augment, crop=16, seed=7)
     first = pairs[0].clean
     pairs.set_epoch(1)
+    assert torch.equal(pairs[0].clean, pairs[0].clean)
     assert not torch.equal(pairs[0].clean, first)
     pairs.set_epoch(0)
     assert torch.equal(pairs[0].clean, first)
@@ -104,6 +108,7 @@ def test_another_epoch_or_seed_is_another_draw(augment: RawAugment, pictures: li
 
 def test_indices_are_those_of_a_sequence(augment: RawAugment, pictures: list[Tensor]) -> None:
     pairs = RawPairs(pictures, augment, crop=16)
+    pairs.set_epoch(0)
     assert torch.equal(pairs[-1].noisy, pairs[COUNT - 1].noisy)
     assert torch.equal(pairs[torch.tensor(3)].noisy, pairs[3].noisy)  # type: ignore[index]
     with pytest.raises(IndexError):
@@ -171,6 +176,53 @@ def test_small_pictures_and_odd_crops_are_refused(augment: RawAugment, pictures:
         RawPairs([torch.full((3, 8, 8), 255.0)], augment, crop=None)[0]
 
 
+def test_oblong_crops_are_flipped_only(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=(12, 20))
+    assert pairs[0].noisy.shape == (4, 6, 10)
+    assert {int(pairs[i].params.place[4]) for i in range(COUNT)} <= {0, 1, 2, 3}
+    pair = pairs[2]
+    assert torch.equal(pairs.replay(2, pair.params).noisy, pair.noisy)
+    for wrong in ((12, 21), (12,), "12", 12.0):
+        with pytest.raises(ValueError, match="even"):
+            RawPairs(pictures, augment, crop=wrong)  # type: ignore[arg-type]
+
+
+def test_flat_keys_are_where_a_script_looks(augment: RawAugment) -> None:
+    picture = np.zeros((16, 16, 3), np.uint8)
+
+    def sample(of: Any, key: Any = None, keys: Any = ("noisy", "clean")) -> Any:
+        pairs = RawPairs([of], augment, crop=16, key=key, keys=keys)
+        pairs.set_epoch(0)
+        return pairs[0]
+
+    pair, flat = sample(picture, keys=None), sample(picture)
+    assert list(flat) == ["noisy", "clean"]
+    assert torch.equal(flat["noisy"], pair.noisy) and torch.equal(flat["clean"], pair.clean)
+    named = sample({"image": picture, "id": 3}, "image", ("lq", "gt", "sigma2", "params"))
+    assert list(named) == ["id", "lq", "gt", "sigma2", "params"] and torch.equal(named["sigma2"], pair.variance)
+    assert list(sample({"image": picture}, "image", ("image", "clean"))) == ["image", "clean"]
+    assert list(sample((picture, 3))[0]) == ["noisy", "clean"]
+    with pytest.raises(ValueError, match="the samples have clean already"):
+        sample({"image": picture, "clean": 1}, "image")
+    for wrong in ("noisy", (), ("a", "a"), ("a", "b", "c", "d", "e")):
+        with pytest.raises(ValueError, match="noisy, clean, variance, params, in this order"):
+            sample(picture, keys=wrong)
+
+
+def test_what_makes_pairs_may_be_a_name(pictures: list[Tensor]) -> None:
+    assert RawPairs(pictures, "universal", crop=16)[0].noisy.shape == (4, 8, 8)
+    with pytest.raises(TypeError, match="name or path of an ISP, such as 'universal'; got int"):
+        RawPairs(pictures, 3)  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match="nosuch"):
+        RawPairs(pictures, Path("nosuch.safetensors"))
+
+
+def test_a_spawned_worker_gets_kilobytes(pictures: list[Tensor]) -> None:
+    stream = io.BytesIO()
+    ForkingPickler(stream).dump(RawPairs(pictures, RawAugment.from_pretrained("universal")))  # as Process.start does
+    assert len(stream.getvalue()) < 64_000  # the tables, of megabytes, are shared memory
+
+
 def test_whole_pictures_lose_their_odd_line(augment: RawAugment, pictures: list[Tensor]) -> None:
     assert RawPairs(pictures, augment, crop=None)[0].noisy.shape == (4, 10, 17)
 
@@ -230,7 +282,8 @@ def test_shards_keep_their_draws_by_identity(augment: RawAugment, pictures: list
     loaded = DataLoader(stream, batch_size=2, num_workers=workers)
     got = {key: noisy for s in loaded for key, noisy in zip(s["__key__"], s["jpg"].noisy, strict=True)}
     assert len(got) == COUNT
-    assert all(torch.equal(got[sample["__key__"]], sample["jpg"].noisy) for sample in stream)
+    again = RawPairStream(Shards(pictures), augment, crop=16, key="jpg", identity="__key__")
+    assert all(torch.equal(got[sample["__key__"]], sample["jpg"].noisy) for sample in again)
 
 
 def test_workers_of_a_stream_share_no_draw(augment: RawAugment) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,6 +160,7 @@ def test_processes_of_a_distributed_run_draw_apart(
 ) -> None:
     (alone,) = wrap([srgb], augment)
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
     drawn: list[RawPair] = []
     for rank in range(3):
         monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
@@ -164,3 +168,102 @@ def test_processes_of_a_distributed_run_draw_apart(
         drawn.append(RawAugment(augment.isp, seed=1)(srgb))
     assert torch.equal(drawn[0].noisy, alone.noisy)
     assert len({tuple(pair.params.isp.gains.flatten().tolist()) for pair in drawn}) == 6
+
+
+def shuffled(srgb: Tensor, workers: int = 0) -> DataLoader[Any]:
+    generator = torch.Generator().manual_seed(1)
+    return batches_of(srgb, 2, shuffle=True, generator=generator, num_workers=workers)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("done", [0, 1, 2, 3, 4])
+def test_a_state_goes_on_where_it_was_taken(augment: RawAugment, srgb: Tensor, done: int, workers: int) -> None:
+    straight = wrap(shuffled(srgb), augment)
+    expected = [pair.noisy for _ in range(3) for pair in straight]
+    first = wrap(shuffled(srgb, workers), augment)
+    for _ in range(done // 3):
+        noisy(first)
+    part = iter(first)
+    for _ in range(done % 3):
+        next(part)
+    resumed = wrap(shuffled(srgb, workers), augment)
+    resumed.load_state_dict(pickle.loads(pickle.dumps(first.state_dict())))
+    rest = [pair.noisy for _ in range(3 - done // 3) for pair in resumed]
+    assert len(rest) == 9 - done and all(map(torch.equal, rest, expected[done:]))
+
+
+def test_a_loop_that_stops_at_the_last_batch_has_ended_the_pass(augment: RawAugment, srgb: Tensor) -> None:
+    wrapped = wrap(batches_of(srgb, 2), augment)
+    list(islice(wrapped, len(wrapped)))
+    assert wrapped.state_dict() == {"epoch": 1, "batch": 0}
+    with pytest.raises(ValueError, match="not the state of a wrapped loader: batch missing"):
+        wrapped.load_state_dict({"epoch": 1})
+
+
+class Resumable(list[Tensor]):
+    """A loader that goes on by itself, as torchdata's StatefulDataLoader."""
+
+    seen = 0
+
+    def __iter__(self) -> Iterator[Tensor]:
+        while self.seen < len(self):
+            self.seen += 1
+            yield self[self.seen - 1]
+        self.seen = 0
+
+    def state_dict(self) -> dict[str, int]:
+        return {"seen": self.seen}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.seen = state["seen"]
+
+
+def test_a_loader_that_resumes_itself_passes_nothing_over(augment: RawAugment, srgb: Tensor) -> None:
+    expected = noisy(wrap([*srgb.split(2)], augment))
+    wrapped, resumed = (wrap(Resumable(srgb.split(2)), augment) for _ in range(2))
+    next(iter(wrapped))
+    resumed.load_state_dict(wrapped.state_dict())
+    assert torch.equal(noisy(resumed), expected[2:])
+
+
+def test_lightning_resumes_in_the_middle_of_an_epoch(augment: RawAugment, srgb: Tensor, tmp_path: Path) -> None:
+    lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
+
+    class Denoiser(lightning.LightningModule):  # type: ignore[name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.network, self.seen = torch.nn.Conv2d(4, 4, 1), list[float]()
+
+        def training_step(self, pair: RawPair, index: int) -> Tensor:
+            self.seen.append(float(pair.noisy.sum()))
+            return (self.network(pair.noisy) - pair.clean).abs().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.1)
+
+    def train(steps: int, checkpoint: Path | None = None) -> tuple[list[float], Any]:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = lightning.Trainer(max_steps=steps, accelerator="cpu", enable_model_summary=False, **quiet)
+        denoiser = Denoiser()
+        trainer.fit(denoiser, wrap(shuffled(srgb), augment), ckpt_path=checkpoint)
+        return denoiser.seen, trainer
+
+    expected, _ = train(7)
+    assert len(set(expected)) == 7
+    begun, trainer = train(4)
+    trainer.save_checkpoint(tmp_path / "at4.ckpt")
+    rest, _ = train(7, tmp_path / "at4.ckpt")
+    assert begun + rest == expected
+
+
+@pytest.mark.parametrize("crop", [(4, 8), [4, 8]])
+def test_flat_keys_and_oblong_crops(augment: RawAugment, srgb: Tensor, crop: Any) -> None:
+    loader = [{"image": srgb, "id": 3}]
+    (batch,) = wrap(loader, augment, key="image", crop=crop, keys=("lq", "gt"))
+    assert list(batch) == ["id", "lq", "gt"] and batch["gt"].shape == (6, 4, 2, 4)
+
+
+def test_an_isp_or_its_name_makes_the_augmentation(augment: RawAugment, srgb: Tensor) -> None:
+    assert torch.equal(noisy(wrap([srgb], augment.isp)), noisy(wrap([srgb], augment)))
+    with pytest.raises(FileNotFoundError, match="nosuch"):
+        wrap([srgb], "nosuch")

@@ -46,10 +46,10 @@ def test_a_batch_replays_from_its_file(pairs: RawPairs, tmp_path: Path) -> None:
 
 
 def test_a_flat_dict_is_the_same(pairs: RawPairs) -> None:
-    params = pairs[1].params
-    again = AugmentParams.from_tensors(params.tensors())
-    assert again.noise.keys() == params.noise.keys() and again.isp._fields == params.isp._fields
-    assert torch.equal(pairs.replay(1, again).noisy, pairs[1].noisy)
+    pair = pairs[1]
+    again = AugmentParams.from_tensors(pair.params.tensors())
+    assert again.noise.keys() == pair.params.noise.keys() and again.isp._fields == pair.params.isp._fields
+    assert torch.equal(pairs.replay(1, again).noisy, pair.noisy)
 
 
 def test_replay_refuses_another_picture(pairs: RawPairs) -> None:

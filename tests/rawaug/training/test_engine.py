@@ -33,6 +33,7 @@ from rawaug.training.estimators import Noisier, Neighbor2Neighbor
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import TrainingStream
 from rawaug.training.loop import train
+from rawaug.training.validation import Watched
 
 where, steps, devices, names = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 generator = torch.Generator().manual_seed(0)
@@ -42,11 +43,12 @@ config = TrainConfig(
     learning_rate=3e-3,
 )
 network = DenoiserConfig("UNet", {"width": 4, "scales": 2})
+watched = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
 for name in names.split():
     estimator = {"noisier": Noisier(1.0, correct=True), "neighbor2neighbor": Neighbor2Neighbor()}[name]
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     folder = where / name
-    net = train(stream, held_out([frame], CFA.RGGB), network, config, folder, 0, "cpu", devices, estimator=estimator)
+    net = train(stream, watched, network, config, folder, 0, "cpu", devices, estimator=estimator)
     save_file(net.state_dict(), folder / f"end{sys.argv[5] if len(sys.argv) > 5 else ''}.safetensors")
 """
 

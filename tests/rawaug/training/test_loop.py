@@ -16,7 +16,6 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
@@ -24,6 +23,7 @@ from rawaug.training import loop
 from rawaug.training.estimators import Supervised
 from rawaug.training.stream import RealCrops, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched, validate
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
 CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
@@ -36,26 +36,26 @@ def stream() -> TrainingStream:
 
 
 @pytest.fixture(scope="module")
-def validation() -> list[Sample]:
+def validation() -> list[Watched]:
     pair = demo_pairs("validation", count=1)[0]
-    return [frozen_sample(pair, noise_model("cycleisp_sidd"), CFA.GRBG, seed=0)]
+    return [Watched(*frozen_sample(pair, noise_model("cycleisp_sidd"), CFA.GRBG, seed=0))]
 
 
 def test_it_learns_to_denoise(tmp_path: Path) -> None:
     noise = noise_model((0.02, 1e-3))
     pair = replace(demo_pairs("train", count=1)[0], noisy=None, shot_var=None, read_var=None)
     stream = TrainingStream(RealCrops([pair], noise, 32, pair.cfa), None, 4, 0.0, seed=0)
-    validation = [frozen_sample(pair, noise, pair.cfa, seed=0)]
+    validation = [Watched(*frozen_sample(pair, noise, pair.cfa, seed=0))]
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2, "deviation": True})
     config = replace(CONFIG, steps=120, batch=4, ema=0.9)
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
     noisy = psnr(validation[0].noisy, validation[0].clean).item()
-    assert loop.validate(net, validation, torch.device("cpu")) > noisy + 2.0
+    assert validate(net, validation, torch.device("cpu"))["psnr"] > noisy + 2.0
     assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,learning_rate,samples_per_second"
 
 
 def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
-    stream: TrainingStream, validation: list[Sample], tmp_path: Path
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path
 ) -> None:
     whole = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "whole", device="cpu")
 
@@ -79,7 +79,7 @@ def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
 
 
 def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
-    stream: TrainingStream, validation: list[Sample], tmp_path: Path
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path
 ) -> None:
     losses = []
 
@@ -107,27 +107,27 @@ def test_a_large_validation_frame_is_seen_in_tiles() -> None:
             return noisy
 
     frame = torch.rand(1, 4, 1500, 2000, generator=torch.Generator().manual_seed(0))  # 12 Mpix
-    sample = Sample(frame + 0.1, frame, torch.full_like(frame, 1e-3))
-    assert loop.validate(Note(), [sample], torch.device("cpu")) == pytest.approx(20.0, abs=1e-3)
+    sample = Watched(frame + 0.1, frame, torch.full_like(frame, 1e-3))
+    assert validate(Note(), [sample], torch.device("cpu"))["psnr"] == pytest.approx(20.0, abs=1e-3)
     assert len(seen) > 1 and max(seen) <= 1536
 
 
 @pytest.mark.parametrize("choose", [True, False])
 def test_the_best_weights_are_kept_or_the_last(
-    choose: bool, stream: TrainingStream, validation: list[Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    choose: bool, stream: TrainingStream, validation: list[Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scores, seen = iter([40.0, 30.0]), []
 
-    def validate(net: torch.nn.Module, *_: object) -> float:
+    def scored(net: torch.nn.Module, *_: object) -> dict[str, float]:
         seen.append({key: value.clone() for key, value in net.state_dict().items()})
-        return next(scores)
+        return {"psnr": next(scores)}
 
-    monkeypatch.setattr(loop, "validate", validate)
+    monkeypatch.setattr(loop, "validate", scored)
     kept = loop.train(stream, validation, NETWORK, CONFIG, tmp_path, device="cpu", choose=choose).state_dict()
     assert all(torch.equal(kept[key], value) for key, value in seen[0 if choose else 1].items())
 
 
-def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Sample], tmp_path: Path) -> None:
+def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Watched], tmp_path: Path) -> None:
     config = replace(CONFIG, learning_rate=1e30, clip_norm=0.0, warmup=0)
     with pytest.raises(ValueError, match="diverged"):
         loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
@@ -163,3 +163,13 @@ def test_the_rate_warms_up_and_falls() -> None:
     assert factors[0] == 0.5 and factors[2] == 1.0
     assert factors[-1] == pytest.approx(0.01)
     assert all(a >= b for a, b in pairwise(factors[2:]))
+
+
+def test_a_log_that_was_begun_with_other_columns_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("step,loss,psnr\n1,0.5,30\n2,0.4,31\n3,0.3,3")
+    journal = loop.Journal(tmp_path, 2)
+    journal.log(3, loss=0.25, psnr=32.0, psnr_srgb=25.0)
+    journal.log(4, loss=0.25, psnr=33.0, psnr_srgb=26.0)
+    journal.close()
+    rows = (tmp_path / "log.csv").read_text().splitlines()
+    assert rows == ["step,loss,psnr,psnr_srgb", "1,0.5,30,", "2,0.4,31,", "3,0.25,32,25", "4,0.25,33,26"]

@@ -13,7 +13,6 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
 from rawaug.experiment.arms import training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
@@ -21,10 +20,11 @@ from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, variance_of
-from rawaug.training.loop import train, validate
+from rawaug.training.loop import train
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
 from rawaug.training.stream import TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.validation import Watched, validate
 
 LEVELS = (0.01, 1e-3)
 
@@ -169,7 +169,8 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     config = TrainConfig(steps=120, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
-    net = train(stream, held_out([frame], CFA.RGGB), network, config, tmp_path, device="cpu", estimator=estimator)
+    frames = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
+    net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)
     packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
-    sample = Sample(unseen, packed, variance_of(unseen, 0.01, 1e-3))
-    assert validate(net, [sample], torch.device("cpu")) > float(psnr(unseen, packed)) + 1.0
+    sample = Watched(unseen, packed, variance_of(unseen, 0.01, 1e-3))
+    assert validate(net, [sample], torch.device("cpu"))["psnr"] > float(psnr(unseen, packed)) + 1.0

@@ -1,0 +1,227 @@
+r"""Denoisers over noise: every method on the same frames under the noise of one camera, ISO by ISO.
+
+The frames are clean RAW; noise of variance ``shot_var y + read_var`` is frozen by (seed, frame, ISO). PSNR and SSIM are
+taken on the mosaic and once more after one fixed development to sRGB. Time is that of denoising alone.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import denoisers
+from denoisers.pretrained import DEFAULT, find
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.evaluation.page import write_figure_page
+from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
+from rawaug.evaluation.tables import METRICS
+from rawaug.files import replacing, write_json
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.registry import Spec
+
+TITLES = {"psnr": "PSNR, RAW (dB)", "ssim": "SSIM, RAW", "psnr_srgb": "PSNR, sRGB (dB)", "ssim_srgb": "SSIM, sRGB"}
+
+
+@dataclass
+class DenoiserSweep:
+    """A comparison of denoisers that trains nothing.
+
+    Args:
+        experiment: "denoisers".
+        name: of the folder in ``out`` that it writes.
+        data: frames of clean RAW: folders, files, or ``kind:path``.
+        count: how many frames of each are used; all if null.
+        crop: side of the middle of each frame that is scored; null for the whole frame.
+        camera: whose noise is added, see :mod:`rawaug.noise.by_name`.
+        isos: the ISOs, each within what was measured for that camera.
+        denoisers: names of shipped ones, or files of ``rawaug run``.
+        classical: classical denoisers; BM3D is left out, with a line that says so, where its wheel is not installed.
+        pmrid: file of PMRID's published weights; null leaves them out.
+        seed: of the noise.
+        device: where networks run: cpu, cuda, ...
+        out: folder of all runs.
+    """
+
+    experiment: str = "denoisers"
+    name: str = "denoisers"
+    data: list[str] = field(default_factory=lambda: ["demo:test"])
+    count: int | None = None
+    crop: int | None = None
+    camera: str = "Sony ILCE-7M3"
+    isos: list[int] = field(default_factory=lambda: [100, 400, 1600, 6400, 25600])
+    denoisers: list[str] = field(default_factory=lambda: [DEFAULT])
+    classical: list[str | dict[str, Any]] = field(default_factory=lambda: ["NonLocalMeans"])
+    pmrid: str | None = None
+    seed: int = 0
+    device: str = "cpu"
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        if not self.isos or not self.data or not (self.denoisers or self.classical or self.pmrid):
+            raise ValueError("isos, data and denoisers: give at least one each")
+        if self.crop is not None and (self.crop < 32 or self.crop % 2):
+            raise ValueError(f"crop is even and at least 32, or null for whole frames, got {self.crop}")
+
+
+def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
+    """The sweep in seconds, on the demo camera, without any trained denoiser."""
+    name = f"{settings.name}-smoke"
+    quick: dict[str, Any] = {
+        "data": ["demo:test"],
+        "count": 1,
+        "crop": 128,
+        "isos": settings.isos[:2],
+        "denoisers": [],
+        "pmrid": None,
+    }
+    return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
+
+
+def sweep(settings: DenoiserSweep) -> dict[str, Any]:
+    """Run a sweep; what stands in ``table.json``: by method its scores by ISO and its seconds a mosaic megapixel."""
+    noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
+    makers = _makers(settings)
+    frames = [_clean(pair, settings.crop) for spec in settings.data for pair in _opened(spec, settings.count)]
+    rows: dict[str, Any] = {}
+    for name, make in makers.items():
+        seconds, rows[name] = list[float](), {"iso": {}}
+        for iso, noise in noises.items():
+            scores = [_scored(make, pair, noise, settings.seed, f"{name}, ISO {iso}", seconds) for pair in frames]
+            rows[name]["iso"][str(iso)] = {key: fmean(score[key] for score in scores) for key in METRICS}
+        rows[name]["seconds_per_megapixel"] = sum(seconds) / len(noises) / sum(p.raw.numel() / 1e6 for p in frames)
+    result = {"settings": asdict(settings), "threads": torch.get_num_threads(), "frames": len(frames), "rows": rows}
+    _report(result, settings)
+    return result
+
+
+def _opened(spec: str, count: int | None) -> Sequence[Pair]:
+    pairs = open_pairs(spec, split="test")
+    return pairs if count is None else pairs[:count]
+
+
+def _clean(pair: Pair, crop: int | None) -> Pair:
+    """The middle of a frame, without its own noisy capture."""
+    middle = pair if crop is None else pair.middle(crop)
+    return replace(middle, noisy=None, shot_var=None, read_var=None)
+
+
+Maker = Callable[[Pair, NoiseModel, int], Method]
+"""Of a frame, its noise and the seed: what denoises it."""
+
+
+def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
+    """Every method by name, the noisy input first."""
+    makers: dict[str, Maker] = {"noisy input": lambda pair, noise, seed: lambda _, sample: sample.noisy}
+    for spec in installed_classical(settings.classical):
+        makers[label_of(spec)] = _filter(spec)
+    for name in settings.denoisers:
+        model, info = denoisers.load(find(name))
+        makers[Path(name).stem] = _network(model.to(settings.device), CFA(info.get("cfa", "RGGB")), clip=False)
+    if settings.pmrid is not None:
+        makers["PMRID as published"] = _network(_published(settings.pmrid).to(settings.device), CFA.RGGB, clip=True)
+    return makers
+
+
+def _filter(spec: Spec) -> Maker:
+    return lambda pair, noise, seed: classical_method(spec, noise, seed)
+
+
+def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:
+    def make(pair: Pair, noise: NoiseModel, seed: int) -> Method:
+        def method(_: Pair, sample: Sample) -> Tensor:
+            denoised = denoise(model, sample, CFA(pair.cfa), self_ensemble=False, own=own)
+            return denoised.clamp(0.0, 1.0) if clip else denoised
+
+        return method
+
+    return make
+
+
+def _published(path: str) -> denoisers.PMRID:
+    """PMRID with the weights of its authors.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such file, or it does not fit the network.
+    """
+    from rawaug.files import read_tensors
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"pmrid: {path}: no such file")
+    model = denoisers.PMRID()
+    try:
+        model.load_state_dict(read_tensors(path, "convert the published weights again")[1])
+    except RuntimeError as error:
+        raise ValueError(f"pmrid: {path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
+    return model.eval()
+
+
+def _scored(
+    make: Maker, pair: Pair, noise: NoiseModel, seed: int, label: str, seconds: list[float]
+) -> dict[str, float]:
+    method = make(pair, noise, seed)
+
+    def timed(pair: Pair, sample: Sample) -> Tensor:
+        start = time.perf_counter()
+        denoised = method(pair, sample)
+        seconds.append(time.perf_counter() - start)
+        return denoised
+
+    score = next(score_method(timed, [pair], noise, CFA(pair.cfa), seed, label))[0]
+    return {key: getattr(score, key) for key in METRICS}
+
+
+def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
+    """``table.json``, the figure, the page and the printed table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    folder, rows = Path(settings.out) / settings.name, result["rows"]
+    write_json(result, folder / "table.json")
+    png = _figure(rows, settings)
+    with replacing(folder / "figure.png") as partial:
+        partial.write_bytes(png)
+    title = f"{settings.name}: {result['frames']} frames, noise of {settings.camera}"
+    head = ["PSNR / PSNR sRGB (dB)", *(f"ISO {iso}" for iso in settings.isos), "s a megapixel"]
+    cells = {
+        name: [
+            *(f"{at['psnr']:.2f} / {at['psnr_srgb']:.2f}" for at in row["iso"].values()),
+            f"{row['seconds_per_megapixel']:.2f}" if name != "noisy input" else "",
+        ]
+        for name, row in rows.items()
+    }
+    page = write_figure_page(folder / "report.html", title, png, head, cells, asdict(settings))
+    table = Table(title=f"{title}; {result['threads']} thread(s)")
+    for k, column in enumerate(head):
+        table.add_column(column, justify="right" if k else "left")
+    for name, row in cells.items():
+        table.add_row(name, *row)
+    Console(width=140).print(table)
+    print(f"table: {folder / 'table.json'}\nfigure: {folder / 'figure.png'}\npage: {page}")
+
+
+def _figure(rows: dict[str, Any], settings: DenoiserSweep) -> bytes:
+    """The four scores over the ISO."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    for axis, (key, label) in zip(figure.subplots(2, 2).flat, TITLES.items(), strict=True):
+        for name, row in rows.items():
+            style = {"color": "grey", "linestyle": ":"} if name == "noisy input" else {"marker": "o"}
+            axis.plot(settings.isos, [at[key] for at in row["iso"].values()], label=name, **style)
+        axis.set(xscale="log", xlabel=f"ISO of {settings.camera}", ylabel=label)
+        axis.set_xticks(settings.isos, [str(iso) for iso in settings.isos])
+    axis.legend(fontsize=8)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=110)
+    return file.getvalue()

@@ -1,0 +1,73 @@
+r"""What a training is watched by: PSNR on frozen frames, in RAW and developed to sRGB, by how noisy they are.
+
+The frames are sorted by their mean noise variance and split in thirds: *low*, *middle* and *high*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from statistics import fmean
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+import denoisers
+from rawaug.bayer import CFA
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.pair import Pair
+from rawaug.data.sample import Sample
+from rawaug.metrics import psnr
+
+PARTS = ("low", "middle", "high")
+
+
+class Watched(NamedTuple):
+    """A frozen frame.
+
+    Args:
+        noisy, clean, variance: packed RAW ``(1, 4, h, w)``.
+        develop: packed RAW to sRGB ``(3, 2h, 2w)``, where the camera is known.
+    """
+
+    noisy: Tensor
+    clean: Tensor
+    variance: Tensor
+    develop: Callable[[Tensor], Tensor] | None = None
+
+
+def watched(sample: Sample, pair: Pair, cfa: CFA) -> Watched:
+    """A sample of a frame, to be developed as that frame is."""
+    exposure = exposure_of(sample.clean, pair)
+    return Watched(*sample, partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure))
+
+
+@torch.no_grad()
+def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) -> dict[str, float]:
+    """Mean PSNR in dB, large frames in tiles.
+
+    Returns:
+        ``psnr`` over all frames; with three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
+        and the same as ``psnr_srgb``, ... where every frame can be developed.
+    """
+    net.eval()
+    raw, srgb = [], []
+    for frame in frames:
+        denoised = denoisers.tiled(net, frame.noisy.to(device), frame.variance.to(device)).cpu()
+        raw.append(psnr(denoised, frame.clean).mean().item())
+        if frame.develop is not None:
+            srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())
+    net.train()
+    noise = [frame.variance.mean().item() for frame in frames]
+    scores = _by_part("psnr", raw, noise)
+    return scores | (_by_part("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
+
+
+def _by_part(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:
+    result, count = {name: fmean(scores)}, len(scores)
+    order = sorted(range(count), key=lambda k: noise[k])
+    for part, label in enumerate(PARTS if count >= len(PARTS) else ()):
+        third = order[part * count // len(PARTS) : (part + 1) * count // len(PARTS)]
+        result[f"{name}_{label}"] = fmean(scores[k] for k in third)
+    return result

@@ -1,0 +1,47 @@
+"""rawaug export: an ONNX file of any size that gives PyTorch's numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import denoisers
+from rawaug.cli import main
+from rawaug.commands.export import export, session_of
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    model = denoisers.build("PMRID", width=4, variance_map=True)
+    model.initialise(seed=1, gain=0.8)
+    path = tmp_path / "small.safetensors"
+    denoisers.save(model, path, {"cfa": "RGGB"})
+    return path
+
+
+def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name, reason="pip install rawaug[export]")
+    out = tmp_path / "small.onnx"
+    assert main(["export", str(weights), str(out)]) == 0
+    assert "largest difference from PyTorch" in capsys.readouterr().out
+    session, model = session_of(out), denoisers.from_pretrained(weights)
+    for height, width in ((64, 32), (31, 45), (5, 130)):
+        noisy = torch.rand(1, 4, height, width, generator=torch.Generator().manual_seed(0)) - 0.05
+        variance = 1e-3 * noisy.clamp_min(0.0) + 1e-5
+        (denoised,) = session.run(None, {"noisy": noisy.numpy(), "variance": variance.numpy()})
+        with torch.no_grad():
+            expected = model(noisy, variance)
+        assert (expected - noisy).abs().max() > 1e-3
+        assert (torch.from_numpy(denoised) - expected).abs().max() < 1e-4
+
+
+def test_what_is_missing_is_said_in_one_line(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rawaug.commands.export.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"export needs onnx, onnxscript, onnxruntime: pip install 'rawaug\[export\]'"):
+        export(weights, tmp_path / "a.onnx")
+    monkeypatch.setattr("rawaug.commands.export.find_spec", lambda name: True)
+    with pytest.raises(ValueError, match=r"ends in \.onnx"):
+        export(weights, tmp_path / "a.pt")

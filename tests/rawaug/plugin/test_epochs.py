@@ -1,0 +1,241 @@
+"""Epochs that nobody announces: every pass draws anew, and the same again where it is asked for."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset, Subset, WeightedRandomSampler, get_worker_info
+
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.epochs import MAX_WORKERS, Passes, Visits
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")  # more workers than cores, on purpose
+
+COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def augment() -> RawAugment:
+    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[Tensor]:
+    return list(torch.randint(256, (COUNT, 3, 12, 14), generator=torch.Generator().manual_seed(0), dtype=torch.uint8))
+
+
+class Strided(IterableDataset[Tensor]):
+    """Pictures in order, picture i to worker i mod W."""
+
+    def __init__(self, pictures: list[Tensor]) -> None:
+        self.pictures = pictures
+
+    def __iter__(self) -> Iterator[Tensor]:
+        info = get_worker_info()
+        return islice(iter(self.pictures), *((info.id, None, info.num_workers) if info else (0, None, 1)))
+
+
+def one_pass(loader: Any) -> Tensor:
+    return torch.cat([pair.noisy for pair in loader])
+
+
+@pytest.fixture(scope="module")
+def epochs(augment: RawAugment, pictures: list[Tensor]) -> list[Tensor]:
+    """Three epochs, each pinned."""
+    pairs, passes = RawPairs(pictures, augment, crop=8, seed=3), []
+    for epoch in range(3):
+        pairs.set_epoch(epoch)
+        passes.append(torch.stack([pairs[i].noisy for i in range(COUNT)]))
+    return passes
+
+
+LOADERS: list[dict[str, Any]] = [
+    {"num_workers": 0, "batch_size": 2},
+    {"num_workers": 1, "batch_size": 4, "multiprocessing_context": "fork"},
+    {"num_workers": 2, "batch_size": 1, "multiprocessing_context": "fork"},
+    {"num_workers": 2, "batch_size": 1, "multiprocessing_context": "fork", "persistent_workers": True},
+    {"num_workers": 1, "batch_size": 3, "multiprocessing_context": "spawn"},
+    {"num_workers": 1, "batch_size": 3, "multiprocessing_context": "forkserver", "persistent_workers": True},
+]
+
+
+def named(settings: dict[str, Any]) -> str:
+    return "-".join(str(value) for value in settings.values())
+
+
+@pytest.mark.parametrize("settings", LOADERS, ids=named)
+def test_every_pass_is_the_next_epoch(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any]
+) -> None:
+    loader = DataLoader(RawPairs(pictures, augment, crop=8, seed=3), **settings)
+    for expected in epochs[:2]:
+        assert torch.equal(one_pass(loader), expected)
+
+
+@pytest.mark.parametrize("settings", [s for s in LOADERS if s.get("multiprocessing_context") != "spawn"], ids=named)
+def test_every_pass_of_a_stream_is_the_next_epoch(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any]
+) -> None:
+    loader = DataLoader(RawPairs(Strided(pictures), augment, crop=8, seed=3), **settings)
+    for expected in epochs[:2]:
+        assert torch.equal(one_pass(loader), expected)
+
+
+def test_draws_with_replacement_never_repeat(augment: RawAugment, pictures: list[Tensor]) -> None:
+    sampler = WeightedRandomSampler([1.0] * 2, 20, generator=torch.Generator().manual_seed(0))
+    noisy = one_pass(DataLoader(RawPairs(pictures[:2], augment, crop=8), batch_size=5, sampler=sampler))
+    assert len({float(patch.sum()) for patch in noisy}) == 20
+
+
+def test_a_pinned_epoch_stays(augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=8, seed=3)
+    loader = DataLoader(pairs, batch_size=2)
+    one_pass(loader)
+    pairs.set_epoch(2)
+    assert torch.equal(one_pass(loader), epochs[2]) and torch.equal(one_pass(loader), epochs[2])
+    again = RawPairs(pictures, augment, crop=8, seed=3)
+    again.load_state_dict(pairs.state_dict())
+    assert torch.equal(one_pass(DataLoader(again, batch_size=4)), epochs[2])
+    with pytest.raises(ValueError, match="at least 0, got -1"):
+        pairs.set_epoch(-1)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_state_goes_on_between_passes(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], workers: int
+) -> None:
+    pairs = RawPairs(pictures, augment, crop=8, seed=3)
+    one_pass(DataLoader(pairs, num_workers=workers))
+    resumed = RawPairs(pictures, augment, crop=8, seed=3)
+    resumed.load_state_dict(pickle.loads(pickle.dumps(pairs.state_dict())))
+    assert torch.equal(one_pass(DataLoader(resumed, num_workers=workers)), epochs[1])
+
+
+def test_a_state_goes_on_in_the_middle_of_a_pass(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor]
+) -> None:
+    order = [4, 2, 0, 5, 1, 3]
+    pairs = RawPairs(pictures, augment, crop=8, seed=3)
+    one_pass(DataLoader(pairs))
+    list(islice(DataLoader(pairs, sampler=order), 2))
+    resumed = RawPairs(pictures, augment, crop=8, seed=3)
+    resumed.load_state_dict(pairs.state_dict())
+    assert torch.equal(one_pass(DataLoader(resumed, sampler=order[2:])), epochs[1][order[2:]])
+    assert torch.equal(one_pass(DataLoader(resumed, sampler=order)), epochs[2][order])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_stream_goes_on_in_the_middle_of_a_pass(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], workers: int
+) -> None:
+    stream = RawPairStream(Strided(pictures), augment, crop=8, seed=3)
+    one_pass(DataLoader(stream))
+    list(islice(DataLoader(stream), 2))
+    resumed = RawPairStream(Strided(pictures), augment, crop=8, seed=3)
+    resumed.load_state_dict(stream.state_dict())
+    loader = DataLoader(resumed, num_workers=workers)
+    assert torch.equal(one_pass(loader), epochs[1][2:])
+    assert torch.equal(one_pass(loader), epochs[2])
+
+
+def test_other_states_are_refused(augment: RawAugment, pictures: list[Tensor]) -> None:
+    pairs = RawPairs(pictures, augment, crop=8)
+    with pytest.raises(ValueError, match="that of 2 pictures, the dataset has 6"):
+        pairs.load_state_dict(RawPairs(pictures[:2], augment, crop=8).state_dict())
+    with pytest.raises(ValueError, match="epoch, visits; got epoch, passes, position"):
+        pairs.load_state_dict(RawPairStream(Strided(pictures), augment, crop=8).state_dict())
+    growing = list(pictures)
+    pairs = RawPairs(growing, augment, crop=8)
+    growing.append(pictures[0])
+    with pytest.raises(ValueError, match="grown from 6 pictures"):
+        pairs[6]
+
+
+def test_a_copy_counts_for_itself_and_its_workers(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor]
+) -> None:
+    pairs = RawPairs(pictures, augment, crop=8, seed=3)
+    for other in (copy.deepcopy(pairs), pickle.loads(pickle.dumps(pairs))):
+        loader = DataLoader(Subset(other, range(COUNT)), num_workers=1, batch_size=COUNT)
+        assert torch.equal(one_pass(loader), epochs[0]) and torch.equal(one_pass(loader), epochs[1])
+    assert torch.equal(one_pass(DataLoader(pairs)), epochs[0])
+
+
+def test_processes_draw_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    visits = Visits(2)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    assert visits.key(0) == (0, 0, 1)
+    assert visits.state_dict()["visits"].tolist() == [1, 1]  # of two pictures in two processes, a pass each
+    state = pickle.dumps(visits)
+    monkeypatch.undo()
+    in_a_spawned_worker = pickle.loads(state)
+    assert in_a_spawned_worker.key(0) == (1, 0, 1)
+    visits.pin(5)
+    assert visits.key(1) == (5, 1)
+
+
+def test_another_number_of_workers_repeats_no_pass() -> None:
+    passes = Passes()
+    begun = [[passes.begin(workers, w)[0] for w in range(max(workers, 1))] for workers in (4, 2, 0, 4)]
+    assert begun == [[0] * 4, [1] * 2, [2], [3] * 4]
+    with pytest.raises(ValueError, match=f"at most {MAX_WORKERS} workers"):
+        passes.begin(MAX_WORKERS + 1, 0)
+
+
+@pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator")
+@pytest.mark.filterwarnings("ignore:.*does not have many workers")
+def test_lightning_resumes_without_a_warning(
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], tmp_path: Path
+) -> None:
+    lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
+
+    class Pictures(lightning.LightningDataModule):  # type: ignore[name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.pairs = RawPairs(pictures, augment, crop=8, seed=3)
+
+        def train_dataloader(self) -> DataLoader[Any]:
+            return DataLoader(self.pairs, 3, num_workers=1, persistent_workers=True, pin_memory=True)
+
+        def state_dict(self) -> dict[str, Any]:
+            return self.pairs.state_dict()
+
+        def load_state_dict(self, state: dict[str, Any]) -> None:
+            self.pairs.load_state_dict(state)
+
+    class Seeing(lightning.LightningModule):  # type: ignore[name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight, self.seen = torch.nn.Parameter(torch.ones(1)), list[Tensor]()
+
+        def training_step(self, pair: Any, index: int) -> Tensor:
+            self.seen.append(pair.noisy)
+            return (self.weight * pair.noisy - pair.clean).abs().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.1)
+
+    def train(until: int, checkpoint: Path | None = None) -> tuple[Tensor, Any]:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = lightning.Trainer(max_epochs=until, accelerator="cpu", enable_model_summary=False, **quiet)
+        seeing = Seeing()
+        trainer.fit(seeing, Pictures(), ckpt_path=checkpoint)
+        return torch.cat(seeing.seen), trainer
+
+    begun, trainer = train(2)
+    trainer.save_checkpoint(tmp_path / "two.ckpt")
+    rest, _ = train(3, tmp_path / "two.ckpt")
+    assert torch.equal(torch.cat([begun, rest]), torch.cat(epochs))

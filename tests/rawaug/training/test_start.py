@@ -1,0 +1,82 @@
+"""Where a training starts: drawn weights, or those of a file whose architecture must agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+import denoisers
+from rawaug.bayer import CFA
+from rawaug.data import demo_pairs
+from rawaug.evaluation.scores import denoise, frozen_sample
+from rawaug.experiment.arms import in_pattern
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import noise_model
+from rawaug.training.start import first_network, start_of
+from rawaug.training.train_config import DenoiserConfig
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    path = tmp_path / "trained.safetensors"
+    denoisers.save(
+        denoisers.build("NAFNet", width=4, encoder=[1], middle=1, decoder=[1], seed=9), path, {"cfa": "GBRG"}
+    )
+    return path
+
+
+def test_a_start_gives_its_weights_and_its_architecture(weights: Path) -> None:
+    expected = denoisers.load(weights)[0].state_dict()
+    agreeing = DenoiserConfig("NAFNet", {"width": 4, "encoder": [1], "middle": 1, "decoder": [1]}, str(weights))
+    for config in (DenoiserConfig(start=str(weights)), agreeing):
+        model = first_network(config, seed=0)
+        assert model.training
+        assert all(torch.equal(value, expected[key]) for key, value in model.state_dict().items())
+    start = start_of(agreeing)
+    assert start is not None and start.cfa == CFA.GBRG and len(start.sha256) == 64
+    assert start_of(DenoiserConfig()) is None
+
+
+def test_another_architecture_is_refused_in_one_line(weights: Path) -> None:
+    for config in (DenoiserConfig("UNet", {"width": 4}, str(weights)), DenoiserConfig("NAFNet", {}, str(weights))):
+        with pytest.raises(ValueError, match=r"denoiser\.start: .* is a NAFNet with .*; leave denoiser\.name") as error:
+            first_network(config, seed=0)
+        assert "\n" not in str(error.value)
+    with pytest.raises(FileNotFoundError, match="nothing: no such denoiser"):
+        first_network(DenoiserConfig(start="nothing"), seed=0)
+
+
+def test_without_a_start_the_seed_draws_the_weights() -> None:
+    config = DenoiserConfig("UNet", {"width": 4, "scales": 2})
+    first, again, other = (first_network(config, seed).state_dict() for seed in (1, 1, 2))
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
+def test_an_isp_behind_another_pattern_has_the_same_colours() -> None:
+    isp = DictionaryISP(ISPConfig(cfa="GRBG"), seed=0)
+    other = in_pattern(isp, CFA.RGGB)
+    assert (str(isp.cfa), str(other.cfa)) == ("GRBG", "RGGB") and in_pattern(isp, CFA.GRBG) is isp
+    grey = torch.full((1, 3, 8, 8), 128, dtype=torch.uint8)
+    ours, theirs = (x.reverse(grey).raw for x in (isp, other))
+    assert torch.equal(ours[..., 0::2, 1::2], theirs[..., 0::2, 0::2])  # red
+
+
+def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
+    class Red(denoisers.UNet):
+        def forward(self, noisy: torch.Tensor, variance: torch.Tensor | None = None) -> torch.Tensor:
+            red_is_first = noisy[:, :1].mean() < noisy[:, 1:2].mean()
+            assert red_is_first
+            return noisy * torch.tensor([2.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1, 1)
+
+    pair = demo_pairs("test", count=1)[0]
+    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
+    for own in CFA:
+        denoised = denoise(Red(width=4, scales=2), sample, pair.cfa, False, own)
+        # The two greens may exchange their names where the pattern moves by a line.
+        ratio = denoised.sum((0, 2, 3)) / sample.noisy.sum((0, 2, 3))
+        assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0], rel=1e-4)
+        assert sorted(ratio[1:3].tolist()) == pytest.approx([3.0, 5.0], rel=1e-4)

@@ -1,0 +1,43 @@
+"""Scores of a training: RAW and sRGB, and the thirds by noise."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug.data import demo_pairs
+from rawaug.evaluation.scores import compared, frozen_sample
+from rawaug.noise import noise_model
+from rawaug.training.validation import Watched, validate, watched
+
+CPU = torch.device("cpu")
+
+
+class Nothing(torch.nn.Module):
+    """Gives back its input."""
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        return noisy
+
+
+def test_thirds_by_noise_whatever_the_order() -> None:
+    clean = torch.full((1, 4, 8, 8), 0.5)
+    errors = [0.1, 0.001, 0.01, 0.1, 0.001, 0.01, 0.01]
+    frames = [Watched(clean + error, clean, torch.full_like(clean, error**2)) for error in errors]
+    scores = validate(Nothing(), frames, CPU)
+    assert set(scores) == {"psnr", "psnr_low", "psnr_middle", "psnr_high"}
+    assert scores["psnr_low"] == pytest.approx(60.0, abs=0.01) and scores["psnr_middle"] == pytest.approx(
+        40.0, abs=0.01
+    )
+    assert scores["psnr_high"] == pytest.approx((40.0 + 20.0 + 20.0) / 3, abs=0.01)
+    assert scores["psnr"] == pytest.approx((2 * 60.0 + 3 * 40.0 + 2 * 20.0) / 7, abs=0.01)
+    assert set(validate(Nothing(), frames[:2], CPU)) == {"psnr"}
+
+
+def test_srgb_is_that_of_the_evaluation() -> None:
+    pair = demo_pairs("validation", count=1)[0]
+    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
+    scores = validate(Nothing(), [watched(sample, pair, pair.cfa)], CPU)
+    expected = compared(sample.noisy, sample.clean, pair.cfa, pair)
+    assert (scores["psnr"], scores["psnr_srgb"]) == pytest.approx((expected[0], expected[2]), abs=1e-3)
