@@ -19,6 +19,7 @@ from rawaug.io import encode_srgb, read_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
+from rawaug.isp.tone_curves import STEPS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
 from rawaug.registry import COMMANDS
@@ -130,7 +131,7 @@ def _tone_curves(axis: Any, isp: DictionaryISP) -> None:
     """What grey becomes: every tone atom in grey, the learned or typical curve in colour."""
     grey = torch.linspace(0, 1, 256)
     if isp.tone is not None:
-        axis.plot(grey.numpy(), isp.tone.curves[:, ::8].T.numpy(), color="0.75", linewidth=0.8)
+        axis.plot(grey.numpy(), isp.tone.curves[:, ::STEPS].T.numpy(), color="0.75", linewidth=0.8)
     for line, name in zip(isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0], ("red", "green", "blue"), strict=True):
         axis.plot(grey.numpy(), line.numpy(), color=f"tab:{name}")
     axis.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")

@@ -12,7 +12,7 @@ from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import ToneDictionary
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.stage import Dials, Stage, Tables, register
-from rawaug.isp.tone_curves import to_code, to_linear
+from rawaug.isp.tone_curves import STEPS, to_code, to_linear
 
 
 @register
@@ -48,7 +48,7 @@ class ToneCurve(Stage):
 
     def describe(self) -> str:
         return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
-            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * 8].tolist()
+            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
         )
 
     def _curves(self, batch: int, params: ISPParams | None) -> Tensor:

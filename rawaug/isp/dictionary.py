@@ -155,7 +155,7 @@ class ToneDictionary(nn.Module):
     The curve of sRGB itself at first. A convex combination of monotone curves is monotone.
 
     Attributes:
-        curves: ``(K, 2041)`` tables, not decreasing, from 0 to 1.
+        curves: ``(K, 1021)`` tables, not decreasing, from 0 to 1.
         typical: ``(K,)`` weights where nothing is known of the picture.
     """
 
@@ -168,7 +168,7 @@ class ToneDictionary(nn.Module):
         self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
 
     def combine(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, K)`` to tables ``(B, 2041)``, the same bits in a batch of any size."""
+        """Weights ``(B, K)`` to tables ``(B, 1021)``, the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
         for weight, curve in zip(weights.unbind(1), self.curves, strict=True):
             table += weight[:, None] * curve

@@ -40,7 +40,7 @@ class Dials(NamedTuple):
         matrix: ``(B, 3, 3)`` x2 to x3.
         floor: ``(B, 1, 3)`` one over the gains.
         frame: ``(B, 6)`` see :class:`rawaug.kernels.raw_torch.Camera`.
-        curves: ``(B, 2041)`` x to x2, in place of the table; or ``(B, 0)``.
+        curves: ``(B, 1021)`` x to x2, in place of the table; or ``(B, 0)``.
         shading: ``(3,)`` of the mask ``2^-(a y^2 + b x y + c x^2)``, or empty.
     """
 

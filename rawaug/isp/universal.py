@@ -118,7 +118,7 @@ def camera_points(xyz_to_camera: Tensor) -> Tensor:
 
 
 def tone_points(tables: Tensor) -> Tensor:
-    """Curves ``(K, 2041)`` as points ``(K, 256)`` whose squared distance is the mean squared error over all codes."""
+    """Curves ``(K, 1021)`` as points ``(K, 256)`` whose squared distance is the mean squared error over all codes."""
     return tables[:, ::STEPS].double() / 16.0
 
 
