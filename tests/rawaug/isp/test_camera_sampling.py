@@ -10,6 +10,7 @@ from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
 from rawaug.isp.light import D65, white_point
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.tone_curves import STEPS
 from rawaug.isp.universal import of_cameras
 
 
@@ -35,7 +36,7 @@ def test_white_fills_the_sensor_and_grey_is_divided_by_the_gains(universal: Dict
     grey = universal.reverse_pixels(torch.full((8, 3, 2, 2), 100 / 255), setting)[:, :, 0, 0]
     assert universal.tone is not None
     curve = universal.tone.combine(setting.tone_weights)
-    torch.testing.assert_close(grey * setting.gains, curve[:, 100 * 8, None].expand(8, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(grey * setting.gains, curve[:, 100 * STEPS, None].expand(8, 3), atol=1e-5, rtol=0)
 
 
 def test_settings_are_of_cameras_that_can_be(universal: DictionaryISP) -> None:
