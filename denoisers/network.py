@@ -145,7 +145,9 @@ class Denoiser(nn.Module, ABC):
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
         noise_map = relative_deviation(noisy.float(), variance.float(), *levels) if self.variance_map else None
-        denoised = domain.inverse(signal + self._correction(signal, noise_map), *levels)
+        correction = self._correction(signal, noise_map)
+        correction = correction if noise_map is None else noise_map * correction
+        denoised = domain.inverse(signal + correction, *levels)
         return torch.where(variance > 0, denoised, noisy)
 
     def _correction(self, signal: Tensor, noise_map: Tensor | None = None) -> Tensor:
