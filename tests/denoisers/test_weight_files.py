@@ -113,7 +113,7 @@ def test_build_names_what_is_unknown() -> None:
     assert build("UNet", width=4).config["width"] == 4
     with pytest.raises(ValueError, match=r"'Unet' is unknown; use one of DHDN, DnCNN, .*\(nearest: UNet\)"):
         build("Unet")
-    with pytest.raises(ValueError, match="UNet has no setting 'depth'; use one of width, scales"):
+    with pytest.raises(ValueError, match="UNet has no setting 'depth'; it has width, scales"):
         build("UNet", depth=3)
     with pytest.raises(ValueError, match="variance_map must be bool, got 1"):
         build("UNet", variance_map=1)

@@ -55,7 +55,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys
     text = capsys.readouterr().out
     assert "augmented" in text and "picture.png" in text
     results = json.loads((tmp_path / "fewshot" / "results.json").read_text())
-    assert set(results["results"]) == {"real", "augmented"}
+    assert set(results["results"]) == {"real", "augmented", "finetuned", "finetuned_augmented"}
     assert (tmp_path / "fewshot" / "picture.png").stat().st_size > 10_000
     weights = tmp_path / "fewshot" / "seed0" / "real" / "denoiser.safetensors"
     before = weights.stat().st_mtime_ns

@@ -72,7 +72,7 @@ def test_noise_that_is_the_same_everywhere_is_refused(noisy_pair: Pair) -> None:
 def test_what_is_refused_is_reported_or_raised_as_is_asked(noisy_pair: Pair) -> None:
     pair = with_variance(noisy_pair, -4e-4, 4e-4)
     isp = fit([pair], progress=False, steps=1, pixels=256)
-    assert "one line" in isp.info["noise_not_measured"] and "noise" not in isp.info
+    assert "do not fit one noise law" in isp.info["noise_not_measured"] and "noise" not in isp.info
     with pytest.raises(ValueError, match="one noise law"):
         fit([pair], progress=False, noise="on", steps=1, pixels=256)
     assert not {"noise", "noise_not_measured"} & set(fit([pair], progress=False, noise="off", steps=1, pixels=256).info)

@@ -71,5 +71,5 @@ def test_both_loci_and_lamps_are_drawn() -> None:
 
 
 def test_a_temperature_out_of_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="1000 to 15000 K"):
+    with pytest.raises(ValueError, match="kelvin must be 1000 to 15000"):
         sample_lights(1, torch.Generator(), (500.0, 8000.0))

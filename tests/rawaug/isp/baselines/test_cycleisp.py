@@ -129,5 +129,5 @@ def test_the_reference_colours_the_rendering() -> None:
         model(raw)
     with pytest.raises(ValueError, match="must have the sides"):
         model(raw, reference=srgb[..., :12])
-    with pytest.raises(ValueError, match="more than 10 pixels, got 8x16"):
+    with pytest.raises(ValueError, match="larger than 10 pixels, got 8x16"):
         model(raw[..., :8, :], reference=srgb[..., :8, :])

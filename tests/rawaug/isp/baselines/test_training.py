@@ -84,7 +84,7 @@ def test_what_cannot_be_fitted_is_refused(exact_pairs: list[Pair]) -> None:
         (exact_pairs, {"steps": 0}, "give seconds or steps"),
         (exact_pairs, {"steps": 1, "crop": 33}, "crop must be even"),
         (exact_pairs, {"steps": 1, "crop": 96}, "shot0: 96 x 128 is smaller than 98"),
-        ([apart], {"steps": 1}, "apart: RAW and sRGB do not meet"),
+        ([apart], {"steps": 1}, "apart: RAW and sRGB are not registered"),
     ]
     for pairs, settings, message in cases:
         with pytest.raises(ValueError, match=message):

@@ -51,7 +51,7 @@ def test_two_numbers_go_towards_the_curves_of_the_standards(
     """gamma 2.4 and toe 0.055 / 1.055 of sRGB, 1 / 0.45 and 0.099 / 1.099 of BT.709, along a flat valley."""
     pairs = [exact_pair(f"shot{k}", WB, k, curve=curve) for k in range(2)]
     isp = fit_isp(pairs, CURVE, progress=False)
-    toe = cast(Any, isp.stages["tone"]).reverse(torch.zeros(1, 3, 1, 1)).flatten()
+    toe = cast(Any, isp.stages["tone"]).reverse(torch.zeros(1, 3, 1, 1), None).flatten()
     assert gammas[0] < cast(Any, isp.stages["gamma"]).reverse_gamma < gammas[1]
     assert (toe > toes[0]).all() and (toe < toes[1]).all()
     assert error_db(isp, exact_pair("unseen", WB, 9, curve=curve)) > 55.0
