@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from rawaug import registry
+
 torch.set_num_threads(1)
 
 
@@ -22,3 +24,12 @@ def camera_files() -> Path:
     if not (folder / "raw").is_dir():
         pytest.skip(f"no real camera files in {folder}; RAWAUG_SHARED names their folder")
     return folder
+
+
+@pytest.fixture
+def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
+    """All registries, with the built-in things in them; what a test registers is forgotten after it."""
+    kinds = [kind for kind in vars(registry).values() if isinstance(kind, registry.Registry)]
+    for kind in kinds:
+        monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
+    return kinds

@@ -35,6 +35,7 @@ def imported(code: str) -> set[str]:
     return {name.split(".")[0] for name in names}
 
 
+@pytest.mark.usefixtures("registries")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # WebDataset leaves closing its shards to Python
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore:.*does not have many workers:UserWarning")  # Lightning's advice

@@ -14,7 +14,7 @@ import pytest
 
 import denoisers
 from rawaug.cli import main
-from rawaug.registry import DENOISERS, LOSSES, NOISE
+from rawaug.registry import Registry
 
 ROOT = Path(__file__).parents[1]
 
@@ -70,16 +70,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def installed(site: Path, registries: list[Registry], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package can be imported in this process, and nothing of it is left afterwards."""
-    kinds = (DENOISERS, NOISE, LOSSES)
     monkeypatch.syspath_prepend(str(site))
-    for kind in kinds:
-        monkeypatch.setattr(kind, "_things", dict(kind._things))
+    for kind in registries:
         vars(kind).pop("_entry_points", None)
     yield
     sys.modules.pop("abroad", None)
-    for kind in kinds:
+    for kind in registries:
         vars(kind).pop("_entry_points", None)
 
 

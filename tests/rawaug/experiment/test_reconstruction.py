@@ -166,8 +166,11 @@ def test_files_of_other_settings_are_not_used(
     before = len(laboratory.folds), len(laboratory.wholes), set(laboratory.denoisers)
     compare(replace(first, **changes))
     assert (len(laboratory.folds) - before[0], len(laboratory.wholes) - before[1]) == (folds, wholes)
-    if wholes and "methods" not in changes:  # another camera's denoiser is not trained on from this one's checkpoint
-        assert not before[2] & set(laboratory.denoisers[len(before[2]) :])
+    later = set(laboratory.denoisers[len(before[2]) :])
+    if "seeds" in changes:  # the camera is the same: its denoisers are kept, and one is added
+        assert before[2] < later and len(later) == 3
+    elif wholes and "methods" not in changes:  # another camera's denoiser is not resumed from this one's checkpoint
+        assert not before[2] & later
 
 
 def test_frames_that_cannot_make_a_table_are_refused(
