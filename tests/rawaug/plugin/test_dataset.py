@@ -348,7 +348,7 @@ def test_half_of_the_crops_are_enlarged_and_replayed(augment: RawAugment, pictur
     assert 0.2 < sum(side < 16 for side in rows) / len(rows) < 0.8
     for wrong in ({"zoom": 0.5}, {"zoom": 2.0, "crop": None}):
         with pytest.raises(ValueError, match="zoom must be at least 1"):
-            RawPairs(pictures, augment, **wrong)  # type: ignore[arg-type]
+            RawPairs(pictures, augment, **wrong)
 
 
 def test_an_enlarged_crop_keeps_its_place_in_the_frame() -> None:
