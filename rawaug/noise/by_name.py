@@ -120,6 +120,7 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     if isinstance(spec, (str, Mapping)):
         name, settings = name_and_settings(spec)
         if name not in NOISE:
+            noise_levels(name)  # an unknown name is reported before its settings
             options = checked_settings(f"noise {name!r}", partial(_shot_read, name), settings)
             return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
         model: NoiseModel = NOISE.make(spec)
