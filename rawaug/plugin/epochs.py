@@ -152,7 +152,9 @@ class Passes(_Epochs):
         """Count a pass of a worker; its epoch, and the number of the first sample."""
         if workers > MAX_WORKERS:
             raise ValueError(f"a stream counts the passes of at most {MAX_WORKERS} workers, got {workers}")
-        started = int(self._counts[workers, worker] + self._counts[:, 0].sum() - self._counts[workers, 0])
+        # Other rows alone: a sibling may be counting the same pass in this one.
+        others = self._counts[:workers, 0].sum() + self._counts[workers + 1 :, 0].sum()
+        started = int(self._counts[workers, worker] + others)
         self._counts[workers, worker] += 1
         resumed, first = self._resumed.tolist()
         start = first if started == resumed else 0
