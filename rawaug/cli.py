@@ -12,6 +12,7 @@ from typing import Any
 
 from rawaug._version import __version__
 from rawaug.extras import MissingExtra
+from rawaug.shortages import shortage, without_traceback
 
 BAD_INPUT = 2
 
@@ -27,6 +28,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {_one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
+    except (RuntimeError, MemoryError) as error:
+        if (reason := shortage(error)) is None:
+            raise
+        print(f"rawaug: {reason}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
@@ -109,7 +115,7 @@ def _one_line(error: Exception) -> str:
         return f"not valid JSON: {error.msg}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+    return " ".join(without_traceback(str(error)).split())
 
 
 if __name__ == "__main__":

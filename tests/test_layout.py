@@ -18,7 +18,7 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "extras", "files", "metrics", "progress", "registry", "seeding", "_version"}
+BASE = {"bayer", "camera_names", "extras", "files", "lock", "metrics", "progress", "registry", "seeding", "shortages", "_version"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
@@ -26,10 +26,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "camera_names": set(),
     "extras": set(),
     "files": set(),
+    "lock": set(),
     "metrics": set(),
     "progress": set(),
     "registry": set(),
     "seeding": set(),
+    "shortages": set(),
     "denoisers": {"bayer", "registry"},
     "kernels": {"bayer"},
     "noise": BASE | {"kernels"},

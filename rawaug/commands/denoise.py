@@ -30,6 +30,7 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.lock import one_at_a_time
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
@@ -219,6 +220,7 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     return below / mosaic.numel()
 
 
+@one_at_a_time(lambda source, out, *_, **__: Path(out))
 def denoise_folder(
     source: str | Path,
     out: str | Path,

@@ -35,6 +35,7 @@ from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
+from rawaug.lock import one_at_a_time
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
 from rawaug.progress import progress
@@ -106,6 +107,7 @@ class Synthesis:
     seconds: float = 0.0
 
 
+@one_at_a_time(lambda source, out, *_, **__: Path(out))
 def synth(
     source: str | Path,
     out: str | Path,
@@ -133,8 +135,9 @@ def synth(
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
-        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings.
-        OSError: if a worker dies.
+        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings or is in
+            use by another run.
+        OSError: if a worker dies, or the output folder is removed meanwhile.
     """
     start = time.perf_counter()
     weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
@@ -264,11 +267,15 @@ def _prepare(settings: _Settings) -> None:
 def _make(task: _Task) -> str | None:
     """Make the missing pairs of a picture; the reason if it cannot be read."""
     try:
+        before, content = task.picture.stat(), sha256(task.picture)
         srgb = even_sided(read_picture(task.picture))
+        after = task.picture.stat()
+        if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+            raise ValueError(f"{task.picture}: changed while it was read; run it again")
     except (OSError, ValueError) as error:
         return str(error)
     s = _settings
-    origin = Origin(str(task.picture), sha256(task.picture), s.isp, s.isp_sha256, s.noise)
+    origin = Origin(str(task.picture), content, s.isp, s.isp_sha256, s.noise)
     for number in task.numbers:
         params = _augment.sample(srgb, keyed_generator(s.seed, "synth", task.key, number))
         write_pair(_numbered(task.stem, number), _augment.apply(srgb, params), _augment, s.format, origin)

@@ -38,8 +38,9 @@ from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.recipe import Recipe
 from rawaug.extras import extra
-from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
+from rawaug.files import digest, find_weights, fingerprint, replacing, sha256, write_json
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import one_at_a_time
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
@@ -85,6 +86,7 @@ class _Run:
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
 
+    @one_at_a_time(lambda self: self.folder if _leads() else None)
     def all_stages(self) -> Results:
         recipe = self.recipe
         results: Results = {arm: [] for arm in recipe.arms}
@@ -274,7 +276,8 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
     if not stamp.is_file() or stamp.read_text() != key:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
-    stamp.write_text(key)
+        with replacing(stamp) as partial:  # a kill must not leave half a key: the checkpoint would be discarded
+            partial.write_text(key)
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:

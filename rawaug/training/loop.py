@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import csv
+import io
 import math
 import os
 import time
@@ -190,9 +191,11 @@ def resume(
 
 
 def write_atomically(state: dict[str, Any], path: Path) -> None:
-    """A checkpoint is there whole or not at all: a kill leaves the one before."""
+    """A checkpoint is there whole or not at all: a kill or a full disk leaves the one before."""
+    content = io.BytesIO()  # PyTorch's own writer does not say that a disk is full
+    torch.save(state, content)
     with replacing(path) as partial:
-        torch.save(state, partial)
+        partial.write_bytes(content.getbuffer())
 
 
 class Journal:
@@ -209,7 +212,8 @@ class Journal:
         if self.path.is_file():
             head, *rows = self.path.read_text().splitlines(keepends=True)
             kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
-            self.path.write_text("".join([head, *kept]) if kept else "")
+            with replacing(self.path) as partial:
+                partial.write_text("".join([head, *kept]) if kept else "")
         self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
 
     def log(self, step: int, **values: float) -> None:
