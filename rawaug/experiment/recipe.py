@@ -57,7 +57,7 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen"] = "convex"
+    sampling: Literal["convex", "independent", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] | None = None

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, get_args, overload
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +32,7 @@ from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
-Sampling = Literal["convex", "perturb", "chosen"]
+Sampling = Literal["convex", "independent", "perturb", "chosen"]
 
 
 class RawAugment(nn.Module):
@@ -46,8 +46,9 @@ class RawAugment(nn.Module):
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
             ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
-            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
-            ISP chooses; ``"chosen"`` takes these as they are.
+            camera uniform convex combinations of the atoms. ``"independent"`` is the same with the gains of another
+            camera in another light, to see what consistency is worth. ``"perturb"`` adds Gaussian noise to the weights
+            that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
@@ -74,8 +75,8 @@ class RawAugment(nn.Module):
         exposure: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
-        if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
+        if sampling not in get_args(Sampling):
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
         if exposure is None:
@@ -135,8 +136,8 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.sampling == "convex":
-            return self.isp.draw_setting(len(srgb), generator)
+        if self.sampling in ("convex", "independent"):
+            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
