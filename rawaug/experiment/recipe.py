@@ -44,7 +44,7 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        sampling: convex, independent, perturb or chosen, see :class:`rawaug.RawAugment`.
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
