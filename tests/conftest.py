@@ -1,10 +1,15 @@
-"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do."""
+"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do.
+
+Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
 from pathlib import Path
 
