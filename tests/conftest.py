@@ -5,12 +5,11 @@ Processes that tests start through multiprocessing's forkserver have what takes 
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ import torch
 from rawaug import registry
 
 torch.set_num_threads(1)
+multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
 
 @pytest.fixture(scope="session")
