@@ -175,7 +175,7 @@ def smoke(recipe: Recipe) -> Recipe:
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
-        isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
+        isp=recipe.isp.smoke(),
         denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},

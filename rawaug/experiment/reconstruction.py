@@ -102,7 +102,6 @@ class Comparison:
 def smoke_comparison(comparison: Comparison) -> Comparison:
     """The comparison in seconds, on the demo camera."""
     downstream = comparison.downstream and comparison.downstream.smoke()
-    tiny = replace(comparison.fit, steps=2, pixels=512, batch=128)
     quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
     return replace(
         comparison,
@@ -113,7 +112,7 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
         longer=0.0,
         patches=1,
         seeds=1,
-        fit=tiny,
+        fit=comparison.fit.smoke(),
         downstream=downstream,
     )
 
@@ -208,7 +207,7 @@ class _Comparison:
         seeds = range(settings.seed, settings.seed + settings.seeds)
         budget = (settings.seconds, settings.crop, settings.batch)
         parts = (
-            asdict(self.fit),
+            self.fit.key(),
             settings.noise,
             downstream and asdict(downstream),
             settings.data,
@@ -230,7 +229,7 @@ class _Comparison:
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
-        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
+        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"
