@@ -30,7 +30,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "progress": set(),
     "registry": set(),
     "seeding": set(),
-    "denoisers": {"bayer", "registry"},
+    "denoisers": {"bayer", "files", "registry"},
     "kernels": {"bayer"},
     "noise": BASE | {"kernels"},
     "isp": BASE | {"kernels", "denoisers"},
@@ -129,9 +129,9 @@ def test_no_circles() -> None:
         ("import rawaug", set()),
         ("import denoisers", set()),
         ("import rawaug.registry", {"registry"}),
-        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "registry"}),
+        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "files", "registry"}),
         ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "registry"}),
-        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels"}),
+        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels", "registry"}),
     ],
 )
 def test_importing_one_part_loads_no_other(code: str, allowed: set[str]) -> None:
