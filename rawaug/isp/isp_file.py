@@ -64,7 +64,8 @@ def read_isp(path: Path) -> tuple[ISPConfig, dict[str, Any], dict[str, Tensor]]:
 
 def damaged(path: Path, error: Exception) -> ValueError:
     """What to raise for a configuration that no ISP can have."""
-    return ValueError(f"{path}: its configuration is damaged ({" ".join(str(error).split())}); {_ADVICE}")
+    reason = " ".join(str(error).split())
+    return ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}")
 
 
 def misfit(path: Path, key: str) -> ValueError:
