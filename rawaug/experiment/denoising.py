@@ -30,6 +30,7 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     network_method,
+    require_numbers,
     row_of,
     score_method,
     summary,
@@ -221,6 +222,8 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
+        runs = [run[kind] for arm in results.values() for run in arm for kind in ("plain", "self_ensemble")]
+        require_numbers([*runs, *classical.values()])
 
 
 def _settings(part: Any) -> dict[str, Any]:
