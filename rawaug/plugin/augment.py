@@ -27,6 +27,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
+from rawaug.kernels.eager import eager
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
@@ -117,6 +118,7 @@ class RawAugment(nn.Module):
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
+    @eager
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
@@ -149,9 +151,10 @@ class RawAugment(nn.Module):
         if not any(self.exposure):
             return setting
         low, high = self.exposure
-        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator)
+        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
+    @eager
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:
         """The :class:`RawPair` that ``params`` describe: pure, bit for bit the same at every call.
@@ -180,6 +183,7 @@ class RawAugment(nn.Module):
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
     @overload
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
+    @eager
     @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
         """Sample, then apply.
