@@ -1,0 +1,313 @@
+r"""One mosaic from a camera RAW, NPZ, TIFF, 16-bit PNG or MATLAB file, with what the file states about its sensor.
+
+    y = (d - black) / (white - black)
+
+for a digital number d, which may not exceed white (but in camera RAW, which :func:`rawaug.io.read_raw` reads). What a
+file does not state (CFA, levels) must be given; what it states cannot be overridden. Floating point without levels
+holds y itself.
+
+======  =============================================  ===============================================================
+file    numbers                                        statements
+======  =============================================  ===============================================================
+RAW     as LibRaw reads them                           all, by their tags
+npz     the array ``noisy`` or ``clean``, or the only  arrays ``cfa``, ``black``, ``white``, ``white_balance``,
+        one; packed ``(4, h, w)`` or ``(H, W)``        ``color_matrix``, ``shot_var``, ``read_var``
+mat     the same, of version 5 or 7.3                  variables of these names
+tiff    the first page                                 its description, as JSON with these keys
+png     16 bits, one channel                           none
+======  =============================================  ===============================================================
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.mat import read_array, read_value, variables
+from rawaug.data.raw_folder import EXTENSIONS
+from rawaug.extras import extra
+from rawaug.io import read_raw
+from rawaug.io.picture_files import read_plane
+from rawaug.io.tiff_tags import damage_as_os_error
+
+ARRAYS = (".npz", ".tif", ".tiff", ".png", ".mat")
+READABLE = (*EXTENSIONS, *ARRAYS)
+TWO_IN_ONE = (".npz", ".mat")
+"""Files that may hold both mosaics of a pair."""
+
+_UNREADABLE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+
+
+class Mosaic(NamedTuple):
+    """A mosaic float32 ``(1, H, W)``, sides even (of an odd side the last line is left out), and its sensor.
+
+    Args:
+        white_balance, color_matrix: as in :class:`rawaug.data.Pair`; None where the file does not state them.
+        levels: (shot_var, read_var), None if not stated.
+    """
+
+    raw: Tensor
+    cfa: CFA
+    white_balance: tuple[float, float, float] | None
+    color_matrix: Tensor | None
+    levels: tuple[float, float] | None
+    camera: str
+
+
+@dataclass(frozen=True)
+class Statements:
+    """What is known of a mosaic besides its numbers; None where it is not."""
+
+    cfa: CFA | None = None
+    black: tuple[float, ...] | None = None
+    white: float | None = None
+    white_balance: tuple[float, float, float] | None = None
+    color_matrix: Tensor | None = None
+    shot_var: float | None = None
+    read_var: float | None = None
+
+    @classmethod
+    def parse(cls, values: Mapping[str, Any], where: str | Path) -> Statements:
+        """Of plain values or arrays; other keys are left out.
+
+        Raises:
+            ValueError: if a value is not of its kind, naming ``where`` it comes from.
+        """
+        parsed = {}
+        for key, value in values.items():
+            if key not in _KINDS or value is None:
+                continue
+            try:
+                parsed[key] = _KINDS[key](value)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
+        return cls(**parsed)
+
+    def joined(self, given: Statements, file: Path) -> Statements:
+        """These statements of ``file``, and what is ``given`` where it has none.
+
+        Raises:
+            ValueError: if both say something, but not the same.
+        """
+        for key in ("cfa", "black", "white"):
+            own, other = getattr(self, key), getattr(given, key)
+            if own is not None and other is not None and own != other:
+                raise ValueError(f"{file}: states {key} {_shown(own)}, not {_shown(other)} as given; leave {key} out")
+        chosen = {key: getattr(given, key) if getattr(self, key) is None else getattr(self, key) for key in _KINDS}
+        return Statements(**chosen)
+
+
+def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) -> Mosaic:
+    """Read a mosaic.
+
+    Args:
+        which: ``"noisy"`` or ``"clean"``.
+        given: CFA and levels for files that do not state them.
+        alone: the file holds both mosaics of its pair, each by its name.
+
+    Raises:
+        FileNotFoundError, OSError: if it is missing or damaged.
+        ValueError: if CFA or levels are unknown or contradict ``given``, or the numbers are not a mosaic within them.
+    """
+    suffix = file.suffix.lower()
+    if suffix in EXTENSIONS:
+        return _camera_file(file, given)
+    if suffix in TWO_IN_ONE:
+        numbers, values = (_npz if suffix == ".npz" else _mat)(file, which, alone)
+    elif suffix == ".png":
+        numbers, values = _png(file), {}
+    elif suffix in (".tif", ".tiff"):
+        numbers, values = _tiff(file)
+    else:
+        raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(ARRAYS)} or a RAW format")
+    stated = Statements.parse(values, file).joined(given, file)
+    if stated.cfa is None:
+        raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
+    return Mosaic(
+        raw=_normalised(file, numbers, stated.cfa, stated),
+        cfa=stated.cfa,
+        white_balance=stated.white_balance,
+        color_matrix=stated.color_matrix,
+        levels=None if stated.shot_var is None or stated.read_var is None else (stated.shot_var, stated.read_var),
+        camera="unknown",
+    )
+
+
+def _camera_file(file: Path, given: Statements) -> Mosaic:
+    frame = read_raw(file)
+    Statements(frame.cfa, _levels(frame.black), frame.white).joined(given, file)
+    colour = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
+    return Mosaic(frame.mosaic, frame.cfa, *colour, frame.noise_profile, frame.camera)
+
+
+def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such NPZ file")
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            names = list(arrays.files)
+            values = {name: arrays[name] for name in names if name in _KINDS}
+            name = _name_of(file, names, which, alone)
+            return arrays[name], values
+    except _Unclear as error:
+        raise ValueError(str(error)) from None
+    except (*_UNREADABLE, AttributeError, TypeError) as error:  # a bare .npy has no files
+        raise OSError(f"{file}: cannot be read as NPZ ({' '.join(str(error).split())}); copy it again") from error
+
+
+def _mat(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:
+    names = variables(file)
+    values = {name: read_value(file, name) for name in names if name in _KINDS}
+    try:
+        return read_array(file, _name_of(file, names, which, alone)), values
+    except _Unclear as error:
+        raise ValueError(str(error)) from None
+
+
+def _png(file: Path) -> np.ndarray:
+    numbers = read_plane(file)
+    if numbers.dtype != np.uint16:
+        raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
+    return numbers
+
+
+def _tiff(file: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    with extra("raw"):
+        import tifffile
+
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such TIFF file")
+    try:
+        with damage_as_os_error(file), tifffile.TiffFile(file) as tiff:
+            page = tiff.pages[0]
+            text = getattr(page, "description", "")
+            numbers = page.asarray()
+    except (tifffile.TiffFileError, zlib.error) as error:
+        raise OSError(f"{file}: cannot be read as TIFF ({error}); copy it again") from error
+    try:
+        stated = json.loads(text) if text.startswith("{") else {}
+    except ValueError:  # a description of another program
+        stated = {}
+    return numbers, stated
+
+
+class _Unclear(ValueError):
+    """The file is whole, but which array is meant is not clear."""
+
+
+def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
+    """The array of a file that is the mosaic: the one of that name, or the only one."""
+    arrays = [name for name in names if name not in _KINDS]
+    if which in arrays:
+        return which
+    if len(arrays) == 1 and not alone:
+        return arrays[0]
+    raise _Unclear(f"{file}: has no array {which}, but {', '.join(arrays) or 'none'}; name its mosaics noisy and clean")
+
+
+def _normalised(file: Path, numbers: np.ndarray, cfa: CFA, stated: Statements) -> Tensor:
+    """Numbers as RAW float32 ``(1, H, W)``, black 0, white 1."""
+    if numbers.dtype.kind not in "fui" or not numbers.size:
+        raise ValueError(f"{file}: holds {numbers.dtype} {numbers.shape}; a mosaic must hold numbers")
+    black, white = _levels_of(file, numbers, stated)
+    low, high = float(numbers.min()), float(numbers.max())
+    if not (high <= white and low > 2 * min(black) - white):
+        raise ValueError(
+            f"{file}: has values from {low:.4g} to {high:.4g}, outside black {_shown(black)} and white {white:g}; "
+            "give the right black and white"
+        )
+    packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)
+    sites = torch.tensor(black, dtype=torch.float32).reshape(-1, 1, 1)
+    return bayer.unpack((packed - sites) / (white - sites), cfa)
+
+
+def _levels_of(file: Path, numbers: np.ndarray, stated: Statements) -> tuple[tuple[float, ...], float]:
+    black, white = stated.black, stated.white
+    if black is None and white is None and numbers.dtype.kind == "f":
+        return (0.0,), 1.0
+    for key, level in (("black", black), ("white", white)):
+        if level is None:
+            raise ValueError(f"{file}: does not state its {key} level; give black and white")
+    assert black is not None and white is not None
+    if white <= max(black):
+        raise ValueError(f"{file}: white level {white:g} is not above black level {_shown(black)}")
+    return black, white
+
+
+def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
+    """``(4, h, w)`` as it is; a mosaic ``(H, W)`` or ``(1, H, W)`` packed."""
+    if numbers.ndim == 3 and numbers.shape[0] == 4:
+        return numbers
+    if numbers.ndim == 3 and numbers.shape[0] == 1:
+        numbers = numbers[0]
+    if numbers.ndim != 2 or min(numbers.shape) < 2:
+        raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use a mosaic (H, W) or packed RAW (4, h, w)")
+    height, width = (side // 2 * 2 for side in numbers.shape)
+    return bayer.pack(numbers[None, :height, :width], cfa)
+
+
+def _levels(value: Any) -> tuple[float, ...]:
+    """One level, or those of R, Gr, Gb, B; four equal ones are one."""
+    levels = tuple(dict.fromkeys(floats)) if len(set(floats := _floats(value))) == 1 else floats
+    if len(levels) not in (1, 4):
+        raise ValueError(f"{len(levels)} levels; use one, or those of R, Gr, Gb, B")
+    return levels
+
+
+def _floats(value: Any) -> tuple[float, ...]:
+    floats = tuple(float(number) for number in np.ravel(value))
+    if not floats or not np.isfinite(floats).all():
+        raise ValueError(f"{np.ravel(value).tolist()} must be finite numbers")
+    return floats
+
+
+def _one(value: Any) -> float:
+    (number,) = _floats(value)
+    return number
+
+
+def _variance(value: Any) -> float:
+    if _one(value) < 0:
+        raise ValueError(f"{_one(value):g} is negative")
+    return _one(value)
+
+
+def _gains(value: Any) -> tuple[float, float, float]:
+    red, green, blue = _floats(value)
+    if min(red, green, blue) <= 0:
+        raise ValueError(f"{red:g}, {green:g}, {blue:g} must be positive")
+    return red / green, 1.0, blue / green
+
+
+def _matrix(value: Any) -> Tensor:
+    return torch.tensor(_floats(value)).reshape(3, 3)
+
+
+def _pattern(value: Any) -> CFA:
+    return CFA(str(value if isinstance(value, str) else np.ravel(value)[0]).strip().upper())
+
+
+_KINDS = {
+    "cfa": _pattern,
+    "black": _levels,
+    "white": _one,
+    "white_balance": _gains,
+    "color_matrix": _matrix,
+    "shot_var": _variance,
+    "read_var": _variance,
+}
+
+
+def _shown(value: Any) -> str:
+    return "/".join(f"{level:g}" for level in value) if isinstance(value, tuple) else f"{value}"
