@@ -171,7 +171,7 @@ def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jp
         raise ValueError(
             f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
         )
-    opened = [open_pairs(str(item), split="train", clean=False) for item in source]
+    opened = [open_pairs(str(item), split="train", as_clean=False) for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]
     files: list[Path] = []

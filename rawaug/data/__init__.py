@@ -64,7 +64,7 @@ _SPLITS = ("train", "validation", "test")
 
 
 def open_pairs(
-    spec: str | Path | Sequence[Pair], split: str = "test", clean: bool = True, **settings: Any
+    spec: str | Path | Sequence[Pair], split: str = "test", as_clean: bool = True, **settings: Any
 ) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
 
@@ -74,7 +74,7 @@ def open_pairs(
             split last). A sequence of pairs is taken as it is.
         split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
-        clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
+        as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -92,7 +92,7 @@ def open_pairs(
     if kind is None:
         _require_none(settings, spec)
         folder = RawFolder(path)
-        require_no_pairs(folder, str(spec), clean)
+        require_no_pairs(folder, str(spec), as_clean)
         return folder
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, named = _path_and_split(path)

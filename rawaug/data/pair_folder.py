@@ -136,11 +136,11 @@ class PairFolder(LazyPairs):
         )
 
 
-def require_no_pairs(folder: RawFolder, spec: str, clean: bool) -> None:
+def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
     """Refuse RAW files that are noisy by their names where all frames are taken alike.
 
     Args:
-        clean: whether the frames are taken for clean ones; if not, only a noisy frame beside its clean one is refused.
+        as_clean: whether the frames are taken for clean ones; if not, only a noisy frame beside its clean one is refused.
 
     Raises:
         ValueError: naming the first.
@@ -151,7 +151,7 @@ def require_no_pairs(folder: RawFolder, spec: str, clean: bool) -> None:
         partner = found and file.with_name(f"{found[1]}_clean{file.suffix}")
         if partner and partner.resolve() in files:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
-        if found and clean:
+        if found and as_clean:
             raise ValueError(f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one")
 
 
