@@ -107,7 +107,8 @@ def _parser(kind: str, recipe: Path | None = None) -> Any:
 
 def _run(kind: str, arguments: Any, given: set[str]) -> None:
     from rawaug.experiment.kinds import KINDS
-    from rawaug.experiment.recipe import Recipe, with_own_pairs
+    from rawaug.experiment.plan import with_own_pairs
+    from rawaug.experiment.recipe import Recipe
 
     experiment, settings = KINDS[kind], vars(arguments)
     file = settings.pop("recipe")

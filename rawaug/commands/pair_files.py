@@ -8,7 +8,7 @@ npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy
 tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1; statements in its description
 ======  =====================================  ====================================================================
 
-The statements are ``cfa``, ``white_balance``, ``color_matrix``, ``shot_var`` and ``read_var``, as far as they are known.
+The statements are ``cfa``, ``white_balance``, ``color_matrix``, ``shot_var`` and ``read_var``, as far as known.
 
 ``NAME.safetensors`` is written last: a pair is there when its parameters are. A DNG's black level is as high as the
 darkest noisy value needs, so that nothing is clipped at black; the clean file has the same levels.
@@ -127,7 +127,9 @@ def _write_tiff(path: Path, packed: Tensor, cfa: bayer.CFA, stated: dict[str, An
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    stated = {key: np.array(value, None if key == "cfa" else np.float32) for key, value in _stated(pair, augment).items()}
+    stated = {
+        key: np.array(value, None if key == "cfa" else np.float32) for key, value in _stated(pair, augment).items()
+    }
     arrays: dict[str, Any] = {**stated, "clean": pair.clean.numpy(), "noisy": pair.noisy.numpy()}
     with replacing(_beside(stem, ".npz")) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)

@@ -23,8 +23,7 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +35,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.mat import read_array, read_value, variables
 from rawaug.data.raw_folder import EXTENSIONS
+from rawaug.data.statements import KINDS, Statements, levels, shown
 from rawaug.extras import extra
 from rawaug.io import read_raw
 from rawaug.io.picture_files import read_plane
@@ -63,49 +63,6 @@ class Mosaic(NamedTuple):
     color_matrix: Tensor | None
     levels: tuple[float, float] | None
     camera: str
-
-
-@dataclass(frozen=True)
-class Statements:
-    """What is known of a mosaic besides its numbers; None where it is not."""
-
-    cfa: CFA | None = None
-    black: tuple[float, ...] | None = None
-    white: float | None = None
-    white_balance: tuple[float, float, float] | None = None
-    color_matrix: Tensor | None = None
-    shot_var: float | None = None
-    read_var: float | None = None
-
-    @classmethod
-    def parse(cls, values: Mapping[str, Any], where: str | Path) -> Statements:
-        """Of plain values or arrays; other keys are left out.
-
-        Raises:
-            ValueError: if a value is not of its kind, naming ``where`` it comes from.
-        """
-        parsed = {}
-        for key, value in values.items():
-            if key not in _KINDS or value is None:
-                continue
-            try:
-                parsed[key] = _KINDS[key](value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
-        return cls(**parsed)
-
-    def joined(self, given: Statements, file: Path) -> Statements:
-        """These statements of ``file``, and what is ``given`` where it has none.
-
-        Raises:
-            ValueError: if both say something, but not the same.
-        """
-        for key in ("cfa", "black", "white"):
-            own, other = getattr(self, key), getattr(given, key)
-            if own is not None and other is not None and own != other:
-                raise ValueError(f"{file}: states {key} {_shown(own)}, not {_shown(other)} as given; leave {key} out")
-        chosen = {key: getattr(given, key) if getattr(self, key) is None else getattr(self, key) for key in _KINDS}
-        return Statements(**chosen)
 
 
 def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) -> Mosaic:
@@ -146,7 +103,7 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
 
 def _camera_file(file: Path, given: Statements) -> Mosaic:
     frame = read_raw(file)
-    Statements(frame.cfa, _levels(frame.black), frame.white).joined(given, file)
+    Statements(frame.cfa, levels(frame.black), frame.white).joined(given, file)
     colour = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
     return Mosaic(frame.mosaic, frame.cfa, *colour, frame.noise_profile, frame.camera)
 
@@ -157,7 +114,7 @@ def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
     try:
         with np.load(file, allow_pickle=False) as arrays:
             names = list(arrays.files)
-            values = {name: arrays[name] for name in names if name in _KINDS}
+            values = {name: arrays[name] for name in names if name in KINDS}
             name = _name_of(file, names, which, alone)
             return arrays[name], values
     except _Unclear as error:
@@ -168,7 +125,7 @@ def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
 
 def _mat(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:
     names = variables(file)
-    values = {name: read_value(file, name) for name in names if name in _KINDS}
+    values = {name: read_value(file, name) for name in names if name in KINDS}
     try:
         return read_array(file, _name_of(file, names, which, alone)), values
     except _Unclear as error:
@@ -208,7 +165,7 @@ class _Unclear(ValueError):
 
 def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
     """The array of a file that is the mosaic: the one of that name, or the only one."""
-    arrays = [name for name in names if name not in _KINDS]
+    arrays = [name for name in names if name not in KINDS]
     if which in arrays:
         return which
     if len(arrays) == 1 and not alone:
@@ -224,7 +181,7 @@ def _normalised(file: Path, numbers: np.ndarray, cfa: CFA, stated: Statements) -
     low, high = float(numbers.min()), float(numbers.max())
     if not (high <= white and low > 2 * min(black) - white):
         raise ValueError(
-            f"{file}: has values from {low:.4g} to {high:.4g}, outside black {_shown(black)} and white {white:g}; "
+            f"{file}: has values from {low:.4g} to {high:.4g}, outside black {shown(black)} and white {white:g}; "
             "give the right black and white"
         )
     packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)
@@ -241,7 +198,7 @@ def _levels_of(file: Path, numbers: np.ndarray, stated: Statements) -> tuple[tup
             raise ValueError(f"{file}: does not state its {key} level; give black and white")
     assert black is not None and white is not None
     if white <= max(black):
-        raise ValueError(f"{file}: white level {white:g} is not above black level {_shown(black)}")
+        raise ValueError(f"{file}: white level {white:g} is not above black level {shown(black)}")
     return black, white
 
 
@@ -255,59 +212,3 @@ def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
         raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use a mosaic (H, W) or packed RAW (4, h, w)")
     height, width = (side // 2 * 2 for side in numbers.shape)
     return bayer.pack(numbers[None, :height, :width], cfa)
-
-
-def _levels(value: Any) -> tuple[float, ...]:
-    """One level, or those of R, Gr, Gb, B; four equal ones are one."""
-    levels = tuple(dict.fromkeys(floats)) if len(set(floats := _floats(value))) == 1 else floats
-    if len(levels) not in (1, 4):
-        raise ValueError(f"{len(levels)} levels; use one, or those of R, Gr, Gb, B")
-    return levels
-
-
-def _floats(value: Any) -> tuple[float, ...]:
-    floats = tuple(float(number) for number in np.ravel(value))
-    if not floats or not np.isfinite(floats).all():
-        raise ValueError(f"{np.ravel(value).tolist()} must be finite numbers")
-    return floats
-
-
-def _one(value: Any) -> float:
-    (number,) = _floats(value)
-    return number
-
-
-def _variance(value: Any) -> float:
-    if _one(value) < 0:
-        raise ValueError(f"{_one(value):g} is negative")
-    return _one(value)
-
-
-def _gains(value: Any) -> tuple[float, float, float]:
-    red, green, blue = _floats(value)
-    if min(red, green, blue) <= 0:
-        raise ValueError(f"{red:g}, {green:g}, {blue:g} must be positive")
-    return red / green, 1.0, blue / green
-
-
-def _matrix(value: Any) -> Tensor:
-    return torch.tensor(_floats(value)).reshape(3, 3)
-
-
-def _pattern(value: Any) -> CFA:
-    return CFA(str(value if isinstance(value, str) else np.ravel(value)[0]).strip().upper())
-
-
-_KINDS = {
-    "cfa": _pattern,
-    "black": _levels,
-    "white": _one,
-    "white_balance": _gains,
-    "color_matrix": _matrix,
-    "shot_var": _variance,
-    "read_var": _variance,
-}
-
-
-def _shown(value: Any) -> str:
-    return "/".join(f"{level:g}" for level in value) if isinstance(value, tuple) else f"{value}"

@@ -18,9 +18,10 @@ import torch
 
 from rawaug.data.colour import develop_mosaic
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.mosaic_files import ARRAYS, READABLE, TWO_IN_ONE, Statements, read_mosaic
+from rawaug.data.mosaic_files import ARRAYS, READABLE, TWO_IN_ONE, read_mosaic
 from rawaug.data.pair import Pair
 from rawaug.data.raw_folder import RawFolder
+from rawaug.data.statements import Statements
 from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
@@ -140,7 +141,7 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
     """Refuse RAW files that are noisy by their names where all frames are taken alike.
 
     Args:
-        as_clean: whether the frames are taken for clean ones; if not, only a noisy frame beside its clean one is refused.
+        as_clean: whether the frames are taken for clean ones; if not, noisy frames are only refused beside clean ones.
 
     Raises:
         ValueError: naming the first.
@@ -152,7 +153,9 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
         if partner and partner.resolve() in files:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
         if found and as_clean:
-            raise ValueError(f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one")
+            raise ValueError(
+                f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one"
+            )
 
 
 def looks_like_pairs(files: Sequence[Path]) -> bool:

@@ -1,9 +1,10 @@
-"""What a run uses of what: its frames, opened and divided but not yet read, and the lines that say so before it starts."""
+"""What a run uses of what: its frames, opened and divided but not yet read, and the lines that say so at its start."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
@@ -58,6 +59,32 @@ class Plan:
             "ISP": camera,
         }
         return [f"{what:<10}{used}" for what, used in found.items()]
+
+
+def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> Recipe:
+    """A recipe whose pairs were replaced uses all of them, and validates on a part of them.
+
+    What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
+    of null, on RAW made from the pictures, stays.
+
+    Args:
+        recipe: as read from ``file`` and the command line.
+        given: the keys of the command line, such as ``data.pairs``.
+    """
+    import yaml
+
+    usual = ((yaml.safe_load(Path(file).read_text()) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
+    if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
+        return recipe
+    reset: dict[str, Any] = {"count": None} | ({} if recipe.data.validation is None else {"validation": HELD_OUT})
+    changes = {key: value for key, value in reset.items() if f"data.{key}" not in given}
+    return replace(recipe, data=replace(recipe.data, **changes))
+
+
+def _kind(spec: str | None) -> str | None:
+    """The dataset of a spec; a folder is one of its own."""
+    kind, colon, _ = (spec or "").partition(":")
+    return kind if colon and len(kind) > 1 and kind != "pairs" else spec
 
 
 def with_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Recipe:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -13,7 +13,6 @@ from rawaug.data.pair_folder import PairSettings
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
-
 
 HELD_OUT = "auto"
 """``data.validation`` that is a part of ``data.pairs``."""
@@ -210,32 +209,6 @@ def smoke(recipe: Recipe) -> Recipe:
         device="cpu",
         devices=1,
     )
-
-
-def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> Recipe:
-    """A recipe whose pairs were replaced uses all of them, and validates on a part of them.
-
-    What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
-    of null, on RAW made from the pictures, stays.
-
-    Args:
-        recipe: as read from ``file`` and the command line.
-        given: the keys of the command line, such as ``data.pairs``.
-    """
-    import yaml
-
-    usual = ((yaml.safe_load(Path(file).read_text()) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
-    if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
-        return recipe
-    reset: dict[str, Any] = {"count": None} | ({} if recipe.data.validation is None else {"validation": HELD_OUT})
-    changes = {key: value for key, value in reset.items() if f"data.{key}" not in given}
-    return replace(recipe, data=replace(recipe.data, **changes))
-
-
-def _kind(spec: str | None) -> str | None:
-    """The dataset of a spec; a folder is one of its own."""
-    kind, colon, _ = (spec or "").partition(":")
-    return kind if colon and len(kind) > 1 and kind not in ("pairs",) else spec
 
 
 def shipped_recipes() -> dict[str, Path]:

@@ -51,7 +51,10 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
             import_module(name)
     parts = {"train": plan.pairs, "validate": plan.validation, "test": plan.test}
     pairs, validation, test = (_read(frames) for frames in parts.values())
-    read = (f"{what} {len(found)} of {len(parts[what])}" for what, found in zip(parts, (pairs, validation, test), strict=True))
+    read = (
+        f"{what} {len(found)} of {len(parts[what])}"
+        for what, found in zip(parts, (pairs, validation, test), strict=True)
+    )
     if recipe.self_supervised:
         pairs, validation = ([noisy_only(pair) for pair in part] for part in (pairs, validation))
     require_usable(recipe, pairs, validation)
