@@ -21,6 +21,7 @@ png     16 bits, one channel                           none
 from __future__ import annotations
 
 import json
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -46,7 +47,20 @@ READABLE = (*EXTENSIONS, *ARRAYS)
 TWO_IN_ONE = (".npz", ".mat")
 """Files that may hold both mosaics of a pair."""
 
-_UNREADABLE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (
+    *(
+        ArithmeticError,
+        AttributeError,
+        EOFError,
+        LookupError,
+        MemoryError,
+        OSError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ),
+    *(struct.error, zipfile.BadZipFile, zlib.error),
+)
 
 
 class Mosaic(NamedTuple):
@@ -117,19 +131,16 @@ def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
             values = {name: arrays[name] for name in names if name in KINDS}
             name = _name_of(file, names, which, alone)
             return arrays[name], values
-    except _Unclear as error:
-        raise ValueError(str(error)) from None
-    except (*_UNREADABLE, AttributeError, TypeError) as error:  # a bare .npy has no files
+    except _Unclear:
+        raise
+    except _UNREADABLE as error:
         raise OSError(f"{file}: cannot be read as NPZ ({' '.join(str(error).split())}); copy it again") from error
 
 
 def _mat(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:
     names = variables(file)
     values = {name: read_value(file, name) for name in names if name in KINDS}
-    try:
-        return read_array(file, _name_of(file, names, which, alone)), values
-    except _Unclear as error:
-        raise ValueError(str(error)) from None
+    return read_array(file, _name_of(file, names, which, alone)), values
 
 
 def _png(file: Path) -> np.ndarray:
@@ -150,6 +161,10 @@ def _tiff(file: Path) -> tuple[np.ndarray, dict[str, Any]]:
             page = tiff.pages[0]
             text = getattr(page, "description", "")
             numbers = page.asarray()
+    except OSError as error:
+        if "imagecodecs" in str(error):
+            raise ValueError(f"{file}: has a compression that is not supported; save it without one") from error
+        raise
     except (tifffile.TiffFileError, zlib.error) as error:
         raise OSError(f"{file}: cannot be read as TIFF ({error}); copy it again") from error
     try:
