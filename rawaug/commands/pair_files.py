@@ -142,7 +142,7 @@ def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
     try:
         white_balance, matrix, _ = _color(pair, augment)
-    except (ValueError, torch.linalg.LinAlgError):
+    except (ValueError, RuntimeError):
         return stated
     return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
 

@@ -48,18 +48,8 @@ TWO_IN_ONE = (".npz", ".mat")
 """Files that may hold both mosaics of a pair."""
 
 _UNREADABLE = (
-    *(
-        ArithmeticError,
-        AttributeError,
-        EOFError,
-        LookupError,
-        MemoryError,
-        OSError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    ),
-    *(struct.error, zipfile.BadZipFile, zlib.error),
+    *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError),
+    *(ValueError, struct.error, zipfile.BadZipFile, zlib.error),
 )
 
 
@@ -118,8 +108,8 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
 def _camera_file(file: Path, given: Statements) -> Mosaic:
     frame = read_raw(file)
     Statements(frame.cfa, levels(frame.black), frame.white).joined(given, file)
-    colour = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
-    return Mosaic(frame.mosaic, frame.cfa, *colour, frame.noise_profile, frame.camera)
+    gains, matrix = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
+    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera)
 
 
 def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:

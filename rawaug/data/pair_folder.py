@@ -18,10 +18,11 @@ import torch
 
 from rawaug.data.colour import develop_mosaic
 from rawaug.data.lazy import LazyPairs
-from rawaug.data.mosaic_files import ARRAYS, READABLE, TWO_IN_ONE, read_mosaic
+from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
 from rawaug.data.pair import Pair
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.statements import Statements
+from rawaug.io.apart import apart
 from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
@@ -95,7 +96,6 @@ class PairFolder(LazyPairs):
     ) -> None:
         self.given = Statements.parse({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
         self.pairs = _pairs_below(Path(path), noisy, clean)
-        self.has_camera_files = any(file.suffix.lower() not in ARRAYS for pair in self.pairs for file in pair[1:])
         super().__init__([pair.name for pair in self.pairs])
 
     def files_of(self, index: int) -> Sequence[Path]:
@@ -110,7 +110,8 @@ class PairFolder(LazyPairs):
         name, *files = self.pairs[index]
         alone = files[0] == files[1]
         noisy, clean = (
-            read_mosaic(file, which, self.given, alone) for file, which in zip(files, ("noisy", "clean"), strict=True)
+            apart(read_mosaic, file, which, self.given, alone)
+            for file, which in zip(files, ("noisy", "clean"), strict=True)
         )
         for what, one, other in (
             ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),
@@ -200,8 +201,9 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
         if not match:
             continue
         folder, *parts = match.groups()
-        values = iter(parts)
-        wanted = folder + _WILD.sub(lambda _, values=values: next(values), clean)  # type: ignore[misc]
+        wanted = folder + "".join(
+            f"{fixed}{part}" for fixed, part in zip(_WILD.split(clean), [*parts, ""], strict=True)
+        )
         partner = index.get(wanted.casefold())
         if partner is None:
             raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or give its pattern")

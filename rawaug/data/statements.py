@@ -33,7 +33,7 @@ class Statements:
         Raises:
             ValueError: if a value is not of its kind, naming ``where`` it comes from.
         """
-        parsed = {}
+        parsed: dict[str, Any] = {}
         for key, value in values.items():
             if key not in KINDS or value is None:
                 continue

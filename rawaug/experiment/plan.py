@@ -12,6 +12,7 @@ from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
@@ -71,9 +72,7 @@ def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> 
         recipe: as read from ``file`` and the command line.
         given: the keys of the command line, such as ``data.pairs``.
     """
-    import yaml
-
-    usual = ((yaml.safe_load(Path(file).read_text()) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
+    usual = ((read_yaml(file) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
     if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
         return recipe
     reset: dict[str, Any] = {"count": None} | ({} if recipe.data.validation is None else {"validation": HELD_OUT})

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_type_hints
 
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -68,7 +69,7 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        sampling: convex, independent, perturb or chosen, see :class:`rawaug.RawAugment`.
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
@@ -81,7 +82,7 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen"] = "convex"
+    sampling: Literal["convex", "independent", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
@@ -199,7 +200,7 @@ def smoke(recipe: Recipe) -> Recipe:
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
-        isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
+        isp=recipe.isp.smoke(),
         denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
@@ -236,11 +237,9 @@ def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
     Raises:
         ValueError: if it sets a key that ``settings``, a dataclass, does not have.
     """
-    import yaml
-
     found: dict[str, Any] = {}
     hints = get_type_hints(settings)
-    for key, value in (yaml.safe_load(Path(file).read_text()) or {}).items():
+    for key, value in (read_yaml(file) or {}).items():
         if key not in hints:
             raise ValueError(f"{file}: unknown key {key}{nearest(key, hints)}")
         if not is_dataclass(hints[key]):

@@ -102,7 +102,7 @@ def _one_step(
     if config.batch % recipe.devices:
         raise ValueError(f"train.batch={config.batch} must be a multiple of devices={recipe.devices}")
     stream = training_stream(recipe, recipe.arms[arm], pairs, pictures, isp, noise, recipe.seed)
-    fabric: Any = Fabric(accelerator=recipe.device, devices=1, precision=config.precision)  # type: ignore[arg-type]
+    fabric: Any = Fabric(accelerator=recipe.device, devices=1, precision=config.precision)
     estimator, net = estimator_of(recipe.arms[arm]), first_network(recipe.network_of(arm), recipe.seed)
     indices = sorted({0, config.batch - 1}) if fabric.device.type == "cpu" else range(config.batch // recipe.devices)
     batch: Any = default_collate([stream[index] for index in indices])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,15 +18,11 @@ from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-QUICK = ["--steps", "4", "--pixels", "512", "--batch", "128", "--noise", "off"]
+QUICK = ["--steps", "4", "--curve-steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
+SETTINGS: dict[str, Any] = {"steps": 4, "curve_steps": 10, "pixels": 512, "batch": 128}
 INTERRUPTED = 130
 
 Shoot = Callable[..., Path]
-
-
-@pytest.fixture(autouse=True)
-def short_first_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 10)
 
 
 @pytest.fixture
@@ -70,7 +67,7 @@ def test_files_and_folders_are_fitted_together(
     assert isp.info["frames"] == ["one", "b", "a", "two"]
     assert isp.info["data"] == [str(one), str(tmp_path / "more"), str(two)]
     assert f"fitted 4 frames in {isp.info['seconds']} s: {out}" in capsys.readouterr().out
-    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", steps=4, pixels=512, batch=128)
+    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", **SETTINGS)
     assert same(isp, by_hand)
     assert not same(isp, fit(out, one, two))
 
@@ -159,12 +156,12 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
     for jpeg in ("true", "false"):
         scores.append(fit(tmp_path / "x.safetensors", seen, "--held-out", raw, "--camera-jpeg", jpeg).info["held_out"])
     assert scores[0] != scores[1]
-    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, steps=4, pixels=512, batch=128), plain)
+    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, **SETTINGS), plain)
 
 
 def test_pairs_are_fitted_as_they_are() -> None:
     pairs, other = rawaug.data.demo_pairs("train", count=2), rawaug.data.demo_pairs("validation", count=1)
-    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, steps=2, pixels=256, batch=64)
+    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, **SETTINGS)
     assert isp.info["frames"] == [pair.name for pair in pairs] and len(isp.info["held_out"]) == 2
 
 

@@ -47,7 +47,7 @@ def write(file: Path, numbers: np.ndarray) -> None:
 def write_png(file: Path, numbers: np.ndarray) -> None:
     import OpenImageIO as oiio
 
-    image = oiio.ImageOutput.create(str(file))
+    image: Any = oiio.ImageOutput.create(str(file))
     image.open(str(file), oiio.ImageSpec(numbers.shape[1], numbers.shape[0], 1, str(numbers.dtype)))
     image.write_image(np.ascontiguousarray(numbers)[..., None])
     image.close()
@@ -98,7 +98,9 @@ def test_statements_of_a_file_are_taken(tmp_path: Path, suffix: str) -> None:
         for kind, numbers in (("noisy", NOISY), ("clean", CLEAN)):
             tifffile.imwrite(tmp_path / f"a_{kind}.tif", numbers, description=json.dumps(stated), metadata=None)
     elif suffix == ".npz":
-        packed = {kind: pack(torch.from_numpy(x.astype(np.int32))[None], "GRBG").numpy() for kind, x in both().items()}
+        packed: dict[str, Any] = {
+            k: pack(torch.from_numpy(x.astype(np.int32))[None], "GRBG").numpy() for k, x in both().items()
+        }
         np.savez(tmp_path / "a.npz", **packed, **{k: np.array(v) for k, v in stated.items()})
     else:
         savemat(tmp_path / "a.mat", {**both(), **stated})

@@ -31,7 +31,12 @@ def own(tmp_path: Path) -> Path:
     for k in range(7):
         clean = np.kron(rng.uniform(0.05, 0.6, (4, 8, 10)), np.ones((1, 4, 4))).astype(np.float32)
         noisy = clean + rng.normal(0, 0.01, clean.shape).astype(np.float32)
-        colour = {"white_balance": [2.0, 1.0, 1.5], "color_matrix": np.eye(3), "shot_var": 1e-6, "read_var": 1e-4}
+        colour: dict[str, Any] = {
+            "white_balance": [2.0, 1.0, 1.5],
+            "color_matrix": np.eye(3),
+            "shot_var": 1e-6,
+            "read_var": 1e-4,
+        }
         np.savez(folder / f"shot{k}.npz", clean=clean, noisy=noisy, cfa="GRBG", **colour)
     return folder
 
