@@ -4,9 +4,11 @@ r"""A RAW pair on disk, in one of three formats, and the parameters that replay 
 format  files                                  content
 ======  =====================================  ====================================================================
 dng     ``NAME_clean.dng NAME_noisy.dng``      16 bits, as a camera would; opens in a RAW developer
-npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, ``shot_var``, ...
-tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1
+npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, and statements
+tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1; statements in its description
 ======  =====================================  ====================================================================
+
+The statements are ``cfa``, ``white_balance``, ``color_matrix``, ``shot_var`` and ``read_var``, as far as known.
 
 ``NAME.safetensors`` is written last: a pair is there when its parameters are. A DNG's black level is as high as the
 darkest noisy value needs, so that nothing is clipped at black; the clean file has the same levels.
@@ -61,8 +63,9 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
     elif format == "npz":
         _write_npz(stem, pair, augment)
     else:
-        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment)
-        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment)
+        stated = _stated(pair, augment)
+        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment.isp.cfa, stated)
+        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment.isp.cfa, stated)
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
     write_tensors(pair.params.tensors(), header, params_file(stem))
 
@@ -112,21 +115,36 @@ def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
+def _write_tiff(path: Path, packed: Tensor, cfa: bayer.CFA, stated: dict[str, Any]) -> None:
     with extra("raw"):
         import tifffile
 
-    mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
+    mosaic = bayer.unpack(packed, cfa)[0].numpy()
     with replacing(path) as partial:
-        tifffile.imwrite(partial, mosaic, photometric="minisblack", metadata=None)
+        tifffile.imwrite(
+            partial, mosaic, photometric="minisblack", metadata=None, description=json.dumps(stated, sort_keys=True)
+        )
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    noise = pair.params.noise
-    arrays: dict[str, Any] = {key: noise[key].numpy() for key in ("shot_var", "read_var") if key in noise}
-    arrays |= {"clean": pair.clean.numpy(), "noisy": pair.noisy.numpy(), "cfa": np.array(str(augment.isp.cfa))}
+    stated = {
+        key: np.array(value, None if key == "cfa" else np.float32) for key, value in _stated(pair, augment).items()
+    }
+    arrays: dict[str, Any] = {**stated, "clean": pair.clean.numpy(), "noisy": pair.noisy.numpy()}
     with replacing(_beside(stem, ".npz")) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)
+
+
+def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
+    """What :mod:`rawaug.data.mosaic_files` reads beside a mosaic; a colour that no camera has is left out."""
+    noise = pair.params.noise
+    stated: dict[str, Any] = {"cfa": str(augment.isp.cfa)}
+    stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
+    try:
+        white_balance, matrix, _ = _color(pair, augment)
+    except (ValueError, RuntimeError):
+        return stated
+    return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
 
 
 def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:

@@ -127,7 +127,9 @@ class _Helper:
             self.connection.send_bytes(pickle.dumps(request))
             if not self.connection.poll(seconds):
                 self.kill()
-                raise _Lost(f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again")
+                raise _Lost(
+                    f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again"
+                )
             kind, content, sizes = pickle.loads(self.connection.recv_bytes())
         except (EOFError, ConnectionError):
             kind, content, sizes = "died", 0, ()
