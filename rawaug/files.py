@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import platform
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +23,12 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, shared: bool = False) -> Iterator[Path]:
     """A path beside ``path`` to write to, which takes its place when the block ends without an error.
+
+    Args:
+        path: of the file.
+        shared: whether processes of this and other machines may write the same file at the same time.
 
     Example:
         >>> import tempfile
@@ -34,7 +40,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
+    writer = f".{platform.node()}-{os.getpid()}" if shared else ""
+    partial = path.with_name(f"{path.name}{writer}.partial")
     try:
         yield partial
         partial.replace(path)
@@ -42,10 +49,22 @@ def replacing(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def write_json(value: Any, path: str | Path) -> None:
-    """Write JSON, whole or not at all, making its folder."""
-    with replacing(path) as partial:
+def write_json(value: Any, path: str | Path, shared: bool = False) -> None:
+    """Write JSON, whole or not at all, making its folder; ``shared`` as for :func:`replacing`."""
+    with replacing(path, shared) as partial:
         partial.write_text(json.dumps(value, indent=1) + "\n")
+
+
+def read_json(path: str | Path, advice: str) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        ValueError: if it is none, ending in ``advice``.
+    """
+    try:
+        return json.loads(Path(path).read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: not valid JSON ({error.msg}); {advice}") from None
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: str | Path) -> None:

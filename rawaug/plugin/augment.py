@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar, overload
 
 import torch
 from torch import Tensor, nn
+from torch._compile import _disable_dynamo  # torch.compiler.disable would load the whole compiler here
 from torch.utils.data import get_worker_info
 
 from rawaug.isp.camera_sampling import EXPOSURE
@@ -116,6 +117,7 @@ class RawAugment(nn.Module):
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
+    @_disable_dynamo  # for torch.compile a call between two graphs: what is inside is compiled already
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
@@ -167,6 +169,7 @@ class RawAugment(nn.Module):
             return self._pair(self._batch(srgb), params.map(lambda t: t[None])).map(lambda t: t[0])
         return self._pair(self._batch(srgb), params)
 
+    @_disable_dynamo
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
