@@ -7,9 +7,10 @@
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
 with it, RawAugment makes it of sRGB first; with ``--workers``, RawPairs makes it in the workers of a loader. On a GPU
 the networks have the sizes of :data:`GPU_SIZES` and train in bf16. ``--compile`` times the steps once more under
-torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its own,
-whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes`` each
-network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes, and scored on the validation frames.
+torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its
+own, whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes``
+each network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes,
+and scored on the validation frames.
 """
 
 from __future__ import annotations

@@ -18,7 +18,18 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "extras", "files", "metrics", "progress", "registry", "seeding", "_version"}
+BASE = {
+    "bayer",
+    "camera_names",
+    "extras",
+    "files",
+    "metrics",
+    "patterns",
+    "progress",
+    "registry",
+    "seeding",
+    "_version",
+}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
@@ -27,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extras": set(),
     "files": set(),
     "metrics": set(),
+    "patterns": {"bayer"},
     "progress": set(),
     "registry": set(),
     "seeding": set(),

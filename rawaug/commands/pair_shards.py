@@ -3,15 +3,15 @@
 ``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files of one
 key, ``PICTURE_NUMBER``:
 
-==================  ===================================================================================================
+==================  ==============================================================================================
 ``KEY.clean.npy``   packed float32 ``(4, h, w)``, R, Gr, Gb, B
 ``KEY.noisy.npy``   the same with noise
-``KEY.json``        picture and its SHA-256, ISP and its SHA-256, CFA, mosaic's height and width, noise levels, parameters
-==================  ===================================================================================================
+``KEY.json``        picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters
+==================  ==============================================================================================
 
 The bytes of a shard depend on its pictures and the settings alone; nothing in it says when, where or by whom it was
-made. A shard is there when ``.shards/shard-000012.json`` is, which is written last; when all are, ``index.json`` (sizes,
-as WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
+made. A shard is there when ``.shards/shard-000012.json`` is, which is written last. Once all are, ``index.json``
+(sizes, as WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, replayed
-from rawaug.files import read_json, replacing, sha256, write_json
+from rawaug.files import read_json, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 
 PER_SHARD = 500
@@ -212,7 +212,7 @@ tags:
 
 # RAW pairs
 
-{pairs} noisy/clean RAW pairs in {len(shards)} WebDataset shards, {size / 1e9:.3g} GB, made from sRGB pictures by rawaug.
+{pairs} noisy/clean RAW pairs in {len(shards)} WebDataset shards, {size / 1e9:.3g} GB, made of sRGB pictures by rawaug.
 
 | setting | value |
 |---|---|
@@ -221,7 +221,7 @@ tags:
 | sampling of cameras | {settings.sampling} |
 | seed | {settings.seed} |
 
-Each sample has `clean.npy` and `noisy.npy`, packed float32 `(4, h, w)` in the order R, Gr, Gb, B, black 0, white 1, not
-clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels, and
-the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
+Each sample has `clean.npy` and `noisy.npy`, packed float32 `(4, h, w)` in the order R, Gr, Gb, B, black 0, white 1,
+not clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise
+levels, and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
 """
