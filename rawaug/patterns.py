@@ -108,7 +108,9 @@ class Pattern:
             raise ValueError(f"{height} x {width} must be multiples of {self.period} to turn {self.name}; crop it")
         turned = bayer.turn(raw, view)
         rows, columns = self.shift_after(view)
-        height, width = (side - bool(shift) * self.period for side, shift in zip(turned.shape[-2:], (rows, columns)))
+        height, width = (
+            side - bool(shift) * self.period for side, shift in zip(turned.shape[-2:], (rows, columns), strict=True)
+        )
         if height < 1 or width < 1:
             raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
         return turned[..., rows : rows + height, columns : columns + width]

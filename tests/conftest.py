@@ -1,5 +1,8 @@
 """One thread a process, for two processes test at once (``make test``); which tests need a GPU; and where real camera
-files lie, if any do."""
+files lie, if any do.
+
+Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
@@ -15,6 +19,7 @@ import torch
 from rawaug import registry
 
 torch.set_num_threads(1)
+multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

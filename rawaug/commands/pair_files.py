@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,12 +30,15 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
 from rawaug.extras import extra
-from rawaug.files import read_header, replacing, write_tensors
+from rawaug.files import digest, read_header, replacing, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
 from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
+
+LONGEST_STEM = 200
+"""Bytes of a picture's name in those of its pairs, which have at most 255."""
 
 _WHITE = 65535
 _BLACK_STEP = 256
@@ -98,9 +102,17 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
             raise ValueError(
                 f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
             )
-        stem = out / own.relative_to(source)
+        stem = out / own.relative_to(source).with_name(_short(own.name))
         missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
         yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, tuple(missing), per_image)
+
+
+def _short(name: str) -> str:
+    """The name, or its beginning and a hash where it leaves no room for the endings of the pairs' files."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= LONGEST_STEM:
+        return name
+    return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
 
 
 def _numbered(stem: Path, number: int) -> Path:

@@ -13,6 +13,8 @@ from typing import Any, Literal, NamedTuple, Protocol
 from rawaug._version import __version__
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture
+from rawaug.io.apart import apart
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
@@ -75,10 +77,10 @@ class Task(Protocol):
 
 
 class PairMaker:
-    """The pairs of pictures under fixed settings."""
+    """The pairs of pictures under fixed settings; those with more than ``max_pixels`` are refused."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
+        self.settings, self.max_pixels = settings, max_pixels
         self.augment = augmentation(settings.isp, settings.noise, settings.sampling)
 
     def origin(self, picture: Path) -> Origin:
@@ -92,7 +94,7 @@ class PairMaker:
         Raises:
             OSError, ValueError: if it cannot be read, here and not on iteration.
         """
-        srgb = even_sided(read_picture(picture))
+        srgb = even_sided(apart(read_picture, picture, self.max_pixels))
 
         def made() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:

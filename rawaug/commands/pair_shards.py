@@ -21,7 +21,7 @@ import io
 import json
 import tarfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, replayed
-from rawaug.files import read_json, replacing, write_json
+from rawaug.files import parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 
 PER_SHARD = 500
@@ -63,7 +63,12 @@ class ShardTask:
     @cached_property
     def known(self) -> dict[str, Any]:
         """The record of an earlier run; empty without one."""
-        return read_json(self.record, "delete it to make the shard again") if self.record.is_file() else {}
+        if not self.record.is_file():
+            return {}
+        try:
+            return parse_object(self.record.read_text())
+        except ValueError as error:
+            raise ValueError(f"{self.record}: {error}; delete it to make the shard again") from None
 
     @property
     def existing(self) -> int:
@@ -118,7 +123,9 @@ def shard_tasks(
     ]
 
 
-def shard_settings(pictures: Sequence[Path], source: Path, per_image: int, per_shard: int) -> dict[str, object]:
+def shard_settings(
+    pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
+) -> dict[str, object]:
     """What else all shards of a folder have in common: a picture more, and all that follow would move."""
     listed = "\n".join(_names(pictures, source)).encode()
     return {
@@ -126,6 +133,7 @@ def shard_settings(pictures: Sequence[Path], source: Path, per_image: int, per_s
         "names_sha256": hashlib.sha256(listed).hexdigest(),
         "per_image": per_image,
         "per_shard": per_shard,
+        "max_pixels": max_pixels,
     }
 
 
@@ -181,14 +189,14 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
 
 def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
     """Write index and card, if all shards are there, whoever made them; whether they are."""
-    records = [read_json(task.record, "delete it") for task in tasks if task.record.is_file()]
-    if len(records) < len(tasks):
+    if not all(task.record.is_file() for task in tasks):
         return False
+    records = [replace(task).known for task in tasks]  # as they are now
     shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
-    write_json(index, out / "index.json", shared=True)
-    with replacing(out / "README.md", shared=True) as partial:
-        partial.write_text(card(shards, settings))
+    write_json(index, out / "index.json")
+    with replacing(out / "README.md") as partial:
+        partial.write_text(card(shards, settings), encoding="utf-8")
     return True
 
 

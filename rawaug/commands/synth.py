@@ -7,6 +7,7 @@ made once.
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
@@ -27,8 +28,11 @@ from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Tas
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import find_weights, read_json, sha256, write_json
+from rawaug.files import find_weights, sha256, write_json
+from rawaug.io.apart import prepare
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 
@@ -47,6 +51,7 @@ def run(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
     shard: str = "1/1",
     per_shard: int = PER_SHARD,
 ) -> None:
@@ -62,10 +67,11 @@ def run(
         sampling: how camera settings are drawn.
         seed: random seed.
         workers: number of processes; by default one per core.
+        max_pixels: larger pictures are refused before they are decoded.
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    made = synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers, shard, per_shard)
+    made = synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers, max_pixels, shard, per_shard)
     print_synthesis(made)
 
 
@@ -91,6 +97,7 @@ def synth(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
     shard: str = "1/1",
     per_shard: int = PER_SHARD,
 ) -> Synthesis:
@@ -107,6 +114,7 @@ def synth(
         seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
+        max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
 
@@ -127,18 +135,18 @@ def synth(
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
-    PairMaker(settings)  # raises for a wrong name here, not in a worker
+    PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
     result = Synthesis(out)
     if format == "webdataset":
         shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
-        fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard)
+        fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         require_same_settings(out / "synth.json", _portable(settings) | fixed)
-        _work_off(shards[part - 1 :: parts], settings, workers, result)
+        _work_off(shards[part - 1 :: parts], settings, max_pixels, workers, result)
         pair_shards.finish(shards, settings, out)
     else:
         tasks = list(picture_tasks(pictures, source, out, per_image))
         require_same_settings(out / "synth.json", vars(settings))
-        _work_off(tasks[part - 1 :: parts], settings, workers, result)
+        _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())
@@ -167,14 +175,17 @@ def _portable(settings: Settings) -> dict[str, object]:
     return {**vars(settings), "isp": Path(settings.isp).name}
 
 
-def _work_off(tasks: Sequence[Task], settings: Settings, workers: int | None, result: Synthesis) -> None:
+def _work_off(
+    tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None, result: Synthesis
+) -> None:
     """Do what is to be done, and count."""
     result.pictures = sum(task.pictures for task in tasks)
     result.existing = sum(task.existing for task in tasks)
     for task in tasks:
         result.broken |= task.broken
     todo = [task for task in tasks if task.todo]
-    for outcome in progress(_done(todo, settings, workers), label="synth", unit="file", total=len(todo), leave=True):
+    outcomes = _done(todo, settings, max_pixels, workers)
+    for outcome in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
         result.made += outcome.made
         result.broken |= outcome.broken
     result.broken = dict(sorted(result.broken.items()))
@@ -198,11 +209,15 @@ def require_same_settings(path: Path, settings: dict[str, object]) -> None:
         ValueError: if the existing files were made with other settings.
     """
     if path.is_file():
-        for key, value in read_json(path, "choose another folder").items():
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+        for key, value in known.items():
             if settings.get(key) != value:
                 raise ValueError(f"{path}: made with {key} {value}, not {settings.get(key)}; choose another folder")
         return
-    write_json(settings, path, shared=True)
+    write_json(settings, path)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------
@@ -210,16 +225,17 @@ def require_same_settings(path: Path, settings: dict[str, object]) -> None:
 _maker: PairMaker
 
 
-def _done(tasks: Sequence[Task], settings: Settings, workers: int | None) -> Iterator[Outcome]:
+def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
     """Of each task as it finishes."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    prepare()
     if workers < 1:
-        _prepare(settings)
+        _prepare(settings, max_pixels)
         yield from map(_make, tasks)
         return
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
-    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings,))
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings, max_pixels))
     try:
         for future in as_completed([pool.submit(_make, task) for task in tasks]):
             yield future.result()
@@ -229,14 +245,14 @@ def _done(tasks: Sequence[Task], settings: Settings, workers: int | None) -> Ite
         pool.shutdown(cancel_futures=True)
 
 
-def _start_worker(settings: Settings) -> None:
+def _start_worker(settings: Settings, max_pixels: int) -> None:
     """A worker has one thread, leaves the interrupt to the parent, and ends when the parent has died."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     torch.set_num_threads(1)
-    _prepare(settings)
+    _prepare(settings, max_pixels)
 
 
 def _end_with(parent: BaseProcess) -> None:
@@ -244,9 +260,9 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-def _prepare(settings: Settings) -> None:
+def _prepare(settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
     global _maker
-    _maker = PairMaker(settings)
+    _maker = PairMaker(settings, max_pixels)
 
 
 def _make(task: Task) -> Outcome:
@@ -259,4 +275,4 @@ def print_synthesis(result: Synthesis) -> None:
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"unreadable: {reason}")
+        print(f"unreadable: {printable(reason)}")

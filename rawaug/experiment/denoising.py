@@ -30,6 +30,7 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     network_method,
+    require_numbers,
     row_of,
     score_method,
     summary,
@@ -114,7 +115,7 @@ class _Run:
             isp.info["key"] = sha256(weights)
             return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
-        settings = {**asdict(self.recipe.isp), "seed": seed}
+        settings = {**self.recipe.isp.key(), "seed": seed}
         measure = self.recipe.noise == "camera"
         key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
         if path.is_file():
@@ -221,6 +222,8 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
+        runs = [run[kind] for arm in results.values() for run in arm for kind in ("plain", "self_ensemble")]
+        require_numbers([*runs, *classical.values()])
 
 
 def _settings(part: Any) -> dict[str, Any]:

@@ -15,11 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, get_args, overload
 
 import torch
 from torch import Tensor, nn
-from torch._compile import _disable_dynamo  # torch.compiler.disable would load the whole compiler here
 from torch.utils.data import get_worker_info
 
 from rawaug import bayer
@@ -30,13 +29,14 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
+from rawaug.kernels.eager import eager
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
-Sampling = Literal["convex", "perturb", "chosen"]
+Sampling = Literal["convex", "independent", "perturb", "chosen"]
 
 
 class RawAugment(nn.Module):
@@ -50,8 +50,9 @@ class RawAugment(nn.Module):
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
             ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
-            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
-            ISP chooses; ``"chosen"`` takes these as they are.
+            camera uniform convex combinations of the atoms. ``"independent"`` is the same with the gains of another
+            camera in another light, to see what consistency is worth. ``"perturb"`` adds Gaussian noise to the weights
+            that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
@@ -62,8 +63,8 @@ class RawAugment(nn.Module):
             like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
 
     Raises:
-        ValueError: if a setting is unknown or out of range, or the noise belongs to the planes of a Bayer mosaic and the
-            pattern is none.
+        ValueError: if a setting is unknown or out of range, or the noise is one of Bayer's planes and the pattern has
+            none.
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -89,8 +90,8 @@ class RawAugment(nn.Module):
         if self.pattern is not None and self.pattern.name in CFA.__members__:
             isp, self.pattern = deepcopy(isp), None
             isp.configure(cfa=str(cfa))
-        if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
+        if sampling not in get_args(Sampling):
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
         if exposure is None:
@@ -133,7 +134,7 @@ class RawAugment(nn.Module):
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
-    @_disable_dynamo  # for torch.compile a call between two graphs: what is inside is compiled already
+    @eager
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
@@ -153,8 +154,8 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.sampling == "convex":
-            return self.isp.draw_setting(len(srgb), generator)
+        if self.sampling in ("convex", "independent"):
+            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
@@ -166,9 +167,10 @@ class RawAugment(nn.Module):
         if not any(self.exposure):
             return setting
         low, high = self.exposure
-        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator)
+        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
+    @eager
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:
         """The :class:`RawPair` that ``params`` describe: pure, bit for bit the same at every call.
@@ -185,7 +187,6 @@ class RawAugment(nn.Module):
             return self._pair(self._batch(srgb), params.map(lambda t: t[None])).map(lambda t: t[0])
         return self._pair(self._batch(srgb), params)
 
-    @_disable_dynamo
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
@@ -208,6 +209,7 @@ class RawAugment(nn.Module):
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
     @overload
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
+    @eager
     @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
         """Sample, then apply.

@@ -13,6 +13,7 @@ import torch
 
 from rawaug.commands import pair_shards
 from rawaug.commands.synth import Synthesis, part_of, replay_sample, synth
+from rawaug.files import replacing
 from rawaug.io import write_picture
 
 FIXED = (2e-3, 1e-4)
@@ -63,7 +64,10 @@ def test_parts_in_any_order_make_the_bytes_of_one_run(pictures: Path, whole: Pat
 
 def test_a_killed_run_is_resumed_by_shard(pictures: Path, whole: Path, tmp_path: Path) -> None:
     shards(pictures, tmp_path, "1/3")
-    (tmp_path / "shard-000001.tar.partial").write_bytes(b"killed here")
+    with replacing(tmp_path / "shard-000001.tar") as partial:
+        abandoned = partial
+    (tmp_path / "shard-000001.tar").unlink()
+    abandoned.write_bytes(b"killed here")
     (tmp_path / "shard-000002.tar").write_bytes(b"killed after this was written, before its record")
     assert not (tmp_path / "README.md").exists() and not (tmp_path / "index.json").exists()
     before = (tmp_path / "shard-000000.tar").stat().st_mtime_ns
@@ -144,7 +148,7 @@ def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Pat
         pair_shards.shard_tasks([pictures / "a.png"], pictures, tmp_path, 1, 0)
     (tmp_path / ".shards").mkdir()
     (tmp_path / ".shards/shard-000000.json").write_text("{")
-    with pytest.raises(ValueError, match=r"shard-000000\.json: not valid JSON .*; delete it to make the shard again"):
+    with pytest.raises(ValueError, match=r"shard-000000\.json: not JSON.*; delete it to make the shard again"):
         shards(pictures, tmp_path)
 
 
