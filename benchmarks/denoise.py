@@ -1,6 +1,6 @@
 """What denoising a frame costs: seconds and peak memory, whole and in tiles, in float32 and in bf16.
 
-    python -m benchmarks.denoise [--device cpu|cuda] [--denoiser rawaug-small] [--megapixels 12 45] [--json FILE]
+    python -m benchmarks.denoise [--device cpu|cuda] [--denoiser rawaug-small] [--megapixels 12 45] [--quick]
 
 A frame is noise, packed, on the device; its time does not depend on what is in it. ``rawaug denoise`` also reads and
 writes a file. Every form runs ``--repeats`` times after one that is not counted, and the fastest counts.
@@ -64,8 +64,11 @@ def main() -> None:
     parser.add_argument("--denoiser", default=DEFAULT, help="name of a shipped denoiser, or its file")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[12.0, 45.0], help="of the mosaics")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="one repeat of 0.25 Mpix")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()
+    if args.quick:
+        args.megapixels, args.repeats = [0.25], 1
     model = denoisers.from_pretrained(args.denoiser)
     model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     figures: dict[str, Any] = {"machine": machine(args.device, torch.get_num_threads())}
