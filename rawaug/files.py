@@ -77,7 +77,7 @@ def _lock(descriptor: int, partial: Path) -> bool:
     """Whether the file is ours now; not if another process has it, or had it and has put it in its place since."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(descriptor), os.stat(partial))
+        return os.path.samestat(os.fstat(descriptor), partial.stat())
     except (BlockingIOError, FileNotFoundError):
         return False
 
@@ -154,7 +154,7 @@ def read_tensors(
     header, tensors = _opened(path, advice, tensors=True)
     for name, tensor in tensors.items():
         values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own
-        if not (values.isfinite().all() or name in infinite and not values.isnan().any()):
+        if not (values.isfinite().all() or (name in infinite and not values.isnan().any())):
             raise ValueError(f"{path}: tensor {name} has values that are not finite; {advice}")
     return header, tensors
 

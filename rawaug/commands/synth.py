@@ -94,7 +94,8 @@ class _Settings:
 
 
 class _Task(NamedTuple):
-    """A picture, its name as the key of its draws, where its pairs go, the numbers of those that are missing, and what is too large."""
+    """A picture, its name as the key of its draws, where its pairs go, the numbers of the missing ones, and the limit
+    of its size."""
 
     picture: Path
     key: str

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
 from rawaug.experiment.denoising import run
-from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.plain_yaml import read_yaml
+from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 
 

@@ -11,7 +11,7 @@ import torch
 from scipy.io import savemat
 
 from rawaug.cli import main
-from rawaug.data import PictureFolder, check
+from rawaug.data import check
 from rawaug.data.sidd.scenes import HELD_BACK
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import time_limit

@@ -231,8 +231,8 @@ def test_a_picture_bomb_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
     chunks = [(b"IHDR", side + bytes((8, 2, 0, 0, 0))), (b"IDAT", zlib.compress(bytes(100))), (b"IEND", b"")]
     parts = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
     (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
-    with pytest.raises(ValueError, match=r"declares 16384 x 16384 pixels of 3 channels, above the limit of 67108864"):
+    with pytest.raises(ValueError, match=r"declares 16384 x 16384 pixels, above the limit of 67108864"):
         read_picture(tmp_path / "bomb.png")
     tifffile.imwrite(tmp_path / "wide.tif", np.zeros((20, 20, 8), np.uint8), photometric="rgb")
-    with pytest.raises(ValueError, match="declares 20 x 20 pixels of 8 channels, above the limit of 500 pixels"):
+    with pytest.raises(ValueError, match="declares 20 x 20 pixels of 8 channels, above the limit of 500"):
         read_picture(tmp_path / "wide.tif", max_pixels=500)
