@@ -42,7 +42,9 @@ def test_a_dng_whose_directories_point_in_a_circle(
 ) -> None:
     numbers = np.full((32, 48), 1000, np.uint16)
     good = read_raw(bayer_dng(tmp_path / "good.dng", numbers))
-    bad = bayer_dng(tmp_path / "bad.dng", numbers, extra=[(330, LONG, 2, (8, 8), True)] if children else ())
+    bad = bayer_dng(tmp_path / "bad.dng", numbers, extra=[(65000, LONG, 2, (8, 8), True)] if children else ())
+    entry = struct.pack("<HHI", 65000, LONG, 2)
+    bad.write_bytes(bad.read_bytes().replace(entry, struct.pack("<HHI", 330, LONG, 2)))  # SubIFDs
     start, successor = first_directory(bad)
     assert start == 8
     if not children:
