@@ -141,11 +141,13 @@ class Denoiser(nn.Module, ABC):
                 does not read it.
 
         Raises:
-            ValueError: if a shape is wrong, or the network was made with a noise map and ``variance`` is missing.
+            ValueError: if a shape or a type is wrong, or the network was made with a noise map and ``variance`` is
+                missing.
         """
         name = type(self).__name__
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
+        self._require_type(noisy, "noisy")
         if not self.reads_variance:
             return noisy + self._correction(noisy)
         if variance is None:
@@ -153,6 +155,7 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
+        self._require_type(variance, "variance")
         if self.domain == "linear":
             return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
@@ -161,11 +164,23 @@ class Denoiser(nn.Module, ABC):
         correction = self._correction(signal, noise_map)
         correction = correction if noise_map is None else noise_map * correction
         denoised = domain.inverse(signal + correction, *levels)
-        return torch.where(variance > 0, denoised, noisy)
+        return torch.where(variance > 0, denoised, noisy).to(noisy.dtype)
 
     def _correction(self, signal: Tensor, noise_map: Tensor | None = None) -> Tensor:
         features = signal if noise_map is None else torch.cat([signal, noise_map], dim=1)
-        return self.residual(pad_to_multiple(features, self.stride))[..., : signal.shape[-2], : signal.shape[-1]]
+        correction = self.residual(pad_to_multiple(features.to(self._dtype), self.stride))
+        return correction[..., : signal.shape[-2], : signal.shape[-1]]
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return next((p.dtype for p in self.parameters()), torch.get_default_dtype())
+
+    def _require_type(self, image: Tensor, what: str) -> None:
+        """Weights and RAW are of one type, but for mixed precision, which converts by itself."""
+        if not image.is_floating_point():
+            raise ValueError(f"{what} must be floating-point RAW with white at 1, got {image.dtype}")
+        if image.dtype != self._dtype and not torch.is_autocast_enabled(image.device.type):
+            raise ValueError(f"{what} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
