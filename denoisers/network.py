@@ -20,9 +20,13 @@ import torch
 from torch import Tensor, nn
 
 from denoisers.domains import DOMAINS, levels_of, relative_deviation
+from rawaug.registry import require_between
 
 PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
+
+MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
+"""Larger networks are refused before they are built: a few bytes of a file or a recipe can ask for any size."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""
@@ -61,9 +65,17 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
 
 
 def require_width(width: int, multiple: int = 1) -> None:
-    """Refuse a number of features that no layer can have."""
+    """Refuse a number of features that no layer can have, or that no machine could hold."""
     if width < 1 or width % multiple:
         raise ValueError(f"width must be a positive multiple of {multiple}, got {width}")
+    require_between("width", width, 1, MOST_FEATURES)
+
+
+def require_bounded(seed: int, **layers: int) -> None:
+    """Refuse what would never be built: more than :data:`MOST_LAYERS` of what is counted, or no seed of PyTorch's."""
+    require_between("seed", seed, -(2**63), 2**63 - 1)
+    for key, number in layers.items():
+        require_between(key, number, 0, MOST_LAYERS)
 
 
 class Denoiser(nn.Module, ABC):
@@ -97,6 +109,7 @@ class Denoiser(nn.Module, ABC):
         super().__init__()
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
+        require_between("channels", channels, 1, MOST_FEATURES)
         self.domain = domain
         self.channels = channels
         self.variance_map = variance_map

@@ -143,14 +143,15 @@ class DictionaryISP(ReverseISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
+    def draw_setting(self, batch: int, generator: torch.Generator, consistent: bool = True) -> ISPParams:
         """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
 
         A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
-        atoms with uniform weights.
+        atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
+        a fitted camera they always have weights of their own.
         """
         if isinstance(self.colour, CameraDictionary):
-            return CameraSampler(self.colour, self.config.tone_atoms).sample(batch, generator)
+            return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent).sample(batch, generator)
         config, device = self.config, self.colour.matrices.device
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
@@ -350,5 +351,8 @@ class DictionaryISP(ReverseISP):
         if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
             raise misfit(path, wrong[0])
         isp.load_state_dict(state)
+        for name, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
+            if not atoms.isfinite().all():
+                raise damaged(path, ValueError(f"its {name} atoms are not finite"))
         isp.info = info
         return isp.eval()
