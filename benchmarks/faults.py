@@ -1,4 +1,4 @@
-"""Kills, full disks, vanishing files and two runs at once: what was there stays whole, and a run goes on as if nothing was.
+"""Kills, full disks and two runs at once: what was there stays whole, and a run goes on as if nothing had been.
 
     python -m benchmarks.faults [--kills 20] [--seed 0] [--commands fit run synth denoise] [--quick] [--json FILE]
 
@@ -124,6 +124,7 @@ def _run(folder: Path, log: Path, command: list[str], before: Callable[[], None]
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         torch.set_num_threads(1)
+        os.environ["RAWAUG_READ_SECONDS"] = "0"  # decoders in the child itself
         os.chdir(folder)
         before()
         from rawaug.cli import main

@@ -9,7 +9,10 @@ from __future__ import annotations
 import re
 
 _WAYS_OUT = (
-    (r"out of shared memory|shared memory\(shm\)|bus error|/torch_", "shared memory is full; enlarge /dev/shm or use fewer workers"),
+    (
+        r"out of shared memory|shared memory\(shm\)|bus error|/torch_",
+        "shared memory is full; enlarge /dev/shm or use fewer workers",
+    ),
     (r"too many open files|ancdata", "too many open files; raise the limit (ulimit -n) or use fewer workers"),
     (r"out of memory|can't allocate memory", "out of memory; use a smaller batch, crop or tile"),
     (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
@@ -36,7 +39,7 @@ def without_traceback(text: str) -> str:
     """The last line of an error that a DataLoader's worker raised, in place of its traceback.
 
     Example:
-        >>> without_traceback("Caught ValueError in DataLoader worker process 0.\\nOriginal Traceback ...\\nValueError: a")
+        >>> without_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")
         'a'
     """
     if "Original Traceback" not in text:

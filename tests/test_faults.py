@@ -1,4 +1,4 @@
-"""Faults of the machine in short form: what was there stays whole, a run goes on as if nothing had been, or one line."""
+"""Faults of the machine in short form: what was there stays whole, and a run goes on or ends in one line."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 import denoisers
-import rawaug.commands.synth as synthesis
 from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairs
 from rawaug.bayer import CFA
 from rawaug.cli import main
+from rawaug.commands import pair_files, pair_maker
 from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
 from rawaug.files import replacing, write_json, write_tensors
 from rawaug.io import RawFrame, write_dng, write_picture
 from rawaug.lock import NAME, locked
 from rawaug.shortages import shortage
-from rawaug.training.loop import write_atomically
+from rawaug.training.state import TrainingState
+from rawaug.training.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forks, signals and limits of Linux")
@@ -49,6 +50,12 @@ def inputs(harness: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     harness.make_inputs(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoders in this process: to start another takes seconds."""
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")
 
 
 # -- kills ------------------------------------------------------------------------------------------------------------
@@ -120,7 +127,13 @@ def test_a_folder_that_was_only_made_for_the_lock_is_taken_away(tmp_path: Path, 
 def test_two_at_once(command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = {
         "synth": ["synth", str(inputs / "pictures"), str(tmp_path), "--workers", "0"],
-        "denoise": ["denoise", str(inputs / "shots"), str(tmp_path), "--denoiser", str(inputs / "denoiser.safetensors")],
+        "denoise": [
+            "denoise",
+            str(inputs / "shots"),
+            str(tmp_path),
+            "--denoiser",
+            str(inputs / "denoiser.safetensors"),
+        ],
     }
     with locked(tmp_path / NAME):
         assert main(arguments[command]) == 2
@@ -141,11 +154,15 @@ def _save_picture(path: Path) -> None:
         np.save(partial.open("wb"), np.zeros(40_000, np.float32))
 
 
+def _save_checkpoint(path: Path) -> None:
+    TrainingState(denoisers.build("DnCNN", width=24, depth=4), TrainConfig(steps=1)).save(path)
+
+
 WRITERS: dict[str, Callable[[Path], object]] = {
     "safetensors": lambda path: write_tensors({"x": torch.zeros(40_000)}, {"format": "rawaug"}, path),
     "json": lambda path: write_json(["x" * 100_000], path),
     "dng": lambda path: write_dng(path, FRAME),
-    "checkpoint": lambda path: write_atomically({"x": torch.zeros(40_000)}, path),
+    "checkpoint": _save_checkpoint,
     "denoiser": lambda path: denoisers.save(denoisers.build("DnCNN", width=32, depth=4), path, {"cfa": "RGGB"}),
     "numpy": _save_picture,
 }
@@ -170,7 +187,7 @@ def test_a_full_disk_leaves_what_was_there_and_says_so(kind: str, tmp_path: Path
 def test_an_output_folder_that_is_removed_on_the_way_is_reported(
     tmp_path: Path, inputs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, calls = synthesis.write_pair, list[Path]()
+    write, calls = pair_files.write_pair, list[Path]()
 
     def write_and_remove(stem: Path, *rest: Any) -> None:
         write(stem, *rest)
@@ -180,7 +197,7 @@ def test_an_output_folder_that_is_removed_on_the_way_is_reported(
                 file.unlink()
             (tmp_path / "out").rmdir()
 
-    monkeypatch.setattr(synthesis, "write_pair", write_and_remove)
+    monkeypatch.setattr(pair_files, "write_pair", write_and_remove)
     with pytest.raises(OSError, match="out: was removed or replaced during this run; run the same command again"):
         synth(inputs / "pictures", tmp_path / "out", workers=0)
 
@@ -207,7 +224,7 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
 ) -> None:
     for k in range(3):
         write_picture(_made(tmp_path / "in") / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
-    read = synthesis.read_picture
+    read = pair_maker.read_picture
 
     def unlucky(path: Path, *rest: Any) -> Any:
         picture = read(path, *rest)
@@ -215,7 +232,7 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture
 
-    monkeypatch.setattr(synthesis, "read_picture", unlucky)
+    monkeypatch.setattr(pair_maker, "read_picture", unlucky)
     result = synth(tmp_path / "in", tmp_path / "out", workers=0)
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
 
@@ -266,9 +283,9 @@ def test_a_worker_that_the_system_kills_is_one_line(
 @pytest.mark.parametrize(
     ("said", "way_out"),
     [
-        ("unable to allocate shared memory(shm) for file </torch_1_2>: No space left on device (28)", "enlarge /dev/shm"),
-        ("DataLoader worker (pid 5) is killed by signal: Bus error. It is possible that dataloader's workers are out of "
-         "shared memory. Please try to raise your shared memory limit.", "enlarge /dev/shm"),
+        ("unable to allocate shared memory(shm) for file </torch_1>: No space left on device (28)", "enlarge /dev/shm"),
+        ("DataLoader worker (pid 5) is killed by signal: Bus error. It is possible that dataloader's workers are out "
+         "of shared memory. Please try to raise your shared memory limit.", "enlarge /dev/shm"),
         ("received 0 items of ancdata", "ulimit -n"),
         ("unable to open shared memory object </torch_1> in read-write mode: Too many open files (24)", "ulimit -n"),
         ("DataLoader worker (pid(s) 5, 6) exited unexpectedly", "fewer workers"),

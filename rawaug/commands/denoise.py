@@ -31,8 +31,8 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
-from rawaug.lock import one_at_a_time
 from rawaug.io.apart import apart
+from rawaug.lock import one_at_a_time
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
 from rawaug.printable import printable
 from rawaug.progress import progress

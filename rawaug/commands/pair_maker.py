@@ -83,9 +83,7 @@ class PairMaker:
         self.settings, self.max_pixels = settings, max_pixels
         self.augment = augmentation(settings.isp, settings.noise, settings.sampling)
 
-    def pairs(
-        self, picture: Path, key: str, numbers: Iterable[int]
-    ) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
+    def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers.
 
         Args:

@@ -244,7 +244,9 @@ def _black_of_sites(path: Path, raw: Any, black: np.ndarray, tags: TiffTags) -> 
     lines = []
     for above, start, length in zip((tags.black_rows, tags.black_columns), first, (height, width), strict=True):
         if above and len(above) != start + length:
-            raise OSError(f"{path}: its TIFF tags are damaged (black levels of {len(above)} lines, not {start + length})")
+            raise OSError(
+                f"{path}: its TIFF tags are damaged (black levels of {len(above)} lines, not {start + length})"
+            )
         lines.append(np.array(above or (0.0,) * (start + length), np.float32)[start:])
     cells = np.tile(black, (-(-height // 2), -(-width // 2)))[:height, :width]
     return np.asarray(cells + lines[0][:, None] + lines[1])

@@ -6,8 +6,8 @@ falls.
 
 from __future__ import annotations
 
-import io
 import copy
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -42,7 +42,9 @@ def test_an_odd_active_area_and_crop_neither_tint_nor_shift(
     whole[top:, left:] = (signal * (WHITE - black) + black).round()  # DNG: pattern and levels begin at the active area
     area = (50829, LONG, 4, (top, left, 48 + top, 64 + left), True)
     crop = [(50719, SHORT, 2, (3, 5), True), (50720, SHORT, 2, (57, 41), True)]
-    path = bayer_dng(tmp_path / "a.dng", whole, cfa.value, black=levels.ravel().tolist(), white=WHITE, extra=[area, *crop])
+    path = bayer_dng(
+        tmp_path / "a.dng", whole, cfa.value, black=levels.ravel().tolist(), white=WHITE, extra=[area, *crop]
+    )
     frame = read_raw(path)
     rows, columns = top % 2, left % 2
     assert frame.cfa == cfa.shifted(rows, columns)
