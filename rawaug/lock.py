@@ -25,8 +25,8 @@ P, R = ParamSpec("P"), TypeVar("R")
 NAME = "rawaug.lock"
 """Of the lock file in a folder."""
 
-_held: set[Path] = set()
-"""Of this process, in which POSIX's locks do not exclude each other."""
+_held: set[tuple[Path, int]] = set()
+"""By process: within one, POSIX's locks do not exclude each other, and a child inherits this set."""
 
 
 @contextmanager
@@ -49,16 +49,17 @@ def locked(file: Path) -> Iterator[None]:
     file = file.absolute()
     made = not file.parent.exists()
     file.parent.mkdir(parents=True, exist_ok=True)
-    if file in _held:
+    own = (file, os.getpid())
+    if own in _held:
         raise ValueError(_refusal(file, "this process"))
     with _acquired(file) as handle:
-        _held.add(file)
+        _held.add(own)
         try:
             yield
             if not _is_at(file, handle):
                 raise OSError(f"{file.parent}: was removed or replaced during this run; run the same command again")
         finally:
-            _held.discard(file)
+            _held.discard(own)
             if _is_at(file, handle):
                 file.unlink()
             if made and file.parent.is_dir() and not any(file.parent.iterdir()):

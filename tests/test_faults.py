@@ -107,7 +107,8 @@ def test_a_second_run_is_refused_with_the_name_of_the_first(tmp_path: Path) -> N
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
     def die() -> None:
-        locked(tmp_path / NAME).__enter__()
+        lock = locked(tmp_path / NAME)
+        lock.__enter__()
         os.kill(os.getpid(), signal.SIGKILL)
 
     assert in_child(die) == -signal.SIGKILL
@@ -149,9 +150,9 @@ FRAME = RawFrame(
 )  # fmt: skip
 
 
-def _save_picture(path: Path) -> None:
-    with replacing(path) as partial:
-        np.save(partial.open("wb"), np.zeros(40_000, np.float32))
+def _save_array(path: Path) -> None:
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.save(file, np.zeros(40_000, np.float32))
 
 
 def _save_checkpoint(path: Path) -> None:
@@ -164,7 +165,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "dng": lambda path: write_dng(path, FRAME),
     "checkpoint": _save_checkpoint,
     "denoiser": lambda path: denoisers.save(denoisers.build("DnCNN", width=32, depth=4), path, {"cfa": "RGGB"}),
-    "numpy": _save_picture,
+    "numpy": _save_array,
 }
 
 
