@@ -66,7 +66,7 @@ def locked(file: Path) -> Iterator[None]:
                 file.parent.rmdir()
 
 
-def one_at_a_time(folder: Callable[P, Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator: hold the lock of the folder that the arguments name during a call; of None none."""
 
     def decorator(function: Callable[P, R]) -> Callable[P, R]:
