@@ -124,10 +124,10 @@ def work() -> None:
 
 
 class Worker:
-    """A process that reads files, restarted after a crash or a fault."""
+    """A process that reads files, each in at most ``seconds``, restarted after a crash or a fault."""
 
-    def __init__(self, folder: Path) -> None:
-        self.log = folder / "stderr.txt"
+    def __init__(self, folder: Path, seconds: float = SECONDS) -> None:
+        self.log, self.seconds = folder / "stderr.txt", seconds
         self.process: subprocess.Popen[str] | None = None
 
     def read(self, kind: str, path: Path) -> tuple[str, str]:
@@ -137,7 +137,7 @@ class Worker:
         _forget_peak(process.pid)
         process.stdin.write(json.dumps([kind, str(path)]) + "\n")
         process.stdin.flush()
-        end = time.monotonic() + SECONDS
+        end = time.monotonic() + self.seconds
         answered = False
         while not answered and time.monotonic() < end and _peak_mebibytes(process.pid) < MEBIBYTES:
             answered = bool(select.select([process.stdout], [], [], 0.05)[0])
@@ -150,7 +150,7 @@ class Worker:
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
-            return "hung", f"more than {SECONDS:g} s"
+            return "hung", f"more than {self.seconds:g} s"
         name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
@@ -266,7 +266,7 @@ def print_table(results: dict[str, Any]) -> None:
             print(f"{kind}: {reason}")
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=5000, help="files of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
@@ -275,7 +275,7 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     if args.worker:
         work()
         return 0

@@ -146,7 +146,7 @@ fabric = launched("cpu", 1, "32-true")
 NODE = """
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 rendezvous = {"rdzv_backend": "static", "rdzv_endpoint": endpoint, "rdzv_configs": {"rank": rank}, "run_id": "meet"}
-config = LaunchConfig(2, 2, 2, **rendezvous, max_restarts=0, monitor_interval=0.05, start_method="forkserver")
+config = LaunchConfig(2, 2, 2, **rendezvous, max_restarts=0, monitor_interval=0.05, start_method="fork")
 elastic_launch(config, exec)(meet, {"where": where})
 """
 """What ``torchrun --nnodes 2 --nproc-per-node 2 --node-rank RANK`` does on a node, for code in place of a file."""
