@@ -27,7 +27,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(
     figures = tmp_path / "figures.json"
     assert fuzz.main(["--quick", "--json", str(figures)]) == 0, capsys.readouterr().out
     kinds = json.loads(figures.read_text())["kinds"]
-    assert {"dng", "jpeg", "picture", "mat5", "mat73", "safetensors"} <= set(kinds)
+    assert {"dng", "jpeg", "picture", "mat5", "mat73", "safetensors", "npy", "recipe"} <= set(kinds)
     assert sum(row["mutated"] for row in kinds.values()) == 100
     assert all(row["refused"] for row in kinds.values()) and sum(row["read"] for row in kinds.values()) > 5
 
@@ -38,7 +38,7 @@ def test_a_worker_that_dies_or_hangs_is_named_and_started_anew(fuzz: ModuleType,
     try:
         for name, outcome, why in (
             ("SIGSEGV", "crashed", "OpenImageIO: SIGSEGV"),
-            ("SIGSTOP", "hung", "more than 1 s"),
+            ("SIGSTOP", "hung", "more than 10 s of a processor, or 1 s in all"),
         ):
             assert worker.read("jpeg", missing) == ("refused", f"{missing}: no such picture file")
             assert worker.process is not None

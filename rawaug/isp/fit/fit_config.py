@@ -7,6 +7,10 @@ from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stage import stage_class
+from rawaug.registry import require_between
+
+MOST = 2**31
+"""Of steps and pixels."""
 
 _SWITCH = ("auto", "on", "off")
 
@@ -69,9 +73,12 @@ class FitConfig:
         return replace(self, steps=2, curve_steps=10, pixels=512, batch=128)
 
     def __post_init__(self) -> None:
-        for key in ("atoms", "pixels", "batch"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key} must be at least 1, got {getattr(self, key)}")
+        for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0}.items():
+            if getattr(self, key) is not None:
+                require_between(key, getattr(self, key), least, MOST)
+        require_between("seed", self.seed, -(2**63), 2**63 - 1)
+        require_between("reach", self.reach, 1.0, float(MOST))
+        require_between("learning_rate", self.learning_rate, 0.0, float(MOST))
         for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
@@ -81,5 +88,3 @@ class FitConfig:
             raise ValueError(f"curve_steps must be at least 0, got {self.curve_steps}")
         if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")
-        if self.steps < 0 or self.reach < 1:
-            raise ValueError(f"steps must be at least 0 and reach at least 1, got {self.steps} and {self.reach}")
