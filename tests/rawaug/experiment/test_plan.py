@@ -133,10 +133,19 @@ def test_settings_of_pairs_need_pairs() -> None:
 
 
 def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
-    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 5)
-    command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--dry-run", "--out", str(tmp_path / "runs")]
+    command = [
+        "run",
+        "fewshot",
+        "--data.pairs",
+        f"pairs:{own}",
+        "--isp.curve_steps",
+        "5",
+        "--dry-run",
+        "--out",
+        str(tmp_path / "runs"),
+    ]
     assert main([*command, *ONE_ARM, *BARE]) == 0
     said = capsys.readouterr().out
     assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said
