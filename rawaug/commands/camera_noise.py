@@ -18,6 +18,7 @@ from rawaug.bayer import CFA, aligned
 from rawaug.data import RawFolder
 from rawaug.data.pair import Pair
 from rawaug.io import read_raw
+from rawaug.io.apart import apart
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_noise, from_dark_frames
 
 WORST_FIT = 0.5
@@ -117,7 +118,7 @@ def _frames(pairs: Sequence[Pair]) -> list[Frame]:
 
 def _frame(pairs: Sequence[Pair], index: int) -> Frame:
     if isinstance(pairs, RawFolder):
-        frame = read_raw(pairs.files[index])
+        frame = apart(read_raw, pairs.files[index])
         return Frame(frame.mosaic, frame.cfa, frame.camera, frame.iso)
     pair = pairs[index]
     return Frame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, pair.camera, pair.iso)

@@ -11,8 +11,9 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.io.apart import apart
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import (
     EldLevels,
@@ -41,6 +43,7 @@ from rawaug.noise import (
     estimate_noise,
     noise_levels,
 )
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
@@ -234,14 +237,21 @@ def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
     return model.to(memory_format=torch.channels_last), CFA(info.get("cfa", "RGGB"))  # type: ignore[call-overload]
 
 
-def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
+def _denoise_file(
+    source: Path,
+    out: Path,
+    loaded: tuple[Denoiser, CFA],
+    noise: Noise,
+    self_ensemble: bool,
+    read: Callable[[Path], RawFrame] = read_raw,
+) -> Denoised:
     start = time.perf_counter()
     if out.suffix.lower() != ".dng":
         raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
     model, cfa = loaded
-    frame = read_raw(source)
+    frame = read(source)
     shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
     mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
     below = _clip_below_zero(mosaic, frame)
@@ -273,6 +283,8 @@ def denoise_folder(
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
+    A file that cannot be read, or whose decoder crashes or hangs, is named and counted.
+
     Raises:
         FileNotFoundError: if there is no such file of weights.
         ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
@@ -289,7 +301,7 @@ def denoise_folder(
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble))
+            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):
@@ -323,8 +335,8 @@ def print_denoised(result: DenoisedFolder) -> None:
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
+        print(f"{printable(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for file, reason in result.broken.items():
-        print(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}")
+        print(printable(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}"))

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from rawaug.plugin.augment import noise_for
 from rawaug.training.noisy_frames import noisy_frame
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
+TINY: dict[str, Any] = {"steps": 1, "curve_steps": 1, "pixels": 256}
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def noisy_pair() -> Pair:
 
 
 def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) -> None:
-    isp = fit([noisy_pair], progress=False, noise_figure=tmp_path / "noise.png", steps=2, pixels=512)
+    isp = fit([noisy_pair], progress=False, noise_figure=tmp_path / "noise.png", curve_steps=2, steps=2, pixels=512)
     (level,) = camera_law(isp.info["noise"]).levels
     assert level.iso is None and level.shot_var == pytest.approx(SHOT_VAR, rel=0.1)
     assert level.r2 is not None and level.r2 > 0.9
@@ -78,11 +80,11 @@ def test_noise_that_is_the_same_everywhere_is_refused(noisy_pair: Pair) -> None:
 
 def test_what_is_refused_is_reported_or_raised_as_is_asked(noisy_pair: Pair) -> None:
     pair = with_variance(noisy_pair, -4e-4, 4e-4)
-    isp = fit([pair], progress=False, steps=1, pixels=256)
+    isp = fit([pair], progress=False, **TINY)
     assert "do not fit one noise law" in isp.info["noise_not_measured"] and "noise" not in isp.info
     with pytest.raises(ValueError, match="one noise law"):
-        fit([pair], progress=False, noise="on", steps=1, pixels=256)
-    assert not {"noise", "noise_not_measured"} & set(fit([pair], progress=False, noise="off", steps=1, pixels=256).info)
+        fit([pair], progress=False, noise="on", **TINY)
+    assert not {"noise", "noise_not_measured"} & set(fit([pair], progress=False, noise="off", **TINY).info)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +113,7 @@ def at_iso(pair: Pair, iso: float | None, shot_var: float, camera: str = "Maker 
 
 def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_path: Path) -> None:
     pairs = [at_iso(noisy_pair, 400, 8e-4), at_iso(noisy_pair, 100, 2e-4)]
-    isp = fit(pairs, progress=False, noise="on", noise_figure=tmp_path / "noise.png", steps=1, pixels=256)
+    isp = fit(pairs, progress=False, noise="on", noise_figure=tmp_path / "noise.png", **TINY)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["noise-iso100.png", "noise-iso400.png"]
     assert isp.info["rendering"] == "sRGB of the pairs (2 of 2)"
     shot_var = noise_for(isp, "camera").sample(200, torch.Generator().manual_seed(0))["shot_var"]
