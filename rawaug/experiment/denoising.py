@@ -43,7 +43,7 @@ from rawaug.experiment.rehearsal import rehearse
 from rawaug.extras import extra
 from rawaug.files import find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
@@ -179,7 +179,7 @@ class _Run:
         model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
         if not _leads():
             return model
-        levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
+        levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
