@@ -13,6 +13,7 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairSettings
 from rawaug.data.readable import Readable
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
@@ -48,12 +49,13 @@ def run(
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
+    settings: PairSettings,
 ) -> None:
     """PSNR and SSIM of an ISP or a denoiser.
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
-        data: folder of RAW files, one file, or kind:path.
+        data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs.
         self_ensemble: also score the average over eight views (denoisers).
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
@@ -62,8 +64,9 @@ def run(
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
+        settings: of pairs:PATH.
     """
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report)
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **vars(settings))
     print_scores(result)
     if json:
         write_json(result, json)
@@ -74,19 +77,20 @@ def run(
 
 def evaluate(
     weights: str | Path,
-    data: str,
+    data: str | Sequence[Pair],
     self_ensemble: bool = False,
     noise: NoiseSpec | None = None,
     seed: int = 0,
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
     Args:
         weights: an ISP's or a denoiser's; the file says which.
-        data: a folder of RAW files, or ``kind:path``.
+        data: a folder of clean RAW files, ``kind:path``, or a sequence of pairs.
         self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
@@ -94,6 +98,7 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+        settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
@@ -103,7 +108,8 @@ def evaluate(
     classical = installed_classical(classical)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
-    pairs = Readable(open_pairs(data, split="test"))
+    pairs = Readable(open_pairs(data, split="test", **settings))
+    data = data if isinstance(data, str) else f"{len(pairs)} pairs"
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
             raise ValueError(
