@@ -74,6 +74,7 @@ def _parser(kind: str) -> Any:
     run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
+    run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
     parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
     subcommands = parser.add_subcommands(dest="command")
@@ -99,9 +100,9 @@ def _run(kind: str, arguments: Any) -> None:
 
     experiment, settings = KINDS[kind], vars(arguments)
     settings.pop("recipe")
-    quick = settings.pop("smoke")
+    quick, overwrite = settings.pop("smoke"), settings.pop("overwrite")
     recipe = experiment.settings(**settings)
-    experiment.run(experiment.smoke(recipe) if quick else recipe)
+    experiment.run(experiment.smoke(recipe) if quick else recipe, overwrite)
 
 
 def _one_line(error: Exception) -> str:

@@ -13,21 +13,22 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
     Score,
     classical_method,
-    installed_classical,
     label_of,
     network_method,
+    require_classical,
     row_of,
     score_classical,
     score_denoiser,
     summary,
 )
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import find_weights, read_header, sha256, write_json
+from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.progress import progress
@@ -61,6 +62,8 @@ def run(
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
     """
+    if json:
+        require_writable(json)
     result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report)
     print_scores(result)
     if json:
@@ -96,7 +99,10 @@ def evaluate(
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
             is for denoisers and the file is an ISP's.
     """
-    classical = installed_classical(classical)
+    require_classical(classical)
+    where = find_device(device)
+    if report is not None:
+        require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = open_pairs(data, split="test")
@@ -111,7 +117,7 @@ def evaluate(
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
-        model = model.to(device)
+        model = model.to(where)
         result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}

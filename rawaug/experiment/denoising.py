@@ -12,8 +12,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
 import denoisers
 from denoisers.network import Denoiser
 from denoisers.pretrained import find
@@ -23,6 +21,7 @@ from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
+from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -36,7 +35,9 @@ from rawaug.evaluation.scores import (
 )
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.extras import extra
 from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
@@ -50,24 +51,32 @@ from rawaug.training.train_config import weights_key
 SHOWN = 3
 """Test frames in the picture."""
 
+KINDS = ("plain", "self_ensemble")
+"""How a denoiser is scored, in this order."""
+
 Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
 
 
-def run(recipe: Recipe) -> Results:
+def run(recipe: Recipe, overwrite: bool = False) -> Results:
     """Run a recipe; the results by arm, one entry a seed, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return empty lists.
+
+    Args:
+        recipe: what is run.
+        overwrite: replace a run of this name with other settings; what does not depend on them is kept.
     """
-    return _Run(recipe).all_stages()
+    return _Run(recipe, overwrite).all_stages()
 
 
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
-    def __init__(self, recipe: Recipe) -> None:
-        self.recipe, self.data = recipe, recipe.data
-        self.folder = Path(recipe.out) / recipe.name
+    def __init__(self, recipe: Recipe, overwrite: bool = False) -> None:
+        require_runnable(recipe, overwrite)
+        self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
+        self.folder = run_folder(recipe)
         self.classical = installed_classical(recipe.classical)
         if recipe.noise != "camera":
             noise_model(recipe.noise)
@@ -87,6 +96,8 @@ class _Run:
 
     def all_stages(self) -> Results:
         recipe = self.recipe
+        if _leads():
+            claim(recipe, self.overwrite)
         results: Results = {arm: [] for arm in recipe.arms}
         models: dict[str, Denoiser] = {}
         for seed in range(recipe.seed, recipe.seed + recipe.seeds):
@@ -171,35 +182,37 @@ class _Run:
         digest = sha256(place / "denoiser.safetensors")
         key = fingerprint(digest, self.data.test, stamps(self.test))
         path = place / "evaluation.json"
-        if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
+        known = json.loads(path.read_text()) if path.is_file() else {}
+        result: dict[str, Any] = known if known.get("key") == key else {"key": key}
+        missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
+        if not missing:
             print(f"already evaluated: {path}")
-            return {kind: known[kind] for kind in ("plain", "self_ensemble")}
-        result: dict[str, Any] = {}
-        model.to(_device(self.recipe.device))
-        for kind in ("plain", "self_ensemble"):
+        model.to(find_device(self.recipe.device))
+        for kind in missing:
             method = network_method(model, isp.cfa, self.pattern(arm, isp), kind == "self_ensemble")
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
-        write_json({"key": key, **result}, path)
-        return result
+            write_json(result, path)
+            print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind]['psnr']:.2f} dB: {path}")
+        return {kind: result[kind] for kind in KINDS if kind in result}
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
         methods = {label_of(spec): classical_method(spec, noise, seed=0) for spec in self.classical}
         for name, (model, info) in self.untouched.items():
-            methods[name] = network_method(model.to(_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
+            methods[name] = network_method(model.to(find_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
         return methods
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
         recipe, cfa = self.recipe, isp.cfa
         others = self.untrained(noise, cfa)
-        classical = {
-            name: summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
-            for name, method in others.items()
-        }
+        classical: dict[str, Any] = {}
         everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
         write_json(everything, self.folder / "results.json")
+        for name, method in others.items():
+            classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
+            write_json(everything, self.folder / "results.json")
         settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
         title = f"{recipe.name}: {settings}, tested on {self.data.test}"
         page, shown = Page(title, results, classical), list[Row]()
@@ -210,7 +223,7 @@ class _Run:
         hidden = [label_of(spec) for spec in self.classical[1:]]
         methods = {name: method for name, method in others.items() if name not in hidden}
         for arm, model in models.items():
-            methods[arm] = network_method(model.to(_device(recipe.device)), cfa, self.pattern(arm, isp))
+            methods[arm] = network_method(model.to(find_device(recipe.device)), cfa, self.pattern(arm, isp))
         for pair in shown_on_page(self.test):
             row = row_of(methods, pair, noise, cfa, seed=0)
             page.add_frame(row, cfa)
@@ -239,14 +252,6 @@ def _leads() -> bool:
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
-
-
-def _device(accelerator: str) -> torch.device:
-    """Where Fabric would put a network."""
-    with extra("train"):
-        from lightning_fabric import Fabric
-
-    return Fabric(accelerator=accelerator, devices=1).device
 
 
 def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:

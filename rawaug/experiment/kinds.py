@@ -18,12 +18,12 @@ class Kind(NamedTuple):
 
     Args:
         settings: dataclass of its keys.
-        run: does it.
+        run: does it; called with the settings and whether another run of the name is replaced.
         smoke: its settings in a form of seconds.
     """
 
     settings: type[Any]
-    run: Callable[[Any], Any]
+    run: Callable[[Any, bool], Any]
     smoke: Callable[[Any], Any]
 
 
