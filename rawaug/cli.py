@@ -6,6 +6,7 @@ Errors are one line on stderr that names the file or key and what to do; the exi
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +15,12 @@ from rawaug._version import __version__
 from rawaug.extras import MissingExtra
 
 BAD_INPUT = 2
+OWN = {
+    "run": "Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.",
+    "completion": "Print a script that completes commands and options in a shell.",
+}
+"""Commands that need the parser itself, beside those of ``rawaug.commands``."""
+SHELLS = ("bash", "zsh", "fish")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,70 +42,91 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
-    from rawaug.experiment.kinds import kind_of
-    from rawaug.experiment.recipe import find_recipe
-    from rawaug.registry import COMMANDS
+    from rawaug.commands.listing import command, listed
+    from rawaug.commands.spelling import require_known_options
+    from rawaug.progress import quiet
 
     kind = "training"
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
+        from rawaug.experiment.kinds import kind_of
+        from rawaug.experiment.recipe import find_recipe
+
         recipe = find_recipe(argv[1])
         kind = kind_of(recipe)
         argv = ["run", "--recipe", str(recipe), *argv[2:]]
-    parser = _parser(kind)
+    names = [*OWN, *listed()]
+    chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
+    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
     if not argv:
         parser.print_help()
         return 0
+    if chosen is not None:
+        require_known_options(chosen, leaves[chosen], argv)
     parsed = parser.parse_args(argv)
-    command: str = parsed.command
-    arguments = parser.instantiate(parsed)[command]
-    if command == "run":
-        _run(kind, arguments)
-    else:
-        name, values = command, vars(arguments)
-        if "action" in values:  # a command of two words
-            name, values = f"{command} {values['action']}", vars(values[values["action"]])
-        call(COMMANDS[name], values)
+    values = vars(parser.instantiate(parsed)[parsed.command])
+    values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
+    with quiet(values.pop("quiet")):
+        if chosen == "run":
+            _run(kind, values)
+        elif chosen == "completion":
+            print(parser.get_completion_script(f"shtab-{values['shell']}"))
+        else:
+            call(command(str(chosen)), values)
     return 0
 
 
-def _parser(kind: str) -> Any:
+def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
+    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments."""
     from jsonargparse import ArgumentParser
 
-    from rawaug.commands.arguments import add_arguments, summary
-    from rawaug.experiment.kinds import KINDS
-    from rawaug.registry import COMMANDS
+    from rawaug.commands.arguments import add_arguments
+    from rawaug.commands.listing import command, listed
+    from rawaug.commands.spelling import spell_with_hyphens
 
-    def new(description: str) -> Any:
-        return ArgumentParser(exit_on_error=False, description=description)
+    def new(description: str, **settings: Any) -> Any:
+        return ArgumentParser(exit_on_error=False, allow_abbrev=False, description=description, **settings)
 
-    run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
-    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
-    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
-    run.add_class_arguments(KINDS[kind].settings)
-    parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
+    parser = new(str(__doc__), prog="rawaug", version=__version__)
     subcommands = parser.add_subcommands(dest="command")
-    subcommands.add_subcommand("run", run, help=run.description)
+    leaves: dict[str, Any] = {}
     groups: dict[str, Any] = {}
-    for name, function in COMMANDS.items():
+    for name, about in {**OWN, **listed()}.items():
         group, _, action = name.partition(" ")
-        command = new(summary(function))
-        add_arguments(command, function)
+        leaves[name] = new(about)
         if not action:
-            subcommands.add_subcommand(name, command, help=command.description)
+            subcommands.add_subcommand(name, leaves[name], help=about)
             continue
         if group not in groups:
             above = new(f"Commands about {group}.")
             subcommands.add_subcommand(group, above, help=above.description)  # the outer one first
             groups[group] = above.add_subcommands(dest="action")
-        groups[group].add_subcommand(action, command, help=command.description)
-    return parser
+        groups[group].add_subcommand(action, leaves[name], help=about)
+    for name, leaf in leaves.items():
+        leaf.add_argument("--quiet", action="store_true", help="print no progress")
+        if name in wanted:
+            if name == "run":
+                _add_run_arguments(leaf, kind)
+            elif name == "completion":
+                leaf.add_argument("shell", choices=SHELLS)
+            else:
+                add_arguments(leaf, command(name))
+        spell_with_hyphens(leaf)
+    return parser, leaves
 
 
-def _run(kind: str, arguments: Any) -> None:
+def _add_run_arguments(run: Any, kind: str) -> None:
     from rawaug.experiment.kinds import KINDS
 
-    experiment, settings = KINDS[kind], vars(arguments)
+    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
+    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
+    run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
+    run.add_class_arguments(KINDS[kind].settings)
+
+
+def _run(kind: str, settings: dict[str, Any]) -> None:
+    from rawaug.experiment.kinds import KINDS
+
+    experiment = KINDS[kind]
     settings.pop("recipe")
     quick, overwrite = settings.pop("smoke"), settings.pop("overwrite")
     recipe = experiment.settings(**settings)
@@ -110,7 +138,8 @@ def _one_line(error: Exception) -> str:
         return f"not valid JSON: {error.msg}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+    text = re.sub(r"<class '([\w.]+)'>", r"\1", " ".join(str(error).split()))
+    return re.sub(r'^Parser key "([^"]+)"', r"\1", text)
 
 
 if __name__ == "__main__":

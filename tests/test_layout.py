@@ -43,6 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "commands": CAMERA | {"plugin", "data", "io", "evaluation", "training"},
     "experiment": CAMERA | {"plugin", "data", "io", "evaluation", "training", "commands"},
     "cli": BASE | {"commands", "experiment"},
+    "__main__": {"cli"},
 }
 
 

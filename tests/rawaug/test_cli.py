@@ -15,9 +15,9 @@ from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
-    "--train.steps", "4", "--train.validate_every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
+    "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
     "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--data.test_count", "2", "--classical", "[]",
+    "--data.test-count", "2", "--classical", "[]",
 ]  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys
     assert main(command) == 0
     assert "already trained" in capsys.readouterr().out
     assert weights.stat().st_mtime_ns == before
-    assert main([*command, "--train.learning_rate", "0.002"]) == 0
+    assert main([*command, "--train.learning-rate", "0.002"]) == 0
     assert weights.stat().st_mtime_ns != before  # other settings are another run
     assert main(["evaluate", str(weights), "--data", "demo:validation", "--self-ensemble"]) == 0
 
