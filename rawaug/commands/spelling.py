@@ -36,7 +36,9 @@ def require_known_options(command: str, parser: Any, arguments: Sequence[str]) -
         if option.startswith("--") and option not in options and not option.startswith(mappings):
             spelt = hyphenated(option)
             longer = [known for known in options if known.startswith(spelt)]
-            raise ValueError(f"{option}: no such option{nearest(spelt, longer or options)}; see rawaug {command} --help")
+            raise ValueError(
+                f"{option}: no such option{nearest(spelt, longer or options)}; see rawaug {command} --help"
+            )
 
 
 def hyphenated(option: str) -> str:

@@ -7,7 +7,7 @@ more on sRGB, after one fixed development (:func:`rawaug.data.development.develo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -81,12 +81,17 @@ def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool, own:
         mosaic = bayer.unpack(denoise(model, shifted, own, self_ensemble), own)
         height, width = mosaic.shape[-2:]
         return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
-    run: Any = partial(denoisers.tiled, model)
+    run: Any = partial(denoisers.tiled, model, each=counted("tile"))
     if self_ensemble:
-        run = denoisers.SelfEnsemble(run, cfa, views=8)
+        run = denoisers.SelfEnsemble(run, cfa, views=8, each=counted("view group"))
     device = next(model.parameters()).device
     denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
     return denoised.cpu()
+
+
+def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Goes through the parts of a frame, where there are several with progress: its tiles, or views of one shape."""
+    return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
 
 
 def score_method(

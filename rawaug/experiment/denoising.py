@@ -234,6 +234,17 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
+        print("\n".join(self.usage(results)))
+
+    def usage(self, results: Results) -> list[str]:
+        """The files of weights, and the command that uses those of the arm with the highest PSNR."""
+        seeds = range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
+        places = {arm: [self.folder / f"seed{s}" / arm / "denoiser.safetensors" for s in seeds] for arm in results}
+        lines = [f"denoiser, {arm}: {place}" for arm, found in places.items() for place in found]
+        _, best, seed = max(
+            (run["plain"]["psnr"], arm, k) for arm, runs in results.items() for k, run in enumerate(runs)
+        )
+        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {places[best][seed]}"]
 
 
 def _settings(part: Any) -> dict[str, Any]:
