@@ -65,7 +65,7 @@ def _dispatch(argv: list[str]) -> int:
     parsed = parser.parse_args(argv)
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
-    with quiet(values.pop("quiet")):
+    with quiet(values["quiet"]):
         if chosen == "run":
             _run(kind, values)
         elif chosen == "completion":
@@ -102,7 +102,6 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
             groups[group] = above.add_subcommands(dest="action")
         groups[group].add_subcommand(action, leaves[name], help=about)
     for name, leaf in leaves.items():
-        leaf.add_argument("--quiet", action="store_true", help="print no progress")
         if name in wanted:
             if name == "run":
                 _add_run_arguments(leaf, kind)
@@ -110,6 +109,8 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
                 leaf.add_argument("shell", choices=SHELLS)
             else:
                 add_arguments(leaf, command(name))
+        if "--quiet" not in leaf._option_string_actions:  # a command may have its own
+            leaf.add_argument("--quiet", action="store_true", help="print no progress")
         spell_with_hyphens(leaf)
     return parser, leaves
 
@@ -127,7 +128,8 @@ def _run(kind: str, settings: dict[str, Any]) -> None:
     from rawaug.experiment.kinds import KINDS
 
     experiment = KINDS[kind]
-    settings.pop("recipe")
+    for key in ("recipe", "quiet"):
+        settings.pop(key)
     quick, overwrite = settings.pop("smoke"), settings.pop("overwrite")
     recipe = experiment.settings(**settings)
     experiment.run(experiment.smoke(recipe) if quick else recipe, overwrite)

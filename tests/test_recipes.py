@@ -98,7 +98,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     assert main([*command, *same_weights]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == said.count("already evaluated") == 4
-    assert main([*command, *same_weights, "--data.test-count", "2"]) == 0
+    assert main([*command, *same_weights, "--data.test-count", "2", "--overwrite"]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == 4 and "already evaluated" not in said
     assert weights.stat().st_mtime_ns == before

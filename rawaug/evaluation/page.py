@@ -191,7 +191,8 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
         if points:
             axis.plot(*zip(*points, strict=True), marker="o" if len(points) == 1 else "", **style)
     axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
-    axis.legend(fontsize=8)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8)
     file = io.BytesIO()
     figure.savefig(file, dpi=130)
     return file.getvalue()

@@ -204,8 +204,8 @@ class Journal:
     """``log.csv`` and TensorBoard's files of a run from ``start`` on; what a killed run logged beyond it is dropped.
 
     A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
-    TensorBoard shows the middles of :data:`SHOWN` validation frames besides. A run from its beginning clears what another
-    one has left.
+    TensorBoard shows the middles of :data:`SHOWN` validation frames besides. A run from its beginning clears what
+    another one has left.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
