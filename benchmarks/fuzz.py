@@ -1,14 +1,15 @@
 """How the readers handle damaged files: each must be read, or refused in one line that names it.
 
-    python -m benchmarks.fuzz [--count 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
+    python -m benchmarks.fuzz [--cases 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
-repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
-repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is restarted when a
-decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
-line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
-more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
-last three.
+repository, has them. Half of the mutations know the structure of the file (benchmarks/mutations.py); the others flip
+bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmarks/damage.py); all are keyed by (seed,
+kind, number). A worker process reads one after the other, and is restarted when a decoder takes it down. Counted are
+files that were read; that were refused as documented (ValueError or OSError of one line with the file's name); that
+crashed a decoder, by its name, which the package contains (:mod:`rawaug.io.apart`); and what must not be: other
+exceptions and numbers that are not finite, more than 10 s, more than 2 GiB. ``--keep`` keeps all files but those of the
+first two columns. Exit status 1 if there is any of the last three.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.damage import make_originals, mutated
+from benchmarks.mutations import MUTATIONS
 from rawaug.seeding import derived_seed
 
 SECONDS, MEBIBYTES = 10.0, 2048.0
@@ -42,6 +44,8 @@ DECODERS = {
     "mat5": "SciPy",
     "mat73": "HDF5",
     "safetensors": "safetensors",
+    "npy": "NumPy",
+    "recipe": "PyYAML",
 }
 """What reads each kind for us."""
 
@@ -57,6 +61,7 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
     from rawaug import DictionaryISP
     from rawaug.commands.info import describe
     from rawaug.data.mat import read_value
+    from rawaug.data.rawir import read_packed
     from rawaug.data.sidd.frames import colour_of, mosaic_of
     from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
     from rawaug.plugin.params import load_params
@@ -69,6 +74,11 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
                 raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
         return frame
 
+    def isp_of(path: Path) -> None:
+        raw = DictionaryISP.from_pretrained(path).reverse(torch.linspace(0, 1, 192).reshape(1, 3, 8, 8)).raw
+        if not raw.isfinite().all():
+            raise ArithmeticError("not finite: RAW of this ISP")
+
     def rewritten() -> None:
         frame = frame_of()
         write_dng(path.with_name(f"{path.stem}.out.dng"), frame, source=path)
@@ -79,12 +89,38 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
         return [lambda: read_raw_and_develop(path), rewritten]
     if kind in ("jpeg", "picture"):
         return [lambda: read_picture(path)]
+    if kind == "recipe":
+        return [lambda: _set_up(path)]
+    if kind == "npy":
+        return [lambda: read_packed(path, path.with_suffix(".png"), None)]
     if kind != "safetensors":
         values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
         return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
-    load = {"isp": DictionaryISP.from_pretrained, "denoiser": denoisers.load, "params": load_params}
+    load = {"isp": isp_of, "denoiser": denoisers.load, "params": load_params}
     kept = path.stem.split("-")[0]
     return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
+
+
+def _set_up(path: Path) -> None:
+    """A recipe as the command line sets it up, its networks without their memory."""
+    import torch
+    from jsonargparse import ArgumentError
+
+    from rawaug.cli import _parser
+    from rawaug.experiment.kinds import KINDS, kind_of
+    from rawaug.experiment.recipe import Recipe
+    from rawaug.training.start import first_network
+
+    try:
+        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path))
+        settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
+        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke"}})
+        if isinstance(recipe, Recipe):
+            with torch.device("meta"):
+                for arm in recipe.arms:
+                    first_network(recipe.network_of(arm), seed=0)
+    except (ArgumentError, ValueError) as error:  # the command line has named the file already
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 def attempt(kind: str, path: Path) -> tuple[str, str]:
@@ -157,7 +193,8 @@ class Worker:
     def _start(self) -> subprocess.Popen[str]:
         with self.log.open("w") as log:
             command, pipe = [sys.executable, "-m", "benchmarks.fuzz", "--worker"], subprocess.PIPE
-            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True)
+            here = os.environ | {"RAWAUG_READ_SECONDS": "0"}  # this worker is what a decoder may take down
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=here)
         assert process.stdout is not None
         ready = select.select([process.stdout], [], [], START_SECONDS)[0] and process.stdout.readline()
         if not ready:
@@ -234,6 +271,8 @@ def _fuzz_kind(
     for original in originals:
         copy = folder / f"{original.stem.split('.')[0]}-whole{original.suffix}"
         copy.write_bytes(original.read_bytes())
+        if kind == "npy":
+            copy.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
         if (result := worker.read(kind, copy))[0] != "read":
             raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
     outcomes, reasons, slowest = Counter[str](), [], 0.0
@@ -241,7 +280,9 @@ def _fuzz_kind(
         rng = np.random.default_rng(derived_seed(seed, kind, number))
         original = originals[number % len(originals)]
         path = folder / f"{original.stem.split('.')[0]}-{number}{original.suffix}"
-        path.write_bytes(mutated(original.read_bytes(), rng))
+        path.write_bytes(_damaged(original, rng))
+        if kind == "npy":
+            path.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
         start = time.perf_counter()
         outcome, why = worker.read(kind, path)
         slowest = max(slowest, time.perf_counter() - start)
@@ -256,6 +297,13 @@ def _fuzz_kind(
     return {"mutated": count, **{o: outcomes[o] for o in OUTCOMES}, "slowest_s": round(slowest, 2), "reasons": reasons}
 
 
+def _damaged(original: Path, rng: np.random.Generator) -> bytes:
+    """The file mutated, in half of the cases as its structure suggests."""
+    whole = original.read_bytes()
+    mutate = next((mutate for end, mutate in MUTATIONS.items() if original.name.endswith(end)), None)
+    return mutated(whole, rng) if mutate is None or rng.random() < 0.5 else mutate(whole, rng)
+
+
 def print_table(results: dict[str, Any]) -> None:
     columns = ("mutated", *OUTCOMES, "slowest_s")
     print("kind         decoder      " + "".join(name.rjust(10) for name in columns))
@@ -268,7 +316,7 @@ def print_table(results: dict[str, Any]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=5000, help="files of all kinds together")
+    parser.add_argument("--cases", type=int, default=5000, help="files of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=DECODERS, default=list(DECODERS))
     parser.add_argument("--quick", action="store_true", help="100 files")
@@ -280,7 +328,7 @@ def main() -> int:
         work()
         return 0
     start = time.perf_counter()
-    results = fuzz(args.kinds, 100 if args.quick else args.count, args.seed, args.keep)
+    results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
     print_table(results)
     absent = [kind for kind in args.kinds if kind not in results]
     print(

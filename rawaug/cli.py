@@ -5,6 +5,7 @@ Errors are one line on stderr that names the file or key and what to do; the exi
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 
 from rawaug._version import __version__
 from rawaug.extras import MissingExtra
+from rawaug.printable import printable
 
 BAD_INPUT = 2
 OWN = {
@@ -28,12 +30,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from jsonargparse import ArgumentError
 
     argv = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files need not fit the terminal's encoding
+            stream.reconfigure(errors="backslashreplace")
     try:
         return _dispatch(argv)
     except BrokenPipeError:  # the reader has closed the pipe, as with `| head`
         return 0
     except (ValueError, OSError, ArgumentError, MissingExtra) as error:
-        print(f"rawaug: {_one_line(error)}", file=sys.stderr)
+        print(f"rawaug: {printable(_one_line(error))}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
@@ -47,6 +52,8 @@ def _dispatch(argv: list[str]) -> int:
     from rawaug.progress import quiet
 
     kind = "training"
+    if argv[:2] == ["run", "--recipe"]:
+        argv = ["run", *argv[2:]]
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
         from rawaug.experiment.kinds import kind_of
         from rawaug.experiment.recipe import find_recipe

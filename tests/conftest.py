@@ -1,4 +1,7 @@
-"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do."""
+"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do.
+
+Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
@@ -14,6 +18,7 @@ import torch
 from rawaug import registry
 
 torch.set_num_threads(1)
+multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
 
 @pytest.fixture(scope="session")

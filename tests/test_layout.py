@@ -18,7 +18,8 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "devices", "extras", "files", "metrics", "progress", "registry", "seeding", "_version"}
+BASE = {"bayer", "camera_names", "devices", "extras", "files", "metrics", "printable", "progress", "registry"}
+BASE |= {"seeding", "_version"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
@@ -28,10 +29,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extras": set(),
     "files": set(),
     "metrics": set(),
+    "printable": set(),
     "progress": set(),
     "registry": set(),
     "seeding": set(),
-    "denoisers": {"bayer", "registry"},
+    "denoisers": {"bayer", "files", "registry"},
     "kernels": {"bayer"},
     "noise": BASE | {"kernels"},
     "isp": BASE | {"kernels", "denoisers"},
@@ -131,9 +133,9 @@ def test_no_circles() -> None:
         ("import rawaug", set()),
         ("import denoisers", set()),
         ("import rawaug.registry", {"registry"}),
-        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "registry"}),
-        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "registry"}),
-        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels"}),
+        ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "files", "registry"}),
+        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "printable", "registry"}),
+        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels", "registry"}),
     ],
 )
 def test_importing_one_part_loads_no_other(code: str, allowed: set[str]) -> None:

@@ -14,6 +14,7 @@ from rawaug.bayer import CFA, aligned
 from rawaug.data import RawFolder
 from rawaug.data.pair import Pair
 from rawaug.io import read_raw
+from rawaug.io.apart import apart
 from rawaug.noise import NoiseEstimate, estimate_noise, from_dark_frames
 
 WORST_FIT = 0.5
@@ -53,7 +54,7 @@ def _mosaics(pairs: Sequence[Pair]) -> tuple[list[Tensor], CFA]:
     found: list[tuple[Tensor, CFA]] = []
     for index in indices:
         if isinstance(pairs, RawFolder):
-            frame = read_raw(pairs.files[index])
+            frame = apart(read_raw, pairs.files[index])
             found.append((frame.mosaic, frame.cfa))
         else:
             pair = pairs[index]

@@ -12,8 +12,9 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,10 @@ from rawaug.commands.synth import require_same_settings
 from rawaug.data.raw_folder import EXTENSIONS
 from rawaug.files import require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
+from rawaug.io.apart import apart
 from rawaug.io.raw import develop
 from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS, Spec
 from rawaug.seeding import keyed_generator
@@ -226,16 +229,22 @@ def _checked(strength: float) -> float:
     return strength
 
 
-def _denoise_file(source: Path, out: Path, method: FrameDenoiser, noise: Noise, strength: float) -> Denoised:
+def _denoise_file(
+    source: Path,
+    out: Path,
+    method: FrameDenoiser,
+    noise: Noise,
+    strength: float,
+    read: Callable[[Path], RawFrame] = read_raw,
+) -> Denoised:
     start = time.perf_counter()
-    frame = read_raw(source)
+    frame = read(source)
     shot_var, read_var, noise_source = levels_of(frame, noise) if method.reads_levels else (*_NO_NOISE, "not needed")
     mosaic = frame.mosaic.lerp(method(frame, (shot_var, read_var)), strength)
     below = _clip_below_zero(mosaic, frame)
     known = (shot_var, read_var) if method.reads_levels else frame.noise_profile
-    left = (
-        None if strength == 1.0 or known is None else ((1 - strength) ** 2 * known[0], (1 - strength) ** 2 * known[1])
-    )
+    rest = (1 - strength) ** 2
+    left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
     out.parent.mkdir(parents=True, exist_ok=True)
     write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
     return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
@@ -266,6 +275,8 @@ def denoise_folder(
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
+    A file that cannot be read, or whose decoder crashes or hangs, is named and counted.
+
     Args:
         source, out: the folders.
         method, noise, strength: as in :func:`denoise_file`.
@@ -289,7 +300,7 @@ def denoise_folder(
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, made, noise, strength))
+            result.files.append(_denoise_file(file, target, made, noise, strength, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):
@@ -317,8 +328,8 @@ def print_denoised(result: DenoisedFolder) -> None:
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
+        print(f"{printable(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for file, reason in result.broken.items():
-        print(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}")
+        print(printable(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}"))

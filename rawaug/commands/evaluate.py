@@ -13,6 +13,7 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
@@ -22,6 +23,7 @@ from rawaug.evaluation.scores import (
     label_of,
     network_method,
     require_classical,
+    require_numbers,
     row_of,
     score_classical,
     score_denoiser,
@@ -70,6 +72,7 @@ def run(
         write_json(result, json)
     if report:
         print(f"page: {report}")
+    require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
 
 
 def evaluate(
@@ -96,8 +99,9 @@ def evaluate(
         report: HTML file to write: scores and pictures of a denoiser.
 
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
-            is for denoisers and the file is an ISP's.
+        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
+            is for denoisers and the file is an ISP's, or no frame can be read. Some that cannot are named under
+            ``broken``.
     """
     require_classical(classical)
     where = find_device(device)
@@ -105,7 +109,7 @@ def evaluate(
         require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
-    pairs = open_pairs(data, split="test")
+    pairs = Readable(open_pairs(data, split="test"))
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
             raise ValueError(
@@ -114,20 +118,29 @@ def evaluate(
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
         result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
+        _require_some(pairs)
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(where)
         result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
             methods["denoised"] = network_method(model, cfa)
-            for pair in shown_on_page(pairs):
+            for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
+    if pairs.broken:
+        result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
     return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
+
+
+def _require_some(pairs: Readable) -> None:
+    if len(pairs.broken) == len(pairs):
+        raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
 
 
 def _denoiser_result(

@@ -1,7 +1,7 @@
 r"""What denoises a RAW frame: a network, or a classical filter where there is none.
 
-A network takes packed RAW and its noise map ``shot_var max(y, 0) + read_var``, a filter the same RAW with its noise made
-white (:class:`denoisers.Stabilised`). Both work in tiles, on the mosaic as the sensor gave it.
+A network takes packed RAW and its noise map ``shot_var max(y, 0) + read_var``, a filter the same RAW with its noise
+made white (:class:`denoisers.Stabilised`). Both work in tiles, on the mosaic as the sensor gave it.
 """
 
 from __future__ import annotations

@@ -33,13 +33,19 @@ from rawaug.commands.pair_files import (
 )
 from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import find_weights, sha256, write_json
+from rawaug.files import digest, find_weights, sha256, write_json
 from rawaug.io import read_picture
+from rawaug.io.apart import apart, prepare
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.plugin.augment import RawAugment, Sampling
 from rawaug.plugin.pictures import even_sided
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
+
+LONGEST_STEM = 200
+"""Bytes of a picture's name in those of its pairs, which have at most 255."""
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
 
@@ -56,6 +62,7 @@ def run(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> None:
     """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
@@ -69,8 +76,9 @@ def run(
         sampling: how camera settings are drawn.
         seed: random seed.
         workers: number of processes; by default one per core.
+        max_pixels: larger pictures are refused before they are decoded.
     """
-    print_synthesis(synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers))
+    print_synthesis(synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers, max_pixels))
 
 
 @dataclass(frozen=True)
@@ -86,12 +94,13 @@ class _Settings:
 
 
 class _Task(NamedTuple):
-    """A picture, its name as the key of its draws, where its pairs go, and the numbers of those that are missing."""
+    """A picture, its name as the key of its draws, where its pairs go, the numbers of those that are missing, and what is too large."""
 
     picture: Path
     key: str
     stem: Path
     numbers: tuple[int, ...]
+    max_pixels: int
 
 
 @dataclass
@@ -116,6 +125,7 @@ def synth(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> Synthesis:
     """Make ``per_image`` pairs of every picture of a folder and its subfolders; existing pairs are kept.
 
@@ -130,6 +140,7 @@ def synth(
         seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
+        max_pixels: larger pictures are refused before they are decoded.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
@@ -149,7 +160,7 @@ def synth(
     augmentation(weights, levels, sampling)  # raises for a wrong name here, not in a worker
     require_same_settings(out / "synth.json", vars(settings))
     result = Synthesis(out, pictures=len(pictures))
-    tasks = list(_tasks(pictures, source, out, per_image))
+    tasks = list(_tasks(pictures, source, out, per_image, max_pixels))
     result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
     todo = [task for task in tasks if task.numbers]
     bar = progress(_done(todo, settings, workers), label="synth", unit="picture", total=len(todo), leave=True)
@@ -176,7 +187,7 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     return pictures
 
 
-def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Iterator[_Task]:
+def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int, max_pixels: int) -> Iterator[_Task]:
     """Pictures that differ in their extension alone keep it in the names of their pairs."""
     stems = Counter(picture.with_suffix("") for picture in pictures)
     taken: dict[Path, Path] = {}
@@ -187,9 +198,17 @@ def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Ite
             raise ValueError(
                 f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
             )
-        stem = out / own.relative_to(source)
+        stem = out / own.relative_to(source).with_name(_short(own.name))
         missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
-        yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
+        yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing), max_pixels)
+
+
+def _short(name: str) -> str:
+    """The name, or its beginning and a hash where it leaves no room for the endings of the pairs' files."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= LONGEST_STEM:
+        return name
+    return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
 
 
 def _numbered(stem: Path, number: int) -> Path:
@@ -224,6 +243,7 @@ _settings: _Settings
 def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Iterator[tuple[_Task, str | None]]:
     """Each task as it finishes, with the reason if it failed."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    prepare()
     if workers < 1:
         _prepare(settings)
         yield from ((task, _make(task)) for task in tasks)
@@ -265,7 +285,7 @@ def _prepare(settings: _Settings) -> None:
 def _make(task: _Task) -> str | None:
     """Make the missing pairs of a picture; the reason if it cannot be read."""
     try:
-        srgb = even_sided(read_picture(task.picture))
+        srgb = even_sided(apart(read_picture, task.picture, task.max_pixels))
     except (OSError, ValueError) as error:
         return str(error)
     s = _settings
@@ -282,4 +302,4 @@ def print_synthesis(result: Synthesis) -> None:
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"unreadable: {reason}")
+        print(f"unreadable: {printable(reason)}")

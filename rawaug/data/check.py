@@ -1,14 +1,12 @@
 """Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
 Everything is read once, as training would read it. A folder is recognised by its publisher's file
-names; anything else is a folder of RAW files, of pictures, or both. Reading takes place in a separate process: where a
-damaged file crashes its decoder, the file is named and a new process continues. (RAW
-files are read in this one: LibRaw's threads do not survive a fork.)
+names; anything else is a folder of RAW files, of pictures, or both. Files are decoded apart (:mod:`rawaug.io.apart`):
+one that crashes its decoder, or hangs, is named and the rest is read.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
 from collections import Counter
@@ -19,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from rawaug.data import picture_folder, raw_folder
 from rawaug.data.dnd import Dnd
@@ -33,9 +30,10 @@ from rawaug.data.sidd.scenes import is_scene
 from rawaug.data.sidd.submission import check_submission
 from rawaug.data.zurich import Zurich
 from rawaug.io import RawFrame, read_raw
+from rawaug.io.apart import apart
+from rawaug.printable import printable
 
 _SHOWN = 6
-_CRASHES = 5
 
 
 @dataclass
@@ -81,7 +79,7 @@ class PartReport:
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
-        return "\n".join([*lines, *(f"    {line}" for line in self.broken)])
+        return "\n".join([*lines, *(f"    {printable(line)}" for line in self.broken)])
 
 
 @dataclass
@@ -96,7 +94,7 @@ class DataReport:
         return [line for part in self.parts for line in part.broken]
 
     def __str__(self) -> str:
-        return "\n".join([str(self.path), *map(str, self.parts)])
+        return "\n".join([printable(self.path), *map(str, self.parts)])
 
 
 def check(path: str | Path, first: int | None = None) -> DataReport:
@@ -177,7 +175,7 @@ class _RawFrames(Sequence[RawFrame]):
         return len(self.files)
 
     def __getitem__(self, index: int) -> RawFrame:  # type: ignore[override]
-        return read_raw(self.files[index])
+        return apart(read_raw, self.files[index])
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
@@ -190,55 +188,19 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
-    found = _facts(items, part.examined)
-    for facts in found:
-        part.add(facts)
-    if len(found) < part.examined:
-        part.broken.append(f"stopped after {_CRASHES} crashes; replace these files first")
-        part.examined = len(found)
+    for index in range(part.examined):
+        part.add(_facts(items, index))
     return part
 
 
-class _Facts(Dataset[PartReport]):
-    """One report per item."""
-
-    def __init__(self, items: Any) -> None:
-        self.items = items
-
-    def __getitem__(self, index: int) -> PartReport:
-        facts = PartReport("")
-        try:
-            _take(facts, self.items.read(index) if isinstance(self.items, PictureFolder) else self.items[index])
-        except (OSError, ValueError) as error:
-            facts.broken.append(" ".join(str(error).split()))
-        return facts
-
-
-def _facts(items: Any, count: int) -> list[PartReport]:
-    """The facts of the first items, read in a forked process where that can be."""
-    fork = {"num_workers": 1, "prefetch_factor": 1, "multiprocessing_context": "fork"}
-    forks = "fork" in multiprocessing.get_all_start_methods() and not isinstance(items, _RawFrames)
-    apart: dict[str, Any] = fork if forks else {}
-    found: list[PartReport] = []
-    crashes = 0
-    while len(found) < count and crashes < _CRASHES:
-        loader = DataLoader(
-            _Facts(items), None, sampler=range(len(found), count), collate_fn=lambda facts: facts, **apart
-        )
-        try:
-            for facts in loader:
-                found.append(facts)  # one by one: what was found before a crash stays
-        except RuntimeError as error:
-            if not (crash := re.search(r"DataLoader worker.*(killed by signal.*|exited.*)", str(error))):
-                raise
-            crashes += 1
-            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes the decoder ({crash[1]})"]))
-    return found
-
-
-def _name(items: Any, index: int) -> str:
-    names = getattr(items, "names", None)
-    return f"number {index + 1}" if names is None else f"{names[index]}"
+def _facts(items: Any, index: int) -> PartReport:
+    """A report on one item."""
+    facts = PartReport("")
+    try:
+        _take(facts, items.read(index) if isinstance(items, PictureFolder) else items[index])
+    except (OSError, ValueError) as error:
+        facts.broken.append(" ".join(str(error).split()))
+    return facts
 
 
 def _take(part: PartReport, item: Any) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import overload
 
 from rawaug.data.pair import Pair
+from rawaug.io.apart import prepare
 
 
 class LazyPairs(Sequence[Pair], ABC):
@@ -19,6 +20,7 @@ class LazyPairs(Sequence[Pair], ABC):
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
         self._last: tuple[int, Pair] | None = None
+        prepare()
 
     @abstractmethod
     def read(self, index: int) -> Pair:

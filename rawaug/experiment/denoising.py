@@ -7,6 +7,7 @@ a stopped run resumes.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +30,7 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     network_method,
+    require_numbers,
     row_of,
     score_method,
     summary,
@@ -125,7 +127,7 @@ class _Run:
             isp.info["key"] = sha256(weights)
             return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
-        settings = {**asdict(self.recipe.isp), "seed": seed}
+        settings = {**self.recipe.isp.key(), "seed": seed}
         measure = self.recipe.noise == "camera"
         key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
         if path.is_file():
@@ -193,7 +195,7 @@ class _Run:
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
             write_json(result, path)
-            print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind]['psnr']:.2f} dB: {path}")
+            print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
@@ -235,15 +237,16 @@ class _Run:
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
         print("\n".join(self.usage(results)))
+        summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
+        require_numbers([*summaries, *classical.values()])
 
     def usage(self, results: Results) -> list[str]:
         """The files of weights, and the command that uses those of the arm with the highest PSNR."""
         seeds = range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
         places = {arm: [self.folder / f"seed{s}" / arm / "denoiser.safetensors" for s in seeds] for arm in results}
         lines = [f"denoiser, {arm}: {place}" for arm, found in places.items() for place in found]
-        _, best, seed = max(
-            (run["plain"]["psnr"], arm, k) for arm, runs in results.items() for k, run in enumerate(runs)
-        )
+        runs = {(arm, k): run["plain"] for arm, found in results.items() for k, run in enumerate(found)}
+        best, seed = max(runs, key=lambda run: runs[run].get("psnr", 0.0))
         return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {places[best][seed]}"]
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
 from rawaug.experiment.denoising import run
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 
@@ -41,14 +42,8 @@ def kind_of(recipe: str | Path) -> str:
     Raises:
         ValueError: if the file cannot be read as YAML, or there is no such kind.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(Path(recipe).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{recipe}: not a YAML file ({reason}); see the recipes in the package") from error
+    content = read_yaml(recipe)
     kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
     if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"{recipe}: unknown experiment {kind!r}; use one of {', '.join(KINDS)}")
+        raise ValueError(f"{recipe}: unknown experiment {kind!r:.80}; use one of {', '.join(KINDS)}")
     return kind

@@ -44,7 +44,7 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        sampling: convex, independent, perturb or chosen, see :class:`rawaug.RawAugment`.
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
@@ -57,7 +57,7 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen"] = "convex"
+    sampling: Literal["convex", "independent", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
@@ -177,7 +177,7 @@ def smoke(recipe: Recipe) -> Recipe:
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
-        isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
+        isp=recipe.isp.smoke(),
         denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},

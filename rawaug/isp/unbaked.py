@@ -53,7 +53,8 @@ def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
 def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:
     """Of the pixels of turned crops in their full frames, ``(B, 2, H, W)``."""
     height, width = srgb.shape[-2:]
-    frames = torch.tensor([frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()], device=srgb.device)
+    corners = [frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()]
+    frames = torch.tensor(corners, device=srgb.device, dtype=torch.float32)
     start, down, right = frames.reshape(-1, 3, 2, 1, 1).unbind(1)
     rows = torch.arange(height, device=srgb.device)[:, None]
     return start + down * rows + right * torch.arange(width, device=srgb.device)

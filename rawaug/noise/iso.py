@@ -97,7 +97,7 @@ class EldLevels:
     def sample_scale(self, law: str, gain: Tensor, generator: torch.Generator) -> Tensor:
         """The scale of ``row``, ``gaussian`` or ``tukey_lambda`` noise at these gains, ``(B,)``, white = 1."""
         line = self.camera[law]
-        scatter = line["sigma"] * torch.randn(gain.shape, generator=generator, device=gain.device)
+        scatter = line["sigma"] * torch.randn(gain.shape, generator=generator, device=gain.device, dtype=gain.dtype)
         return torch.exp(line["slope"] * gain.log() + line["bias"] + scatter - math.log(self.white_dn))
 
     def typical(self) -> tuple[float, float]:

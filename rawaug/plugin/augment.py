@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, get_args, overload
 
 import torch
 from torch import Tensor, nn
@@ -27,12 +27,13 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
+from rawaug.kernels.eager import eager
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
-Sampling = Literal["convex", "perturb", "chosen"]
+Sampling = Literal["convex", "independent", "perturb", "chosen"]
 
 
 class RawAugment(nn.Module):
@@ -46,8 +47,9 @@ class RawAugment(nn.Module):
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
             ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
-            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
-            ISP chooses; ``"chosen"`` takes these as they are.
+            camera uniform convex combinations of the atoms. ``"independent"`` is the same with the gains of another
+            camera in another light, to see what consistency is worth. ``"perturb"`` adds Gaussian noise to the weights
+            that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
@@ -74,8 +76,8 @@ class RawAugment(nn.Module):
         exposure: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
-        if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
+        if sampling not in get_args(Sampling):
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
         if exposure is None:
@@ -116,6 +118,7 @@ class RawAugment(nn.Module):
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
+    @eager
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
@@ -135,8 +138,8 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.sampling == "convex":
-            return self.isp.draw_setting(len(srgb), generator)
+        if self.sampling in ("convex", "independent"):
+            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
@@ -148,9 +151,10 @@ class RawAugment(nn.Module):
         if not any(self.exposure):
             return setting
         low, high = self.exposure
-        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator)
+        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
+    @eager
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:
         """The :class:`RawPair` that ``params`` describe: pure, bit for bit the same at every call.
@@ -179,6 +183,7 @@ class RawAugment(nn.Module):
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
     @overload
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
+    @eager
     @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
         """Sample, then apply.

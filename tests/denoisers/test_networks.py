@@ -225,7 +225,7 @@ def test_unet_has_the_published_features() -> None:
     [
         (lambda: UNet(width=0), "positive multiple of 1"),
         (lambda: DHDN(width=5), "positive multiple of 2"),
-        (lambda: UNet(scales=0), "scales must be at least 1"),
+        (lambda: UNet(scales=0), "scales must be a whole number from 1 to 12, got 0"),
         (lambda: DnCNN(depth=1), "depth must be at least 2"),
         (lambda: NAFNet(encoder=(1,), decoder=(1, 1)), "the same number of scales"),
     ],

@@ -12,9 +12,10 @@ same folder; else the gains are 1, the colour matrix is the identity, and the pi
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -32,6 +33,11 @@ from rawaug.registry import DATASETS
 BLOCKS = 32
 """Blocks of a frame."""
 
+MOST_FRAMES = 1000
+"""Of SIDD+, which has 32."""
+
+T = TypeVar("T")
+
 _NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
 
 
@@ -41,6 +47,26 @@ class NoisyBlock(NamedTuple):
     name: str
     noisy: Tensor
     cfa: CFA
+
+
+class Once(Generic[T]):
+    """What ``read`` gives, read when it is first asked for; a file found damaged then is not read again."""
+
+    def __init__(self, read: Callable[[], T]) -> None:
+        self.read = read
+        self.value: T | None = None
+        self.fault: Exception | None = None
+
+    def __call__(self) -> T:
+        if self.fault is not None:
+            raise self.fault
+        if self.value is None:
+            try:
+                self.value = self.read()
+            except (OSError, ValueError) as error:
+                self.fault = error
+                raise
+        return self.value
 
 
 class SiddBlocks(LazyPairs):
@@ -64,7 +90,7 @@ class SiddBlocks(LazyPairs):
         self.path = Path(path)
         self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
-        self._blocks: tuple[Tensor, Tensor] | None = None
+        self._all = Once(self._read_all)
         super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
 
     def read(self, index: int) -> Pair:
@@ -75,14 +101,12 @@ class SiddBlocks(LazyPairs):
         colour = self._colours.get(frame.name, _NO_COLOUR)
         return _pair(self.names[index], clean[block], noisy[block], frame.cfa, colour, levels, frame.camera)
 
-    def _all(self) -> tuple[Tensor, Tensor]:
-        if self._blocks is None:
-            clean, noisy = (_blocks_of_scenes(file) for file in self.files)
-            _require_same_shape(clean, noisy, self.files[1])
-            self._blocks = clean, noisy
-            self._levels = noise_level_functions(self.path)
-            self._colours = _colours(self.path)
-        return self._blocks
+    def _read_all(self) -> tuple[Tensor, Tensor]:
+        clean, noisy = (_blocks_of_scenes(file) for file in self.files)
+        _require_same_shape(clean, noisy, self.files[1])
+        self._levels = noise_level_functions(self.path)
+        self._colours = _colours(self.path)
+        return clean, noisy
 
 
 class SiddPlusBlocks(LazyPairs):
@@ -101,23 +125,23 @@ class SiddPlusBlocks(LazyPairs):
         path = Path(path)
         self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
         patterns = find_file(path, "siddplus_*bayer_patterns.csv")
-        with patterns.open(encoding="utf-8-sig", newline="") as stream:
-            self.cfas = [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
-        self._blocks: tuple[Tensor, Tensor] | None = None
+        self.cfas = _patterns(patterns)
+        self._all = Once(self._read_all)
         super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
 
     def read(self, index: int) -> Pair:
-        if self._blocks is None:
-            clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
-            _require_same_shape(clean, noisy, self.files[1])
-            if len(clean) != len(self):
-                raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
-            self._blocks = clean, noisy
         frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
-        clean, noisy = self._blocks
+        clean, noisy = self._all()
         levels = captured_noise(clean[frame].numpy(), noisy[frame].numpy())
         cfa = self.cfas[index // BLOCKS]
         return _pair(self.names[index], clean[index], noisy[index], cfa, _NO_COLOUR, levels, "SIDD+")
+
+    def _read_all(self) -> tuple[Tensor, Tensor]:
+        clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
+        _require_same_shape(clean, noisy, self.files[1])
+        if len(clean) != len(self):
+            raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
+        return clean, noisy
 
 
 class SiddBenchmark(Sequence[NoisyBlock]):
@@ -137,17 +161,15 @@ class SiddBenchmark(Sequence[NoisyBlock]):
     def __init__(self, path: str | Path) -> None:
         self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
-        self._blocks: Tensor | None = None
+        self._all = Once(partial(_blocks_of_scenes, self.file))
 
     def __len__(self) -> int:
         return len(HELD_BACK) * BLOCKS
 
     def __getitem__(self, index: int) -> NoisyBlock:  # type: ignore[override]
         scene, block = divmod(range(len(self))[index], BLOCKS)
-        if self._blocks is None:
-            self._blocks = _blocks_of_scenes(self.file)
         frame = self.scenes[scene]
-        return NoisyBlock(f"{frame.name}_{block:02d}", self._blocks[scene, block], frame.cfa)
+        return NoisyBlock(f"{frame.name}_{block:02d}", self._all()[scene, block], frame.cfa)
 
     def __iter__(self) -> Iterator[NoisyBlock]:
         return (self[index] for index in range(len(self)))
@@ -191,6 +213,18 @@ def find_file(path: Path, pattern: str) -> Path:
             f"{path}: contains {len(found)} files {pattern}, such as {found[0]} and {found[1]}; give a folder with one"
         )
     return found[0]
+
+
+def _patterns(file: Path) -> list[CFA]:
+    """A pattern for each frame of 32 blocks."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            names = [row[0].strip().upper() for row in csv.reader(stream) if row]
+        if len(names) > MOST_FRAMES:
+            raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
+        return [CFA(name) for name in names]
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{file}: is no list of patterns, one for each frame ({error}); copy it again") from None
 
 
 def _blocks_of_scenes(file: Path) -> Tensor:

@@ -29,6 +29,7 @@ from rawaug.data.mat import read_array, read_value
 from rawaug.data.pair import Pair
 from rawaug.data.sidd.scenes import HELD_BACK, SiddScene, is_scene
 from rawaug.io import read_picture
+from rawaug.io.apart import apart
 from rawaug.io.picture_files import view_of_orientation
 
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
@@ -79,7 +80,7 @@ class SiddFrames(LazyPairs):
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
         if "GT_SRGB" in files:
-            srgb = _even(turn_back(read_picture(files["GT_SRGB"]), view))
+            srgb = _even(turn_back(apart(read_picture, files["GT_SRGB"]), view))
         else:
             srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
         shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)

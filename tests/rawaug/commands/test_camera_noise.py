@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from rawaug.data.pair import Pair
 from rawaug.noise import NoiseEstimate, estimate_noise, noise_model
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
+TINY: dict[str, Any] = {"steps": 1, "curve_steps": 1, "pixels": 256}
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def noisy_pair() -> Pair:
 
 
 def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) -> None:
-    isp = fit([noisy_pair], progress=False, noise_figure=tmp_path / "noise.png", steps=2, pixels=512)
+    isp = fit([noisy_pair], progress=False, noise_figure=tmp_path / "noise.png", curve_steps=2, steps=2, pixels=512)
     assert isp.info["noise"]["shot_var"] == pytest.approx(SHOT_VAR, rel=0.1)
     assert isp.info["noise"]["r2"] > 0.9
     assert (tmp_path / "noise.png").stat().st_size > 10_000
@@ -71,11 +73,11 @@ def test_noise_that_is_the_same_everywhere_is_refused(noisy_pair: Pair) -> None:
 
 def test_what_is_refused_is_reported_or_raised_as_is_asked(noisy_pair: Pair) -> None:
     pair = with_variance(noisy_pair, -4e-4, 4e-4)
-    isp = fit([pair], progress=False, steps=1, pixels=256)
+    isp = fit([pair], progress=False, **TINY)
     assert "do not fit one noise law" in isp.info["noise_not_measured"] and "noise" not in isp.info
     with pytest.raises(ValueError, match="one noise law"):
-        fit([pair], progress=False, noise="on", steps=1, pixels=256)
-    assert not {"noise", "noise_not_measured"} & set(fit([pair], progress=False, noise="off", steps=1, pixels=256).info)
+        fit([pair], progress=False, noise="on", **TINY)
+    assert not {"noise", "noise_not_measured"} & set(fit([pair], progress=False, noise="off", **TINY).info)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +17,11 @@ from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-QUICK = ["--steps", "4", "--pixels", "512", "--batch", "128", "--noise", "off"]
+QUICK = ["--steps", "4", "--curve-steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
+SETTINGS: dict[str, Any] = {"steps": 4, "curve_steps": 10, "pixels": 512, "batch": 128}
 INTERRUPTED = 130
 
 Shoot = Callable[..., Path]
-
-
-@pytest.fixture(autouse=True)
-def short_first_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 10)
 
 
 @pytest.fixture
@@ -69,7 +66,7 @@ def test_files_and_folders_are_fitted_together(
     assert isp.info["frames"] == ["one", "b", "a", "two"]
     assert isp.info["data"] == [str(one), str(tmp_path / "more"), str(two)]
     assert f"fitted 4 frames in {isp.info['seconds']} s: {out}" in capsys.readouterr().out
-    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", steps=4, pixels=512, batch=128)
+    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", **SETTINGS)
     assert same(isp, by_hand)
     assert not same(isp, fit(out, one, two))
 
@@ -155,10 +152,10 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
     without = fit(tmp_path / "x.safetensors", raw, "--held-out", raw, "--camera-jpeg", "false")
     assert same(without, plain) and without.info["held_out"] == plain.info["held_out"]
     assert not same(with_jpeg, plain) and with_jpeg.info["held_out"] != plain.info["held_out"]
-    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, steps=4, pixels=512, batch=128), plain)
+    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, **SETTINGS), plain)
 
 
 def test_pairs_are_fitted_as_they_are() -> None:
     pairs = rawaug.data.demo_pairs("train", count=2)
-    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=pairs[1:], steps=2, pixels=256, batch=64)
+    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=pairs[1:], **SETTINGS)
     assert isp.info["frames"] == [pair.name for pair in pairs] and len(isp.info["held_out"]) == 2

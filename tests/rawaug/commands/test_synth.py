@@ -17,6 +17,7 @@ from rawaug.bayer import pack
 from rawaug.cli import main
 from rawaug.commands.pair_files import camera_frames, replay
 from rawaug.commands.synth import synth
+from rawaug.files import replacing
 from rawaug.io import read_raw, write_picture
 from rawaug.noise import estimate_noise
 
@@ -72,7 +73,10 @@ def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -
     synth(pictures, parts, per_image=1, workers=0)
     for file in parts.rglob("a_png_0*"):
         file.unlink()
-    (parts / "c_1_clean.dng.partial").write_bytes(b"a run that was killed here")
+    with replacing(parts / "c_1_clean.dng") as partial:
+        abandoned = partial.name
+    (parts / "c_1_clean.dng").unlink()
+    (parts / abandoned).write_bytes(b"a run that was killed here")
     again = synth(pictures, parts, per_image=2, workers=0)
     assert (again.made, again.existing) == (5, 3)
     assert contents(parts) == contents(whole)

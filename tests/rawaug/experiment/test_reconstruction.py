@@ -22,7 +22,7 @@ from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig
 
 FrameOf = Callable[..., Pair]
-TINY = FitConfig(steps=1, pixels=256, batch=64)
+TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64)
 
 
 class Laboratory:
@@ -257,7 +257,6 @@ def test_the_smoke_form_keeps_what_is_quick() -> None:
 def test_a_fit_never_sees_the_frame_that_is_left_out(
     frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 2)
     monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
     monkeypatch.setattr(reconstruction, "open_pictures", lambda spec, min_side: [])
     monkeypatch.setattr(reconstruction, "mosaic_only_psnr", lambda pictures, cfa: 0.0)

@@ -270,7 +270,7 @@ def test_nothing_is_drawn_from_the_global_state() -> None:
         ({"stages": ()}, "stages: none"),
         ({"encoder_widths": (8, 8)}, "must be three"),
         ({"knee": 1.0}, "knee must be in"),
-        ({"gain_atoms": 0}, "at least 1"),
+        ({"gain_atoms": 0}, "gain_atoms must be a whole number from 1 to 2048, got 0"),
     ],
 )
 def test_impossible_configurations_are_refused(settings: dict[str, Any], message: str) -> None:

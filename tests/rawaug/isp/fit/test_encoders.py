@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
@@ -16,7 +16,6 @@ SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "CURVE_STEPS", 20)
     monkeypatch.setattr(encoders, "STEPS", 40)
     monkeypatch.setattr(encoders, "FOLDS", 2)
     monkeypatch.setattr(encoders, "FRAMES_A_STEP", 2)
@@ -27,7 +26,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def config(wanted: str) -> FitConfig:
-    return FitConfig(atoms=2, reach=1.0, steps=0, pixels=512, batch=64, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
+    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64}
+    return FitConfig(atoms=2, reach=1.0, **few, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
 
 
 def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:
