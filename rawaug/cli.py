@@ -48,14 +48,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
     from rawaug.commands.listing import command, listed
-    from rawaug.commands.spelling import require_known_options
+    from rawaug.commands.spelling import require_known_keys, require_known_options
     from rawaug.progress import quiet
 
-    kind = "training"
+    kind, recipe = "training", None
     if argv[:2] == ["run", "--recipe"]:
         argv = ["run", *argv[2:]]
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
         from rawaug.experiment.kinds import kind_of
+        from rawaug.experiment.plain_yaml import read_yaml
         from rawaug.experiment.recipe import find_recipe
 
         recipe = find_recipe(argv[1])
@@ -69,6 +70,8 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     if chosen is not None:
         require_known_options(chosen, leaves[chosen], argv)
+    if recipe is not None:
+        require_known_keys(recipe, read_yaml(recipe), leaves["run"])
     parsed = parser.parse_args(argv)
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words

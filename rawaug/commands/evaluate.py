@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,12 +64,16 @@ def run(
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
     """
+
+    def written(result: dict[str, Any]) -> None:
+        print_scores(result)
+        if json:
+            write_json(result, json)
+
     if json:
         require_writable(json)
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report)
-    print_scores(result)
-    if json:
-        write_json(result, json)
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, written)
+    written(result)
     if report:
         print(f"page: {report}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
@@ -84,6 +88,7 @@ def evaluate(
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+    first: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
@@ -97,6 +102,7 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+        first: called with the result without self-ensemble and classical denoisers where these are still to come.
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
@@ -110,6 +116,7 @@ def evaluate(
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = Readable(open_pairs(data, split="test"))
+    about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
             raise ValueError(
@@ -123,7 +130,14 @@ def evaluate(
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(where)
-        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        result = {"self_ensemble": False, "seed": seed}
+        result |= summary([score for score, *_ in score_denoiser(model, pairs, levels, cfa, seed, False, "evaluate")])
+        if first is not None and (self_ensemble or classical):
+            first({**about[0], **result, **about[1]})
+        if self_ensemble:
+            result = _with_self_ensemble(result, model, pairs, levels, cfa)
+        if classical:
+            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
         _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
@@ -135,7 +149,7 @@ def evaluate(
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
         result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
-    return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
+    return {**about[0], **result, **about[1]}
 
 
 def _require_some(pairs: Readable) -> None:
@@ -143,23 +157,11 @@ def _require_some(pairs: Readable) -> None:
         raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
 
 
-def _denoiser_result(
-    model: Denoiser,
-    pairs: Sequence[Pair],
-    noise: NoiseModel,
-    cfa: CFA,
-    seed: int,
-    self_ensemble: bool,
-    classical: Sequence[Spec],
+def _with_self_ensemble(
+    plain: Mapping[str, Any], model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA
 ) -> dict[str, Any]:
-    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
-    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
-    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
-    if self_ensemble:
-        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
-        result |= {"plain": plain, **summary([score for score, *_ in scored])}
-    else:
-        result |= plain
-    if classical:
-        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
-    return result
+    """The summary of a denoiser averaged over views, with the one without under ``plain``."""
+    settings = {"self_ensemble": True, "seed": plain["seed"]}
+    scored = score_denoiser(model, pairs, noise, cfa, plain["seed"], True, "evaluate, self-ensemble")
+    without = {key: value for key, value in plain.items() if key not in settings}
+    return {**settings, "plain": without, **summary([score for score, *_ in scored])}

@@ -6,7 +6,7 @@ The key ``train.learning_rate`` of a recipe is ``--train.learning-rate``. Below 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rawaug.registry import nearest
@@ -39,6 +39,31 @@ def require_known_options(command: str, parser: Any, arguments: Sequence[str]) -
             raise ValueError(
                 f"{option}: no such option{nearest(spelt, longer or options)}; see rawaug {command} --help"
             )
+
+
+def require_known_keys(file: object, content: Any, parser: Any) -> None:
+    """Refuse a key of a recipe that the parser does not have.
+
+    Args:
+        file: names the recipe in messages.
+        content: of its YAML.
+        parser: of the command that reads it.
+
+    Raises:
+        ValueError: naming the key, and the one that is nearly spelt so.
+    """
+    known = {action.dest for action in parser._actions}
+
+    def walk(part: Mapping[str, Any], above: str) -> None:
+        for name, value in part.items():
+            key = f"{above}{name}"
+            if isinstance(value, Mapping) and any(other.startswith(f"{key}.") for other in known):
+                walk(value, f"{key}.")
+            elif key not in known:
+                raise ValueError(f"{file}: {key}: no such key{nearest(key, known)}")
+
+    if isinstance(content, Mapping):
+        walk(content, "")
 
 
 def hyphenated(option: str) -> str:

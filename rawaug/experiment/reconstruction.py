@@ -24,6 +24,7 @@ from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.early_checks import require_precision
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -121,6 +122,8 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
     require_free(comparison, overwrite)
+    if comparison.downstream is not None:
+        require_precision(comparison.downstream.train.precision)
     comparing = _Comparison(comparison)
     claim(comparison, overwrite)
     return comparing.table()

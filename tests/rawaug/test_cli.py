@@ -198,7 +198,7 @@ def test_bad_input_is_one_line(
 def test_an_unknown_key_in_a_recipe_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = tmp_path / "mine.yaml"
     recipe.write_text("name: mine\ntrain: {stepz: 3}\narms: {real: {}}\n")
-    assert "stepz" in refused(capsys, "run", str(recipe))
+    assert "mine.yaml: train.stepz: no such key (nearest: train.steps)" in refused(capsys, "run", str(recipe))
 
 
 def test_weights_of_no_use_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
