@@ -53,6 +53,7 @@ img { max-width: 100%; } pre { background: #f4f4f4; padding: 1rem; overflow-x: a
 @media (max-width: 40rem) {
   body { margin: 1rem auto; padding: 0 .6rem; font-size: 14px; } h1 { font-size: 1.3rem; }
   th, td { padding: .2rem .4rem; } th { vertical-align: bottom; } .table { font-size: 13px; }
+  td:first-child { min-width: 6rem; max-width: 35vw; overflow-wrap: anywhere; }
   .window { width: calc(50% - .3rem); }
 }
 """

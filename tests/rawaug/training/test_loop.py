@@ -201,6 +201,6 @@ def test_tensorboard_has_the_rate_and_crops_of_this_run_alone(tmp_path: Path, va
     assert [(point.step, point.value) for point in seen.Scalars("loss")] == [(1, 0.5), (2, 0.5), (3, 0.25), (4, 0.25)]
     assert seen.Scalars("learning_rate")[0].value == pytest.approx(1e-3)
     crop = seen.Images("noisy_denoised_clean/0")[0]
-    assert (crop.height, crop.width) == (192, 3 * 192)
+    assert (crop.height, crop.width) == (96, 3 * 96)
     rows = (tmp_path / "log.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["1", "0.5"], ["2", "0.5"], ["3", "0.25"], ["4", "0.25"]]
