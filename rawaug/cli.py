@@ -10,6 +10,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rawaug._version import __version__
@@ -48,10 +49,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
     from rawaug.commands.listing import command, listed
-    from rawaug.commands.spelling import require_known_keys, require_known_options
+    from rawaug.commands.spelling import given_keys, require_known_keys, require_known_options
     from rawaug.progress import quiet
 
-    kind, recipe = "training", None
+    if argv == ["run"]:
+        from rawaug.experiment.recipe import recipe_list
+
+        print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
+        print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
+        return 0
+    kind, recipe, shown = "training", None, None
     if argv[:2] == ["run", "--recipe"]:
         argv = ["run", *argv[2:]]
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
@@ -61,10 +68,11 @@ def _dispatch(argv: list[str]) -> int:
 
         recipe = find_recipe(argv[1])
         kind = kind_of(recipe)
+        shown = recipe if {"-h", "--help"} & set(argv) else None
         argv = ["run", "--recipe", str(recipe), *argv[2:]]
     names = [*OWN, *listed()]
     chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
-    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
+    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen], shown)
     if not argv:
         parser.print_help()
         return 0
@@ -77,7 +85,7 @@ def _dispatch(argv: list[str]) -> int:
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
     with quiet(values["quiet"]):
         if chosen == "run":
-            _run(kind, values)
+            _run(kind, values, given_keys(argv))
         elif chosen == "completion":
             print(parser.get_completion_script(f"shtab-{values['shell']}"))
         else:
@@ -85,8 +93,11 @@ def _dispatch(argv: list[str]) -> int:
     return 0
 
 
-def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
-    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments."""
+def _parser(kind: str, wanted: Sequence[str | None], recipe: Path | None = None) -> tuple[Any, dict[str, Any]]:
+    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments.
+
+    ``run`` takes the keys of ``kind``; the values of ``recipe`` stand in its help.
+    """
     from jsonargparse import ArgumentParser
 
     from rawaug.commands.arguments import add_arguments
@@ -114,7 +125,7 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
     for name, leaf in leaves.items():
         if name in wanted:
             if name == "run":
-                _add_run_arguments(leaf, kind)
+                _add_run_arguments(leaf, kind, recipe)
             elif name == "completion":
                 leaf.add_argument("shell", choices=SHELLS)
             else:
@@ -125,24 +136,37 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
     return parser, leaves
 
 
-def _add_run_arguments(run: Any, kind: str) -> None:
+def _add_run_arguments(run: Any, kind: str, recipe: Path | None) -> None:
     from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.recipe import defaults_of
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
+    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
+    if recipe is not None:
+        run.set_defaults(defaults_of(recipe, KINDS[kind].settings))
 
 
-def _run(kind: str, settings: dict[str, Any]) -> None:
+def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.plan import with_own_pairs
+    from rawaug.experiment.recipe import Recipe
 
     experiment = KINDS[kind]
-    for key in ("recipe", "quiet"):
-        settings.pop(key)
-    quick, overwrite = settings.pop("smoke"), settings.pop("overwrite")
+    file, _ = settings.pop("recipe"), settings.pop("quiet")
+    quick, dry, overwrite = (settings.pop(flag) for flag in ("smoke", "dry_run", "overwrite"))
     recipe = experiment.settings(**settings)
-    experiment.run(experiment.smoke(recipe) if quick else recipe, overwrite)
+    if isinstance(recipe, Recipe) and file:
+        recipe = with_own_pairs(recipe, str(file[0]), given)
+    recipe = experiment.smoke(recipe) if quick else recipe
+    if not dry:
+        experiment.run(recipe, overwrite)
+    elif experiment.dry_run is None:
+        raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
+    else:
+        experiment.dry_run(recipe, overwrite)
 
 
 def _one_line(error: Exception) -> str:

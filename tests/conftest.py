@@ -1,4 +1,5 @@
-"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do.
+"""One thread a process, for two processes test at once (``make test``); which tests need a GPU; and where real camera
+files lie, if any do.
 
 Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
 """
@@ -19,6 +20,15 @@ from rawaug import registry
 
 torch.set_num_threads(1)
 multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests with the mark ``gpu`` are skipped without a CUDA device."""
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
 @pytest.fixture(scope="session")

@@ -18,8 +18,20 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "devices", "extras", "files", "metrics", "printable", "progress", "registry"}
-BASE |= {"seeding", "_version"}
+BASE = {
+    "bayer",
+    "camera_names",
+    "devices",
+    "extras",
+    "files",
+    "metrics",
+    "patterns",
+    "printable",
+    "progress",
+    "registry",
+    "seeding",
+    "_version",
+}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
@@ -29,6 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extras": set(),
     "files": set(),
     "metrics": set(),
+    "patterns": {"bayer"},
     "printable": set(),
     "progress": set(),
     "registry": set(),
@@ -134,8 +147,14 @@ def test_no_circles() -> None:
         ("import denoisers", set()),
         ("import rawaug.registry", {"registry"}),
         ("import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D", {"bayer", "files", "registry"}),
-        ("import rawaug.noise", {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "printable", "registry"}),
-        ("from rawaug import DictionaryISP", {"bayer", "seeding", "camera_names", "files", "isp", "kernels", "registry"}),
+        (
+            "import rawaug.noise",
+            {"bayer", "seeding", "kernels", "noise", "camera_names", "extras", "printable", "registry"},
+        ),
+        (
+            "from rawaug import DictionaryISP",
+            {"bayer", "seeding", "camera_names", "files", "isp", "kernels", "registry"},
+        ),
     ],
 )
 def test_importing_one_part_loads_no_other(code: str, allowed: set[str]) -> None:

@@ -13,6 +13,7 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairSettings
 from rawaug.data.readable import Readable
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
@@ -49,12 +50,13 @@ def run(
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
+    settings: PairSettings,
 ) -> None:
     """PSNR and SSIM of an ISP or a denoiser.
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
-        data: folder of RAW files, one file, or kind:path.
+        data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs.
         self_ensemble: also score the average over eight views (denoisers).
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
@@ -63,6 +65,7 @@ def run(
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
+        settings: of pairs:PATH.
     """
 
     def written(result: dict[str, Any]) -> None:
@@ -72,7 +75,8 @@ def run(
 
     if json:
         require_writable(json)
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, written)
+    more = {"first": written, **vars(settings)}
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **more)
     written(result)
     if report:
         print(f"page: {report}")
@@ -81,7 +85,7 @@ def run(
 
 def evaluate(
     weights: str | Path,
-    data: str,
+    data: str | Sequence[Pair],
     self_ensemble: bool = False,
     noise: NoiseSpec | None = None,
     seed: int = 0,
@@ -89,12 +93,13 @@ def evaluate(
     device: str = "cpu",
     report: str | Path | None = None,
     first: Callable[[dict[str, Any]], None] | None = None,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
     Args:
         weights: an ISP's or a denoiser's; the file says which.
-        data: a folder of RAW files, or ``kind:path``.
+        data: a folder of clean RAW files, ``kind:path``, or a sequence of pairs.
         self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
@@ -103,6 +108,7 @@ def evaluate(
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
         first: called with the result without self-ensemble and classical denoisers where these are still to come.
+        settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
@@ -115,7 +121,8 @@ def evaluate(
         require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
-    pairs = Readable(open_pairs(data, split="test"))
+    pairs = Readable(open_pairs(data, split="test", **settings))
+    data = data if isinstance(data, str) else f"{len(pairs)} pairs"
     about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:

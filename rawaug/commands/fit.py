@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from rawaug.commands.camera_noise import as_info, measure_camera_noise
 from rawaug.data import RawFolder, open_pairs
+from rawaug.data.identity import shared_frame
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.files import require_writable
@@ -36,7 +37,7 @@ def run(
     Args:
         data: RAW files, folders of them, or one kind:path.
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
-        held_out: frames excluded from the fit; their PSNR_r is shown during the fit.
+        held_out: frames of which none is fitted; their PSNR_r is shown during the fit.
         out: output .safetensors file.
         noise: measure the camera's noise, for noise: camera; auto continues without it where the frames do not
             allow it.
@@ -92,13 +93,13 @@ def fit(
         dark: folder of dark frames to measure the read variance.
         noise_figure: where to draw the measured points and the line.
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
-        held_out: frames excluded from the fit; their PSNR_r is shown in the progress bar and stored in
+        held_out: frames of which none is fitted; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
         state: file with the state of the fit, to resume it; removed at the end.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or not a Bayer RAW file.
+        FileNotFoundError, ValueError: if a file is missing or not a Bayer RAW file, or a held-out frame is also fitted.
 
     Example:
         >>> isp = fit("demo:train", steps=2, pixels=512, progress=False)
@@ -109,7 +110,7 @@ def fit(
         raise ValueError(f"noise must be auto, on or off, got {noise!r}")
     start = time.perf_counter()
     pairs = _pairs(source, camera_jpeg)
-    watch = None if held_out is None else _Watch(_pairs(held_out, camera_jpeg))
+    watch = None if held_out is None else _Watch(_unseen(_pairs(held_out, camera_jpeg), pairs))
     estimate = _measured_noise(pairs, noise, dark)  # before the fit: what fails here fails early
     isp = fit_isp(pairs, FitConfig(**settings), progress, state, watch)
     if watch is not None:
@@ -154,6 +155,13 @@ class _Watch:
         return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
 
 
+def _unseen(held_out: Sequence[Pair], fitted: Sequence[Pair]) -> Sequence[Pair]:
+    """``held_out``, unless a frame of it is also fitted."""
+    if (seen := shared_frame(held_out, fitted)) is not None:
+        raise ValueError(f"held-out: {seen} is also fitted; hold out other frames")
+    return held_out
+
+
 def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
         source = [source]
@@ -165,7 +173,7 @@ def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jp
         raise ValueError(
             f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
         )
-    opened = [open_pairs(str(item), split="train") for item in source]
+    opened = [open_pairs(str(item), split="train", as_clean=False) for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]
     files: list[Path] = []

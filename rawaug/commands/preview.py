@@ -32,7 +32,9 @@ _MAXIMUM = 768
 
 
 @COMMANDS.register("preview")
-def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0, max_pixels: int = MAX_PIXELS) -> None:
+def run(
+    picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0, max_pixels: int = MAX_PIXELS
+) -> None:
     """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
     Args:

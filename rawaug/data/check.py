@@ -22,6 +22,7 @@ from rawaug.data import picture_folder, raw_folder
 from rawaug.data.dnd import Dnd
 from rawaug.data.fivek import CAMERAS, fivek_numbers
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.rawir import Rawir
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
@@ -34,6 +35,7 @@ from rawaug.io.apart import apart
 from rawaug.printable import printable
 
 _SHOWN = 6
+_PAIRS = "pairs:"
 
 
 @dataclass
@@ -97,17 +99,25 @@ class DataReport:
         return "\n".join([printable(self.path), *map(str, self.parts)])
 
 
-def check(path: str | Path, first: int | None = None) -> DataReport:
+def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
     """Identify the data in a folder (or a SIDD submission) and read it.
 
     Args:
-        path: a folder, a RAW file, or a SIDD submission.
+        path: a folder, a RAW file, a SIDD submission, or ``pairs:PATH``.
         first: read at most this many items of each kind.
+        settings: of :class:`rawaug.data.PairFolder`, for noisy/clean pairs; None is left out.
 
     Raises:
         FileNotFoundError: if there is no such path.
-        ValueError: if it contains no known data.
+        ValueError: if it contains no known data, or settings are given and it is not ``pairs:PATH``.
     """
+    settings = {key: value for key, value in settings.items() if value is not None}
+    if str(path).startswith(_PAIRS):
+        folder = Path(str(path).removeprefix(_PAIRS))
+        opened = PairFolder(folder, **settings)
+        return DataReport(folder, [_part("noisy/clean pairs", lambda: opened, first)])
+    if settings:
+        raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
@@ -147,6 +157,9 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
     files = [path] if path.is_file() else [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
+    if path.is_dir() and looks_like_pairs(files):
+        yield "noisy/clean pairs", lambda: PairFolder(path)
+        return
     raws = sorted(file for file in files if file.suffix.lower() in raw_folder.EXTENSIONS)
     numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
     if raws:

@@ -47,6 +47,26 @@ def mat_version(path: str | Path) -> str:
     raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
 
 
+def variables(path: str | Path) -> list[str]:
+    """The names of a file's variables.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: as :func:`read_array`.
+    """
+    path = Path(path)
+    if mat_version(path) == "5":
+        from scipy.io import whosmat
+
+        with _as_os_error(path):
+            return [name for name, *_ in whosmat(path)]
+    with _as_os_error(path):
+        with extra("data"):
+            import h5py
+
+        with h5py.File(path, "r") as file:
+            return [name for name in file if not name.startswith("#")]
+
+
 def read_array(path: str | Path, name: str) -> np.ndarray:
     """The numeric array ``name``, axes and type as in MATLAB.
 

@@ -27,6 +27,7 @@ class Pair:
         camera: make and model.
         registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
+        color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
 
     Raises:
         ValueError: if shapes or dtypes disagree, a side is odd, or levels come without the other or without ``noisy``.
@@ -43,6 +44,7 @@ class Pair:
     read_var: float | None = None
     camera: str = "unknown"
     registered: bool = True
+    color_known: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name

@@ -57,10 +57,16 @@ class RawFolder(LazyPairs):
         if missing:
             raise FileNotFoundError(f"{missing[0]}: no such RAW file")
         if not self.files:
-            raise ValueError(f"{path}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}")
+            raise ValueError(
+                f"{path}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}; "
+                "noisy/clean pairs of other formats are read as pairs:PATH"
+            )
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr = adjust_maximum_thr
         super().__init__(_names(self.files))
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        return (self.files[index],)
 
     def read(self, index: int) -> Pair:
         """The frame of ``files[index]``, developed, or with its camera's JPEG."""

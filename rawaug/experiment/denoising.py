@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import denoisers
@@ -18,10 +19,9 @@ from denoisers.network import Denoiser
 from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
-from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
-from rawaug.data.lazy import LazyPairs
+from rawaug.data import PictureFolder
+from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
-from rawaug.data.remembered import Remembered
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
@@ -38,10 +38,12 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.early_checks import require_runnable
+from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.rehearsal import rehearse
 from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.extras import extra
-from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
+from rawaug.files import find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import noise_for
@@ -60,7 +62,14 @@ Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
 
 
-def run(recipe: Recipe, overwrite: bool = False) -> Results:
+def run(
+    recipe: Recipe,
+    overwrite: bool = False,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    validation: Sequence[Pair] | None = None,
+    test: Sequence[Pair] | None = None,
+) -> Results:
     """Run a recipe; the results by arm, one entry a seed, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return empty lists.
@@ -68,14 +77,33 @@ def run(recipe: Recipe, overwrite: bool = False) -> Results:
     Args:
         recipe: what is run.
         overwrite: replace a run of this name with other settings; what does not depend on them is kept.
+        pairs, validation, test: in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name. With
+            ``pairs`` alone a part of them is held out for validation.
     """
-    return _Run(recipe, overwrite).all_stages()
+    given = {"pairs": pairs, "validation": validation, "test": test}
+    given_frames = {key: frames for key, frames in given.items() if frames is not None}
+    return _Run(recipe, overwrite, given_frames).all_stages()
+
+
+def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
+    """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
+
+    Raises:
+        OSError, ValueError: for the first thing found wrong.
+    """
+    prepared = _Run(recipe, overwrite)
+    print("\n".join(prepared.plan.lines(recipe)))
+    rehearse(recipe, prepared.plan)
+    print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
 
 
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
-    def __init__(self, recipe: Recipe, overwrite: bool = False) -> None:
+    def __init__(
+        self, recipe: Recipe, overwrite: bool = False, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})
+    ) -> None:
+        recipe = with_given_pairs(recipe, given)
         require_runnable(recipe, overwrite)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
         self.folder = run_folder(recipe)
@@ -86,18 +114,22 @@ class _Run:
             first_network(recipe.network_of(arm), seed=0)
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
-        self.test = _first(open_pairs(self.data.test), self.data.test_count)
-        source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
-        self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
-        _require_unseen(self.test, {"pairs": source, "validation": self.validation})
-        pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
-        self.pictures = Remembered(pictures, self.data.memory_mb) if self.data.memory_mb else pictures
-        self.pairs = list(source[: self.data.count])
-        if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+        self.plan = plan = planned(recipe, given)
+        self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
+        self.pairs: list[Pair] = []
+
+    def read(self) -> None:
+        """The frames into memory; what they lack is found before anything is fitted."""
+        if _leads():
+            print("\n".join(self.plan.lines(self.recipe)))
+        self.pairs = list(self.plan.pairs)
+        if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+        require_usable(self.recipe, self.pairs, self.validation)
 
     def all_stages(self) -> Results:
         recipe = self.recipe
+        self.read()
         if _leads():
             claim(recipe, self.overwrite)
         results: Results = {arm: [] for arm in recipe.arms}
@@ -256,10 +288,6 @@ def _settings(part: Any) -> dict[str, Any]:
     return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
 
 
-def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
-    return pairs if count is None else pairs[:count]
-
-
 def _leads() -> bool:
     """Whether this is the one of several training processes that writes and evaluates."""
     with extra("train"):
@@ -268,22 +296,6 @@ def _leads() -> bool:
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
-def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:
-    """Refuse test frames that are also among the frames of training or validation."""
-    unseen = _identities(test)
-    for part, pairs in others.items():
-        seen = unseen & _identities(pairs)
-        if seen:
-            raise ValueError(f"data.test: {min(seen)} is also in data.{part}; test on unseen frames")
-
-
-def _identities(pairs: Sequence[Pair]) -> set[str]:
-    """Identifies frames without reading them: the path of a file, else the name."""
-    if isinstance(pairs, RawFolder):
-        return {str(file.resolve()) for file in pairs.files}
-    if isinstance(pairs, LazyPairs):
-        return set(pairs.names)
-    return {pair.name for pair in pairs}
 
 
 def _discard_other_checkpoint(place: Path, key: str) -> None:
@@ -294,22 +306,3 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
     stamp.write_text(key)
-
-
-def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage depends on, by frame, without reading files again.
-
-    Path, size and modification time of RAW files; names of a dataset's frames; samples of the content of frames in
-    memory.
-    """
-    if isinstance(pairs, RawFolder):
-        return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]
-    if isinstance(pairs, LazyPairs):
-        return list(pairs.names)
-    return [_sampled(pair) for pair in pairs]
-
-
-def _sampled(pair: Pair) -> str:
-    known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
-    images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
-    return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]

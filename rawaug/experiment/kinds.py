@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
-from rawaug.experiment.denoising import run
+from rawaug.experiment.denoising import dry_run, run
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
@@ -21,15 +21,17 @@ class Kind(NamedTuple):
         settings: dataclass of its keys.
         run: does it; called with the settings and whether another run of the name is replaced.
         smoke: its settings in a form of seconds.
+        dry_run: says what would be done and tries what could fail late; None where it cannot be had.
     """
 
     settings: type[Any]
     run: Callable[[Any, bool], Any]
     smoke: Callable[[Any], Any]
+    dry_run: Callable[[Any, bool], None] | None = None
 
 
 KINDS = {
-    "training": Kind(Recipe, run, smoke),
+    "training": Kind(Recipe, run, smoke, dry_run),
     "reconstruction": Kind(Comparison, compare, smoke_comparison),
     "ablation": Kind(Ablation, ablate, smoke_ablation),
     "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep),

@@ -34,9 +34,14 @@ class UnbakedISP(nn.Module):
     @torch.no_grad()
     def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
         """sRGB to clean packed RAW."""
+        return bayer.pack_rgb(self.colours(srgb, params, place, white), self.isp.cfa)
+
+    @torch.no_grad()
+    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """RAW of all three colours at every site, ``(B, 3, H, W)``."""
         require_batch(srgb, params, place)
         x5 = self.isp.reverse_pixels(as_float(srgb), params, None if place is None else _coordinates(srgb, place))
-        return bayer.pack(bayer.mosaic(x5, self.isp.cfa), self.isp.cfa).clamp_(max=white)
+        return x5.clamp(max=white)
 
 
 def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:

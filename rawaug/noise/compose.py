@@ -45,6 +45,7 @@ class Compose(NoiseModel):
         if not models or len(set(streams)) < len(streams):
             raise ValueError(f"Compose needs one or more noise models of different kinds, got {streams}")
         self.models = list(models)
+        self.by_plane = any(model.by_plane for model in models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         params: Params = {}

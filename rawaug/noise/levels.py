@@ -39,7 +39,9 @@ def published() -> dict[str, Any]:
 def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
     low, high = (math.log(limit) for limit in limits)
-    return torch.exp(low + (high - low) * torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32))
+    return torch.exp(
+        low + (high - low) * torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32)
+    )
 
 
 def _normal(batch: int, generator: torch.Generator) -> Tensor:

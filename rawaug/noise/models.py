@@ -48,6 +48,8 @@ class NoiseModel(ABC):
     """
 
     stream: ClassVar[str]
+    by_plane = False
+    """Whether the four planes differ in more than their signal: such noise knows packed Bayer RAW alone."""
 
     @abstractmethod
     def sample(self, batch: int, generator: torch.Generator) -> Params:

@@ -141,6 +141,7 @@ class ColourBias(_FixedPattern):
     """An offset N(0, sd^2) of each of R, Gr, Gb and B in each picture; it shows as a cast in the shadows."""
 
     stream = "colour_bias"
+    by_plane = True
 
     def __init__(self, sd: float) -> None:
         _require_not_negative(sd=sd)

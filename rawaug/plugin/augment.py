@@ -21,6 +21,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.isp.camera_sampling import EXPOSURE
 from rawaug.isp.dictionary import perturb
 from rawaug.isp.model import DictionaryISP
@@ -29,6 +31,7 @@ from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.eager import eager
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
@@ -56,6 +59,12 @@ class RawAugment(nn.Module):
         exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
             default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
             above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
+        cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
+            like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
+
+    Raises:
+        ValueError: if a setting is unknown or out of range, or the noise is one of Bayer's planes and the pattern has
+            none.
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -74,8 +83,13 @@ class RawAugment(nn.Module):
         strength: float = 0.1,
         seed: int = 0,
         exposure: tuple[float, float] | None = None,
+        cfa: str | None = None,
     ) -> None:
         super().__init__()
+        self.pattern = None if cfa is None else pattern(cfa)
+        if self.pattern is not None and self.pattern.name in CFA.__members__:
+            isp, self.pattern = deepcopy(isp), None
+            isp.configure(cfa=str(cfa))
         if sampling not in get_args(Sampling):
             raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
@@ -88,6 +102,8 @@ class RawAugment(nn.Module):
         self.baked = frozen(reverse_pass(isp))
         self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
+        if self.pattern is not None and self.noise.by_plane:
+            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
         self.sampling = sampling
         self.strength = strength
         self.seed = seed
@@ -175,9 +191,19 @@ class RawAugment(nn.Module):
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
-            clean = self.baked(srgb, params.isp, params.place, white=1.0)
+            clean = self._clean(srgb, params)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
+            if self.pattern is None:
+                return RawPair(noisy, clean, variance, params)
+            noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
             return RawPair(noisy, clean, variance, params)
+
+    def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
+        """Clean RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
+        if self.pattern is None:
+            return self.baked(srgb, params.isp, params.place, white=1.0)
+        rgb = self.baked.colours(srgb, params.isp, params.place, white=1.0)
+        return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
 
     @overload
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...

@@ -49,6 +49,8 @@ class FramePair(Protocol):
     def camera(self) -> str: ...
     @property
     def registered(self) -> bool: ...
+    @property
+    def color_known(self) -> bool: ...
 
 
 class Shot(NamedTuple):
@@ -115,6 +117,11 @@ def sample_pixels(
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
+    if not pair.color_known:
+        raise ValueError(
+            f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
+            "use a shipped one, such as universal"
+        )
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")

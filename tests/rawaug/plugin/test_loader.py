@@ -133,7 +133,7 @@ def test_fabric_sets_up_the_loader_that_is_wrapped(augment: RawAugment, srgb: Te
     assert noisy(wrap(loader, augment, device=fabric.device)).shape == (6, 4, 8, 10)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="pinned memory and the copy to a GPU need one")
+@pytest.mark.gpu
 def test_pinned_pictures_become_pairs_on_the_gpu(srgb: Tensor) -> None:
     augment = RawAugment(DictionaryISP())
     loader = DataLoader(TensorDataset(srgb, torch.arange(6)), batch_size=3, pin_memory=True, num_workers=2)
