@@ -22,6 +22,7 @@ OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pai
 BASE = {
     "bayer",
     "camera_names",
+    "devices",
     "extras",
     "files",
     "metrics",
@@ -37,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
     "bayer": {"seeding"},
     "camera_names": set(),
+    "devices": {"registry"},
     "extras": set(),
     "files": set(),
     "metrics": set(),
@@ -57,6 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "commands": CAMERA | {"plugin", "data", "io", "evaluation", "training"},
     "experiment": CAMERA | {"plugin", "data", "io", "evaluation", "training", "commands"},
     "cli": BASE | {"commands", "experiment"},
+    "__main__": {"cli"},
 }
 
 

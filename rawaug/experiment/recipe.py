@@ -132,6 +132,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
         untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
         seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
@@ -150,6 +151,7 @@ class Recipe:
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str | dict[str, Any]] = field(default_factory=list)
     untouched: list[str] = field(default_factory=list)
+    self_ensemble: bool = True
     steps: int | None = None
     seed: int = 0
     seeds: int = 1
