@@ -106,8 +106,8 @@ def test_two_folders_may_use_the_same_names(own: Path, tmp_path: Path) -> None:
 
 
 def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
-    flat = torch.zeros(1, 64, 64)
-    pair = Pair("a", torch.zeros(3, 64, 64, dtype=torch.uint8), flat, "RGGB", noisy=flat)  # type: ignore[arg-type]
+    flat = torch.zeros(1, 72, 72)
+    pair = Pair("a", torch.zeros(3, 72, 72, dtype=torch.uint8), flat, "RGGB", noisy=flat)  # type: ignore[arg-type]
     recipe = Recipe(arms={"r2r": ArmConfig(estimator="r2r")}, data=DataConfig())
     with pytest.raises(ValueError, match="a: has no noise levels"):
         require_usable(recipe, [pair], [])
@@ -116,12 +116,12 @@ def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
     with pytest.raises(ValueError, match=r"arms\.two: needs 2 shots"):
         require_usable(twice, [pair], [])
     supervised = Recipe(arms=ARMS, data=DataConfig())
-    with pytest.raises(ValueError, match=r"64 x 64 is too small for train\.crop=60"):
-        require_usable(replace(supervised, train=replace(supervised.train, crop=60)), [pair], [])
-    require_usable(replace(supervised, train=replace(supervised.train, crop=58)), [pair], [])
+    with pytest.raises(ValueError, match=r"72 x 72 is too small for train\.crop=68"):
+        require_usable(replace(supervised, train=replace(supervised.train, crop=68)), [pair], [])
+    require_usable(replace(supervised, train=replace(supervised.train, crop=66)), [pair], [])
     with pytest.raises(ValueError, match="unknown, so no ISP can be fitted"):
         require_usable(supervised, [replace(pair, color_known=False)], [])
-    require_usable(replace(supervised, camera="universal", train=replace(supervised.train, crop=58)), [pair], [])
+    require_usable(replace(supervised, camera="universal", train=replace(supervised.train, crop=66)), [pair], [])
 
 
 def test_settings_of_pairs_need_pairs() -> None:
