@@ -114,7 +114,7 @@ def _set_up(path: Path) -> None:
     try:
         kind, parser = KINDS[kind_of(path)], _parser(kind_of(path))
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke"}})
+        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke", "dry_run"}})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:

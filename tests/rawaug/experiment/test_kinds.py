@@ -52,7 +52,7 @@ def test_the_commands_of_a_header_can_be_given(name: str) -> None:
         given = parser.instantiate(parser.parse_args(["run", "--recipe", str(find_recipe(name)), *rest])).run
         settings = vars(given)
         settings.pop("recipe")
-        quick = settings.pop("smoke")
+        quick, _ = settings.pop("smoke"), settings.pop("dry_run")
         kind = KINDS[kind_of(find_recipe(name))]
         recipe = kind.settings(**settings)
         assert not quick or kind.smoke(recipe).name.endswith("-smoke")
