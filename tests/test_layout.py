@@ -18,24 +18,14 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {
-    "bayer",
-    "camera_names",
-    "extras",
-    "files",
-    "metrics",
-    "patterns",
-    "printable",
-    "progress",
-    "registry",
-    "seeding",
-    "_version",
-}
+BASE = {"bayer", "camera_names", "devices", "extras", "files", "metrics", "patterns", "printable", "progress"}
+BASE |= {"registry", "seeding", "_version"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
     "bayer": {"seeding"},
     "camera_names": set(),
+    "devices": {"registry"},
     "extras": set(),
     "files": set(),
     "metrics": set(),
@@ -56,6 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "commands": CAMERA | {"plugin", "data", "io", "evaluation", "training"},
     "experiment": CAMERA | {"plugin", "data", "io", "evaluation", "training", "commands"},
     "cli": BASE | {"commands", "experiment"},
+    "__main__": {"cli"},
 }
 
 
