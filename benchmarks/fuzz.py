@@ -8,8 +8,8 @@ bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmar
 kind, number). A worker process reads one after the other, and is restarted when a decoder takes it down. Counted are
 files that were read; that were refused as documented (ValueError or OSError of one line with the file's name); that
 crashed a decoder, by its name, which the package contains (:mod:`rawaug.io.apart`); and what must not be: other
-exceptions and numbers that are not finite, more than 10 s, more than 2 GiB. ``--keep`` keeps all files but those of the
-first two columns. Exit status 1 if there is any of the last three.
+exceptions and numbers that are not finite, more than 10 s of a processor, more than 2 GiB. ``--keep`` keeps all files
+but those of the first two columns. Exit status 1 if there is any of the last three.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,8 @@ from benchmarks.damage import make_originals, mutated
 from benchmarks.mutations import MUTATIONS
 from rawaug.seeding import derived_seed
 
-SECONDS, MEBIBYTES = 10.0, 2048.0
+SECONDS, WAITING_SECONDS, MEBIBYTES = 10.0, 120.0, 2048.0
+"""Of a processor for a file, of a wait for it, and of memory."""
 START_SECONDS = 120.0
 DECODERS = {
     "raw": "LibRaw",
@@ -53,112 +53,6 @@ OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]
 
 
-def readers(kind: str, path: Path) -> list[Callable[[], object]]:
-    """Every reader in the package for this kind of file."""
-    import torch
-
-    import denoisers
-    from rawaug import DictionaryISP
-    from rawaug.commands.info import describe
-    from rawaug.data.mat import read_value
-    from rawaug.data.rawir import read_packed
-    from rawaug.data.sidd.frames import colour_of, mosaic_of
-    from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
-    from rawaug.plugin.params import load_params
-
-    def frame_of() -> RawFrame:
-        frame = read_raw(path)
-        numbers = [*frame.white_balance, *frame.daylight, *(frame.noise_profile or ()), frame.white, *frame.black]
-        for tensor in (frame.mosaic, frame.color_matrix, frame.shading_gains, torch.tensor(numbers)):
-            if not tensor.isfinite().all():
-                raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
-        return frame
-
-    def isp_of(path: Path) -> None:
-        raw = DictionaryISP.from_pretrained(path).reverse(torch.linspace(0, 1, 192).reshape(1, 3, 8, 8)).raw
-        if not raw.isfinite().all():
-            raise ArithmeticError("not finite: RAW of this ISP")
-
-    def rewritten() -> None:
-        frame = frame_of()
-        write_dng(path.with_name(f"{path.stem}.out.dng"), frame, source=path)
-
-    if kind == "raw":
-        return [frame_of]
-    if kind == "dng":
-        return [lambda: read_raw_and_develop(path), rewritten]
-    if kind in ("jpeg", "picture"):
-        return [lambda: read_picture(path)]
-    if kind == "recipe":
-        return [lambda: _set_up(path)]
-    if kind == "npy":
-        return [lambda: read_packed(path, path.with_suffix(".png"), None)]
-    if kind != "safetensors":
-        values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
-        return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
-    load = {"isp": isp_of, "denoiser": denoisers.load, "params": load_params}
-    kept = path.stem.split("-")[0]
-    return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
-
-
-def _set_up(path: Path) -> None:
-    """A recipe as the command line sets it up, its networks without their memory."""
-    import torch
-    from jsonargparse import ArgumentError
-
-    from rawaug.cli import _parser
-    from rawaug.experiment.kinds import KINDS, kind_of
-    from rawaug.experiment.recipe import Recipe
-    from rawaug.training.start import first_network
-
-    try:
-        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path), ["run"])[0]
-        settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
-        if isinstance(recipe, Recipe):
-            with torch.device("meta"):
-                for arm in recipe.arms:
-                    first_network(recipe.network_of(arm), seed=0)
-    except (ArgumentError, ValueError) as error:  # the command line has named the file already
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-
-
-def attempt(kind: str, path: Path) -> tuple[str, str]:
-    """``read``, ``refused`` or ``fault``, and why."""
-    outcome = "read", ""
-    for read in readers(kind, path):
-        try:
-            read()
-        except (ValueError, OSError) as error:
-            text = str(error)
-            if "\n" in text or path.stem not in text:
-                return "fault", f"{type(error).__name__} without name, or of many lines: {text!r}"
-            outcome = "refused", text
-        except Exception as error:
-            import traceback
-
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            return "fault", f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
-    return outcome
-
-
-def work() -> None:
-    """Read what standard input names, and answer each with a line of JSON; the first answer says that all is there."""
-    import faulthandler
-    import warnings
-
-    faulthandler.enable()
-    warnings.simplefilter("ignore")
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what decoders print must not come between the answers
-    attempt("dng", Path("none"))
-    print("[]", file=answers, flush=True)
-    for line in sys.stdin:
-        kind, name = json.loads(line)
-        outcome, why = attempt(kind, Path(name))
-        print(json.dumps([outcome, why]), file=answers, flush=True)
-
-
 class Worker:
     """A process that reads files, restarted after a crash or a fault."""
 
@@ -173,9 +67,11 @@ class Worker:
         _forget_peak(process.pid)
         process.stdin.write(json.dumps([kind, str(path)]) + "\n")
         process.stdin.flush()
-        end = time.monotonic() + SECONDS
+        end, busy = time.monotonic() + WAITING_SECONDS, _processor_seconds(process.pid) + SECONDS
         answered = False
-        while not answered and time.monotonic() < end and _peak_mebibytes(process.pid) < MEBIBYTES:
+        while not answered and time.monotonic() < end and _processor_seconds(process.pid) < busy:
+            if _peak_mebibytes(process.pid) >= MEBIBYTES:
+                break
             answered = bool(select.select([process.stdout], [], [], 0.05)[0])
         line = process.stdout.readline() if answered else ""
         peak = _peak_mebibytes(process.pid)
@@ -186,13 +82,13 @@ class Worker:
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
-            return "hung", f"more than {SECONDS:g} s"
+            return "hung", f"more than {SECONDS:g} s of a processor, or {WAITING_SECONDS:g} s in all"
         name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
     def _start(self) -> subprocess.Popen[str]:
         with self.log.open("w") as log:
-            command, pipe = [sys.executable, "-m", "benchmarks.fuzz", "--worker"], subprocess.PIPE
+            command, pipe = [sys.executable, "-m", "benchmarks.attempts"], subprocess.PIPE
             here = os.environ | {"RAWAUG_READ_SECONDS": "0"}  # this worker is what a decoder may take down
             process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=here)
         assert process.stdout is not None
@@ -222,6 +118,15 @@ def _ends(process: subprocess.Popen[str]) -> bool:
     except subprocess.TimeoutExpired:
         return False
     return True
+
+
+def _processor_seconds(process: int) -> float:
+    """What a process has used of the processors, which other programs on the machine do not lengthen; 0 if unknown."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _forget_peak(process: int) -> None:
@@ -322,11 +227,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="100 files")
     parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.worker:
-        work()
-        return 0
     start = time.perf_counter()
     results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
     print_table(results)

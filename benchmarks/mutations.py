@@ -1,7 +1,7 @@
 """Damage that knows the structure of a file: what a reader believes is changed, and the rest is left whole.
 
-A mutation takes the bytes of a whole file and a generator, and gives the bytes of a hostile one: directories in a circle,
-sizes and counts beyond reason, types exchanged, parts twice or missing, checksums that are right all the same.
+A mutation takes the bytes of a whole file and a generator, and gives the bytes of a hostile one: directories in a
+circle, sizes and counts beyond reason, types exchanged, parts twice or missing, checksums that are right all the same.
 """
 
 from __future__ import annotations

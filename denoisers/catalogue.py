@@ -19,7 +19,8 @@ def build(name: str, **config: Any) -> Denoiser:
     """A new network of the class ``name``, with ``config`` as its constructor's arguments.
 
     Raises:
-        ValueError: if the name or a key is unknown, or a value is of the wrong type or out of range, or it has too many weights.
+        ValueError: if the name or a key is unknown, a value is of the wrong type or out of range, or the network has
+            more than :data:`MOST_WEIGHTS`.
 
     Example:
         >>> build("DnCNN", width=8, depth=3).config["depth"]

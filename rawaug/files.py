@@ -12,7 +12,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -78,7 +78,7 @@ def _lock(descriptor: int, partial: Path) -> bool:
     """Whether the file is ours now; not if another process has it, or had it and has put it in its place since."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(descriptor), os.stat(partial))
+        return os.path.samestat(os.fstat(descriptor), partial.stat())
     except (BlockingIOError, FileNotFoundError):
         return False
 
@@ -166,16 +166,23 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
         partial.write_bytes(len(ordered).to_bytes(8, "little") + ordered + content[end:])
 
 
-def read_tensors(path: str | Path, advice: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+def read_tensors(
+    path: str | Path, advice: str, infinite: Collection[str] = ()
+) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Header and tensors of a safetensors file, on the CPU.
 
+    Args:
+        path: the file.
+        advice: ends the messages.
+        infinite: names of tensors in which infinity has a meaning.
+
     Raises:
-        ValueError: if it cannot be read, or a value is not finite, ending in ``advice``.
+        ValueError: if it cannot be read, or a value is not finite; ending in ``advice``.
     """
     header, tensors = _opened(path, advice, tensors=True)
     for name, tensor in tensors.items():
         values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own
-        if not values.isfinite().all():
+        if not (values.isfinite().all() or (name in infinite and not values.isnan().any())):
             raise ValueError(f"{path}: tensor {name} has values that are not finite; {advice}")
     return header, tensors
 

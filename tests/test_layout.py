@@ -18,8 +18,20 @@ FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for fi
 OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pairs", "params")}
 """Re-exports for one release: the only files whose name may stand twice."""
 
-BASE = {"bayer", "camera_names", "devices", "extras", "files", "metrics", "patterns", "printable", "progress"}
-BASE |= {"registry", "seeding", "_version"}
+BASE = {
+    "bayer",
+    "camera_names",
+    "devices",
+    "extras",
+    "files",
+    "metrics",
+    "patterns",
+    "printable",
+    "progress",
+    "registry",
+    "seeding",
+    "_version",
+}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),

@@ -75,8 +75,8 @@ def run(
 
     if json:
         require_writable(json)
-    given = (self_ensemble, noise, seed, classical or (), device, report, written)
-    result = evaluate(weights, data, *given, **vars(settings))
+    more = {"first": written, **vars(settings)}
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **more)
     written(result)
     if report:
         print(f"page: {report}")

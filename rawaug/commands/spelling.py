@@ -41,6 +41,17 @@ def require_known_options(command: str, parser: Any, arguments: Sequence[str]) -
             )
 
 
+def given_keys(arguments: Sequence[str]) -> set[str]:
+    """The keys that are set on a command line.
+
+    Example:
+        >>> sorted(given_keys(["run", "fewshot", "--data.pairs", "mine", "--train.learning-rate=1e-4"]))
+        ['data.pairs', 'train.learning_rate']
+    """
+    options = (argument.partition("=")[0] for argument in arguments if argument.startswith("--"))
+    return {option.removeprefix("--").replace("-", "_") for option in options}
+
+
 def require_known_keys(file: object, content: Any, parser: Any) -> None:
     """Refuse a key of a recipe that the parser does not have.
 

@@ -33,8 +33,8 @@ class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
     Files are decoded apart (:mod:`rawaug.io.apart`): one that crashes its decoder, or hangs, is skipped like any other
-    damaged one. After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
-    a warning; :attr:`skipped` and :meth:`report` list them at any time.
+    damaged one. After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far
+    are logged as a warning; :attr:`skipped` and :meth:`report` list them at any time.
 
     Args:
         path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.

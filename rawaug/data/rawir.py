@@ -12,7 +12,6 @@ The P20's pictures are cropped and zoomed against their RAW: they are not regist
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,7 @@ WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 
 _DAMAGE = (ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError)
 """What NumPy raises for headers that say anything."""
+_MAGIC = b"\x93NUMPY"
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
 
@@ -106,13 +106,13 @@ def _array(file: Path) -> np.ndarray:
         OSError: if it is damaged.
     """
     try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (*_DAMAGE, zipfile.BadZipFile) as error:
+        with file.open("rb") as opened:
+            if opened.read(len(_MAGIC)) != _MAGIC:  # NumPy would open an archive of arrays, or a pickle
+                raise ValueError("does not begin as one")
+        return np.load(file, mmap_mode="r", allow_pickle=False)
+    except _DAMAGE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise OSError(f"{file}: cannot be read as an array ({reason}); copy it again") from error
-    if not isinstance(array, np.ndarray):
-        raise OSError(f"{file}: is an archive of arrays, not an array; copy it again")
-    return array
 
 
 def picture_beside(file: Path) -> Path:

@@ -81,7 +81,8 @@ def run(
             ``pairs`` alone a part of them is held out for validation.
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
-    return _Run(recipe, overwrite, {key: frames for key, frames in given.items() if frames is not None}).all_stages()
+    given_frames = {key: frames for key, frames in given.items() if frames is not None}
+    return _Run(recipe, overwrite, given_frames).all_stages()
 
 
 def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
@@ -297,6 +298,8 @@ def _leads() -> bool:
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
+
+
 
 
 def _discard_other_checkpoint(place: Path, key: str) -> None:

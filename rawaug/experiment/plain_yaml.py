@@ -1,7 +1,7 @@
 """YAML of strangers: how large and how deeply nested a recipe may be, its aliases written out.
 
-A few lines of anchors and aliases stand for billions of values (the "billion laughs"). Reading them takes no time, since
-equal values are one object; whatever visits each of them never ends. Here they are counted before anything is built.
+A few lines of anchors and aliases stand for billions of values (the "billion laughs"). Reading them takes no time,
+since equal values are one object; whatever visits each of them never ends. Here they are counted first.
 Source: YAML 1.2.2, chapter 7.1; https://en.wikipedia.org/wiki/Billion_laughs_attack.
 """
 

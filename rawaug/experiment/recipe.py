@@ -12,7 +12,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
@@ -96,7 +96,10 @@ class ArmConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
             raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
-        name, settings = name_and_settings(self.estimator)
+        try:
+            name, settings = name_and_settings(self.estimator)
+        except ValueError as error:
+            raise ValueError(f"estimator: {error}") from None
         for key in ("alpha", "correct", "gamma"):
             if (old := getattr(self, key)) is not None:
                 settings[key] = old
@@ -159,8 +162,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        if self.seeds < 1:
-            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
+        require_between("seed", self.seed, -(2**63), 2**62)
+        require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
         if self.data.pairs is None and self.camera is None:

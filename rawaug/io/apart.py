@@ -1,9 +1,9 @@
 """Reading apart: decoders run in a helper process, so that a crash or a hang of theirs ends one file.
 
-LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers wrote. :func:`apart` calls a reader in a
-helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
-``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets a
-new helper. Each thread of each DataLoader worker has its own.
+LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers wrote. :func:`apart` calls a reader in
+a helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
+``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets
+a new helper. Each thread of each DataLoader worker has its own.
 
 Helpers are forked from one clean process (:mod:`rawaug.io.reading_process`), which imports the libraries once: to
 start one takes milliseconds, and no thread of a decoder has to survive a fork. Needs Unix sockets; elsewhere, files are
@@ -25,6 +25,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -151,10 +152,8 @@ class _Helper:
 
     def kill(self) -> None:
         """End the process, whatever it does."""
-        try:
+        with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass  # it is gone
         self.close()
 
     def close(self) -> None:

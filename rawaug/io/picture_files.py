@@ -188,10 +188,9 @@ def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
     """Refuse what would fill the memory before anything is decoded."""
     pixels = spec.width * spec.height * spec.depth
     if pixels > max_pixels or pixels * spec.nchannels > MAX_CHANNELS * max_pixels:
-        size = f"{spec.height} x {spec.width} pixels of {spec.nchannels} channels"
-        raise ValueError(
-            f"{path}: declares {size}, above the limit of {max_pixels} pixels; split it, or raise max_pixels"
-        )
+        size = f"{spec.height} x {spec.width} pixels"
+        size += f" of {spec.nchannels} channels" if pixels <= max_pixels else ""
+        raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
 
 
 def _require_srgb(spec: Any, path: Path) -> None:

@@ -17,6 +17,8 @@ from rawaug.files import parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp.config import ISPConfig
 
 _ADVICE = "fit or copy it again"
+_INFINITE = ("colour.spread",)
+"""A width, which is infinite where the light says nothing of the colour."""
 _OLD_NAMES = {
     "shading.": "stages.shading.mask.",
     **{
@@ -46,7 +48,7 @@ def read_isp(path: Path) -> tuple[ISPConfig, dict[str, Any], dict[str, Tensor]]:
     Raises:
         ValueError: if the file is not that of an ISP, or its header is damaged.
     """
-    header, state = read_tensors(path, _ADVICE)
+    header, state = read_tensors(path, _ADVICE, _INFINITE)
     if header.get("kind") != "isp":
         raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
     try:

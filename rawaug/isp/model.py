@@ -351,5 +351,8 @@ class DictionaryISP(ReverseISP):
         if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
             raise misfit(path, wrong[0])
         isp.load_state_dict(state)
+        for name, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
+            if not atoms.isfinite().all():
+                raise damaged(path, ValueError(f"its {name} atoms are not finite"))
         isp.info = info
         return isp.eval()

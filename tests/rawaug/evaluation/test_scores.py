@@ -8,15 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import denoisers
 from rawaug.bayer import CFA
+from rawaug.cli import main
 from rawaug.commands.evaluate import evaluate
 from rawaug.data import demo_pairs
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import (
+    Score,
     classical_method,
     compared,
     denoise,
@@ -25,9 +28,11 @@ from rawaug.evaluation.scores import (
     installed_classical,
     require_classical,
     score_method,
+    summary,
 )
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import write_json
+from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -151,3 +156,45 @@ def test_a_filter_whose_library_is_missing_is_refused_and_bm3d_left_out_of_recip
     monkeypatch.setitem(sys.modules, "skimage", None)
     with pytest.raises(ValueError, match=r"classical: NonLocalMeans: skimage is not installed; run: pip install"):
         installed_classical(["NonLocalMeans"])
+@pytest.fixture
+def crops(tmp_path: Path) -> Path:
+    """Two pairs of RAWIR, which have no noise of their own."""
+    folder = tmp_path / "crops"
+    folder.mkdir()
+    packed = np.random.default_rng(0).integers(0, 1024, (2, 16, 16, 4)).astype(np.uint16)
+    for k in range(2):
+        np.save(folder / f"{k}.npy", packed[k])
+        write_picture(folder / f"{k}.jpg", torch.full((3, 32, 32), 90, dtype=torch.uint8))
+    return folder
+
+
+def test_a_score_that_is_no_number_is_named_and_left_out_of_the_mean(
+    identity: Path, crops: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scores = [Score("a", 30.0, 0.5), Score("b", float("inf"), 0.7), Score("c", 20.0, float("nan"))]
+    result = summary(scores)
+    assert result["psnr"] == 25.0 and result["ssim"] == pytest.approx(0.6)
+    assert [set(image) for image in result["images"]] == [{"name", "psnr", "ssim"}, {"name", "ssim"}, {"name", "psnr"}]
+    assert result["no_numbers"] == ["b: psnr is inf", "c: ssim is nan"]
+    assert "no_numbers" not in summary(scores[:1])
+    figures = crops / "scores.json"
+    arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--noise", "[0, 0]", "--json", str(figures)]
+    assert main(arguments) == 2  # nothing to denoise: the frames are equal
+    printed = capsys.readouterr()
+    assert "PSNR_d" in printed.out and "0: psnr is inf" in printed.err and len(printed.err.strip().splitlines()) == 1
+    written = json.loads(figures.read_text())
+    assert "psnr" not in written and written["ssim"] == pytest.approx(1.0)
+
+
+def test_frames_that_cannot_be_read_are_named_and_the_rest_is_scored(
+    identity: Path, crops: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (crops / "1.npy").write_bytes(b"PK\x03\x04 no archive")
+    figures, page = crops / "scores.json", crops / "page.html"
+    arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--json", str(figures)]
+    assert main([*arguments, "--report", str(page)]) == 2
+    assert "1.npy: cannot be read as an array" in capsys.readouterr().err
+    result = json.loads(figures.read_text())
+    assert [image["name"] for image in result["images"]] == ["0"] and len(result["broken"]) == 1 and page.is_file()
+    (crops / "0.npy").write_bytes(b"")
+    assert main(arguments) == 2 and "none of the 2 frames can be read" in capsys.readouterr().err
