@@ -12,7 +12,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
