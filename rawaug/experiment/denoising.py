@@ -88,6 +88,10 @@ def run(
 def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
 
+    Args:
+        recipe: what would be run.
+        overwrite: it would replace a run of this name with other settings.
+
     Raises:
         OSError, ValueError: for the first thing found wrong.
     """
