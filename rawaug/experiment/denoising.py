@@ -43,8 +43,9 @@ from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.rehearsal import rehearse
 from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.extras import extra
-from rawaug.files import find_weights, fingerprint, sha256, write_json
+from rawaug.files import find_weights, fingerprint, replacing, sha256, write_json
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import one_at_a_time
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
@@ -131,6 +132,7 @@ class _Run:
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
         require_usable(self.recipe, self.pairs, self.validation)
 
+    @one_at_a_time(lambda self: self.folder if _leads() else None)
     def all_stages(self) -> Results:
         recipe = self.recipe
         self.read()
@@ -307,4 +309,5 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
     if not stamp.is_file() or stamp.read_text() != key:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
-    stamp.write_text(key)
+        with replacing(stamp) as partial:  # a kill must not leave half a key: the checkpoint would be discarded
+            partial.write_text(key)
