@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import denoisers
 from denoisers.network import Denoiser
@@ -16,6 +16,7 @@ from rawaug.data.pair import Pair
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
+    Run,
     Score,
     classical_method,
     installed_classical,
@@ -23,7 +24,7 @@ from rawaug.evaluation.scores import (
     network_method,
     row_of,
     score_classical,
-    score_denoiser,
+    score_method,
     summary,
 )
 from rawaug.evaluation.tables import print_scores
@@ -31,7 +32,7 @@ from rawaug.files import find_weights, read_header, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS, Spec
+from rawaug.registry import COMMANDS, ESTIMATORS, Spec
 
 
 @COMMANDS.register("evaluate")
@@ -40,6 +41,7 @@ def run(
     *,
     data: str,
     self_ensemble: bool = False,
+    views: Literal[4, 8] | None = None,
     noise: tuple[float, float] | str | dict[str, Any] | None = None,
     seed: int = 0,
     classical: list[str | dict[str, Any]] | None = None,
@@ -53,6 +55,7 @@ def run(
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
         data: folder of RAW files, one file, or kind:path.
         self_ensemble: also score the average over eight views (denoisers).
+        views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
         seed: of that noise.
@@ -61,7 +64,7 @@ def run(
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
     """
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report)
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views)
     print_scores(result)
     if json:
         write_json(result, json)
@@ -78,6 +81,7 @@ def evaluate(
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+    views: Literal[4, 8] | None = None,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
@@ -91,6 +95,7 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+        views: of the self-ensemble, 4 or 8; given alone it asks for one.
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
@@ -101,9 +106,9 @@ def evaluate(
     kind = read_header(weights)["kind"]
     pairs = open_pairs(data, split="test")
     if kind == "isp":
-        if self_ensemble or noise is not None or classical or report is not None:
+        if self_ensemble or views or noise is not None or classical or report is not None:
             raise ValueError(
-                f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
+                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report apply to denoisers only"
             )
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
@@ -112,12 +117,14 @@ def evaluate(
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(device)
-        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+        ensemble = views or (8 if self_ensemble else 1)
+        result = _denoiser_result(model, pairs, levels, cfa, seed, ensemble, classical, at_test)
         if report is not None:
-            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
+            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
-            methods["denoised"] = network_method(model, cfa)
+            methods["denoised"] = network_method(model, cfa, at_test=at_test)
             for pair in shown_on_page(pairs):
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
@@ -130,15 +137,20 @@ def _denoiser_result(
     noise: NoiseModel,
     cfa: CFA,
     seed: int,
-    self_ensemble: bool,
+    views: int,
     classical: Sequence[Spec],
+    at_test: Callable[[Run], Run],
 ) -> dict[str, Any]:
     """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
-    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
-    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
-    if self_ensemble:
-        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
-        result |= {"plain": plain, **summary([score for score, *_ in scored])}
+    result: dict[str, Any] = {"self_ensemble": views > 1, "seed": seed}
+
+    def scored(count: int, label: str) -> dict[str, Any]:
+        method = network_method(model, cfa, views=count, at_test=at_test)
+        return summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, label)])
+
+    plain = scored(1, "evaluate")
+    if views > 1:
+        result |= {"views": views, "plain": plain, **scored(views, f"evaluate, {views} views")}
     else:
         result |= plain
     if classical:

@@ -23,6 +23,7 @@ from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
+from rawaug.data.select import selected
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -81,7 +82,7 @@ class _Run:
         _require_unseen(self.test, {"pairs": source, "validation": self.validation})
         pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
         self.pictures = Remembered(pictures, self.data.memory_mb) if self.data.memory_mb else pictures
-        self.pairs = list(source[: self.data.count])
+        self.pairs = selected(source, self.data.count, self.data.select)
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
 
@@ -149,6 +150,7 @@ class _Run:
             return model
         levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info |= {} if recipe.arms[arm].sees_clean else {"estimator": recipe.arms[arm].estimator}
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
         denoisers.save(model, path, info)
@@ -169,19 +171,24 @@ class _Run:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
         digest = sha256(place / "denoiser.safetensors")
-        key = fingerprint(digest, self.data.test, stamps(self.test))
+        settings = [] if self.recipe.views == 8 else [self.recipe.views]
+        key = fingerprint(digest, self.data.test, stamps(self.test), *settings)
         path = place / "evaluation.json"
         if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
             print(f"already evaluated: {path}")
             return {kind: known[kind] for kind in ("plain", "self_ensemble")}
         result: dict[str, Any] = {}
-        model.to(_device(self.recipe.device))
-        for kind in ("plain", "self_ensemble"):
-            method = network_method(model, isp.cfa, self.pattern(arm, isp), kind == "self_ensemble")
+        for kind, views in (("plain", 1), ("self_ensemble", self.recipe.views)):
+            method = self.method(arm, model, isp, views)
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
         write_json({"key": key, **result}, path)
         return result
+
+    def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
+        """The denoiser of an arm as it is tested."""
+        at_test = estimator_of(self.recipe.arms[arm]).at_test
+        return network_method(model.to(_device(self.recipe.device)), isp.cfa, self.pattern(arm, isp), views, at_test)
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
@@ -210,7 +217,7 @@ class _Run:
         hidden = [label_of(spec) for spec in self.classical[1:]]
         methods = {name: method for name, method in others.items() if name not in hidden}
         for arm, model in models.items():
-            methods[arm] = network_method(model.to(_device(recipe.device)), cfa, self.pattern(arm, isp))
+            methods[arm] = self.method(arm, model, isp)
         for pair in shown_on_page(self.test):
             row = row_of(methods, pair, noise, cfa, seed=0)
             page.add_frame(row, cfa)

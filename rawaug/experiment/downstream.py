@@ -81,8 +81,9 @@ def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConf
     net = train(
         stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
     )
-    frames = [_centre(pair, config.test_crop) for spec in config.test for pair in open_pairs(spec, split="test")]
-    scores = [score.psnr for score, *_ in score_denoiser(net, frames, noise, cfa, 0, False, "PSNR_d")]
+    test = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
+    frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in test]
+    scores = [score.psnr for score, *_ in score_denoiser(net, frames, noise, cfa, 0, 1, "PSNR_d")]
     return sum(scores) / len(scores)
 
 
@@ -132,14 +133,3 @@ class MadeCrops:
         params = self.noise.sample(1, generator)
         noisy = self.noise.apply(clean, params)
         return Sample(noisy[0], clean[0], self.noise.variance(noisy, params)[0])
-
-
-def _centre(pair: Pair, side: int | None) -> Pair:
-    """The piece at the centre of a frame, its pattern kept."""
-    height, width = pair.raw.shape[-2:]
-    if side is None or min(height, width) <= side:
-        return pair
-    top, left = (height - side) // 4 * 2, (width - side) // 4 * 2
-    window = (..., slice(top, top + side), slice(left, left + side))
-    noisy = None if pair.noisy is None else pair.noisy[window].contiguous()
-    return replace(pair, srgb=pair.srgb[window].contiguous(), raw=pair.raw[window].contiguous(), noisy=noisy)

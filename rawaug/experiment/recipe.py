@@ -19,6 +19,8 @@ class DataConfig:
     Args:
         pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null for none.
         count: number of pairs to use; null for all.
+        select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
+            folders.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
         memory_mb: size in megabytes of the cache of decoded pictures.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; null validates on RAW
@@ -30,6 +32,7 @@ class DataConfig:
 
     pairs: str | None = "demo:train"
     count: int | None = None
+    select: str | list[str] = "first"
     pictures: str = "demo:"
     memory_mb: int = 0
     validation: str | None = "demo:validation"
@@ -103,6 +106,7 @@ class Recipe:
         arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
+        views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
         untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
@@ -121,6 +125,7 @@ class Recipe:
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str | dict[str, Any]] = field(default_factory=list)
+    views: Literal[4, 8] = 8
     untouched: list[str] = field(default_factory=list)
     steps: int | None = None
     seed: int = 0

@@ -49,6 +49,7 @@ class FramePair(Protocol):
     def camera(self) -> str: ...
     @property
     def registered(self) -> bool: ...
+    def require_rendered(self) -> None: ...
 
 
 class Shot(NamedTuple):
@@ -105,7 +106,8 @@ def sample_pixels(
         noisy: take the captured noisy RAW (and never the clean one).
 
     Raises:
-        ValueError: if there is no pair, or a noisy RAW is asked for and absent.
+        ValueError: if there is no pair, one has no picture in the camera's colours, or a noisy RAW is asked for and
+            absent.
     """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
@@ -115,6 +117,7 @@ def sample_pixels(
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
+    pair.require_rendered()
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
