@@ -42,15 +42,17 @@ class _Frame(NamedTuple):
     """What the blocks of a frame have in common.
 
     Args:
+        levels: of the noise.
+        levels_from_clean: whether they were measured against the clean blocks.
         colour: from METADATA; None where there is none.
-        levels: from the dataset's table; None where they are to be measured against the clean blocks.
         srgb, noisy_srgb: pictures ``(32, 3, H, W)``, as the mosaics lie; None where there are none.
     """
 
     cfa: CFA
     camera: str
+    levels: tuple[float, float]
+    levels_from_clean: bool
     colour: Colour | None = None
-    levels: tuple[float, float] | None = None
     srgb: Tensor | None = None
     noisy_srgb: Tensor | None = None
 
@@ -93,14 +95,16 @@ class SiddBlocks(LazyPairs):
         scene, block = divmod(index, BLOCKS)
         clean, noisy = (blocks[scene] for blocks in self._all())
         if self._frame is None or self._frame[0] != scene:
-            self._frame = scene, self._frame_of(scene, clean)
+            self._frame = scene, self._frame_of(scene, clean, noisy)
         return _pair(self.names[index], block, clean, noisy, self._frame[1])
 
-    def _frame_of(self, scene: int, clean: Tensor) -> _Frame:
+    def _frame_of(self, scene: int, clean: Tensor, noisy: Tensor) -> _Frame:
         shot = self.scenes[scene]
+        known = self._levels.get(shot.name)
+        levels = known or captured_noise(clean.numpy(), noisy.numpy())
         what = f"{self.path}: {shot.name}"
         pictures = {key: turned_like(every[scene], clean, shot.cfa, what) for key, every in self._pictures.items()}
-        return _Frame(shot.cfa, shot.camera, self._colours.get(shot.name), self._levels.get(shot.name), **pictures)
+        return _Frame(shot.cfa, shot.camera, levels, known is None, self._colours.get(shot.name), **pictures)
 
     def _all(self) -> tuple[Tensor, Tensor]:
         if self._blocks is None:
@@ -137,6 +141,7 @@ class SiddPlusBlocks(LazyPairs):
             self.cfas = [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
         self._blocks: tuple[Tensor, Tensor] | None = None
         self._pictures: dict[str, Tensor] = {}
+        self._frame: tuple[int, _Frame] | None = None
         super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
 
     def read(self, index: int) -> Pair:
@@ -153,9 +158,12 @@ class SiddPlusBlocks(LazyPairs):
         number, block = divmod(index, BLOCKS)
         part = slice(number * BLOCKS, (number + 1) * BLOCKS)
         clean, noisy = (blocks[part] for blocks in self._blocks)
-        what, cfa = f"{self.path}: frame {number}", self.cfas[number]
-        pictures = {key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()}
-        return _pair(self.names[index], block, clean, noisy, _Frame(cfa, "SIDD+", **pictures))
+        if self._frame is None or self._frame[0] != number:
+            what, cfa = f"{self.path}: frame {number}", self.cfas[number]
+            pictures = {key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()}
+            levels = captured_noise(clean.numpy(), noisy.numpy())
+            self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
+        return _pair(self.names[index], block, clean, noisy, self._frame[1])
 
 
 class SiddBenchmark(Sequence[NoisyBlock]):
@@ -256,7 +264,6 @@ def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:
 def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) -> Pair:
     """Block ``block`` of a frame's mosaics ``(32, 1, H, W)``."""
     colour = frame.colour or _NO_COLOUR
-    shot_var, read_var = frame.levels or captured_noise(clean.numpy(), noisy.numpy())
     if frame.srgb is not None:
         srgb = frame.srgb[block]
     else:
@@ -269,10 +276,10 @@ def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) ->
         white_balance=colour.white_balance,
         color_matrix=colour.matrix,
         noisy=noisy[block],
-        shot_var=shot_var,
-        read_var=read_var,
+        shot_var=frame.levels[0],
+        read_var=frame.levels[1],
         camera=frame.camera,
         rendered=frame.srgb is not None or frame.colour is not None,
         noisy_srgb=None if frame.noisy_srgb is None else frame.noisy_srgb[block],
-        levels_from_clean=frame.levels is None,
+        levels_from_clean=frame.levels_from_clean,
     )
