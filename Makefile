@@ -4,9 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-BENCHMARKS := augment folder fuzz loader networks noise synth
+# pip evaluates environment markers for the Python that runs it, whatever --python-version says; uv does not.
+COMPILE := MACOSX_DEPLOYMENT_TARGET=14.0 $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary :all:
+PYTHONS := 3.10 3.11 3.12 3.13
+PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  # CUDA, CPU, CPU
+WHEEL := build/resolve/requirements.in
+LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
 
-.PHONY: demo test lint docs bench clean
+BENCHMARKS := augment denoise folder fuzz loader networks noise shards synth
+
+.PHONY: demo test lint docs bench dist lock resolve clean
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without augmentation
 	$(BIN)/rawaug run recipes/fewshot.yaml
@@ -19,14 +26,30 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: $(VENV)/.docs
-	$(BIN)/mkdocs build --strict
+docs: $(VENV)/.docs  ## the site, in site/; a broken link or reference stops it
+	$(BIN)/zensical build --strict --clean
 
 bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name --quick || exit 1; done
 
+dist: | $(BIN)/python  ## the wheel and the source archive of a release
+	$(BIN)/pip install --quiet --disable-pip-version-check build
+	$(BIN)/python -m build
+
+lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
+	$(COMPILE) --universal --python-version 3.10 --fork-strategy requires-python --output-file constraints.txt $<
+	sed -i.old -E '/^(rawaug|nvidia-|cuda-)/d; 1i $(LOCKED)' constraints.txt && rm constraints.txt.old
+
+resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on the index and not installed
+	for python in $(PYTHONS); do for platform in $(PLATFORMS); do \
+	  $(COMPILE) --constraint constraints.txt --python-version $$python --python-platform $$platform $< \
+	    --output-file build/resolve/$$python-$$platform.txt || exit 1; \
+	  echo "Python $$python, $$platform: $$(grep -c == build/resolve/$$python-$$platform.txt) packages," \
+	    $$(grep -E '^(torch|triton|rawpy|numpy)==' build/resolve/$$python-$$platform.txt); \
+	done; done
+
 clean:
-	rm -rf $(VENV) runs build site *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) runs build dist site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -42,3 +65,11 @@ $(VENV)/.test: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.docs: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable .[docs]
 	touch $(VENV)/.demo $@
+
+$(VENV)/.uv: | $(BIN)/python
+	$(BIN)/pip install --quiet --disable-pip-version-check uv
+	touch $@
+
+$(WHEEL): setup.cfg $(VENV)/.uv
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/resolve .
+	echo "rawaug[test,docs,export] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@

@@ -1,12 +1,16 @@
 """What the augmentation costs: million sRGB pixels a second, against other ways to the same RAW, and peak memory.
 
-    python benchmarks/augment.py [--quick] [--json FILE] [--threads N]
+    python benchmarks/augment.py [--device cpu|cuda] [--quick] [--profile] [--json FILE] [--threads N]
 
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
 with its own noise. *cycleisp* is its network from sRGB to RAW alone, and *unbaked* the ISP's own reverse pass, each on
 one small crop whose time is scaled by pixels, in the network's favour. *copy* turns bytes into as many floats as are
-made of them, and does no more. All are timed in turn, and the fastest run of each counts.
+made of them, and does no more; *kornia* flips and rotates float pictures, as users of a GPU do anyway; *drawn before*
+is rawaug without the draw of its parameters. All are timed in turn, and the fastest run of each counts.
+
+The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
+as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
 """
 
 from __future__ import annotations
@@ -33,6 +37,10 @@ from rawaug.isp.baselines.upi import UPI, unprocess_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 
+COUNTED = 3 + 4 + 4
+"""Bytes a pixel that any augmentation must move: uint8 in, noisy and clean RAW out in float32."""
+MOVED = (3 + 4) + (4 + 4 + 4)
+"""Bytes a pixel that rawaug moves: pictures to clean RAW, then clean RAW to noisy RAW and variance."""
 NETWORK_CROP = 64
 UNBAKED_CROP = 256
 
@@ -56,54 +64,84 @@ def published_upi(picture: Tensor, generator: torch.Generator) -> tuple[Tensor, 
     """One float picture ``(1, 3, H, W)`` as in the published code: unprocess, clip, mosaic, variance, noise."""
     params = UPI().sample(1, generator)
     clean = bayer.pack_rgb(unprocess_pixels(picture, params).clamp(0.0, 1.0), "RGGB")
-    log_shot = torch.empty(()).uniform_(-9.21, -4.42, generator=generator)  # ln 1e-4 to ln 0.012
-    log_read = 2.18 * log_shot + 1.2 + torch.empty(()).normal_(std=0.26, generator=generator)
+    scalar = picture.new_empty(())
+    log_shot = scalar.uniform_(-9.21, -4.42, generator=generator)  # ln 1e-4 to ln 0.012
+    log_read = 2.18 * log_shot + 1.2 + torch.empty_like(scalar).normal_(std=0.26, generator=generator)
     variance = clean * log_shot.exp() + log_read.exp()
     noisy = clean + torch.empty_like(clean).normal_(generator=generator) * variance.sqrt()
     return clean, noisy, variance
 
 
-def augmentations() -> dict[str, RawAugment]:
+def augmentations(device: torch.device) -> dict[str, RawAugment]:
     """The shipped ISP, its constants first, then with encoders that look at every picture."""
     looking = DictionaryISP.from_pretrained("universal")
     looking.use_encoders(True)
     return {
-        "rawaug": RawAugment.from_pretrained("universal"),
-        "rawaug, encoders": RawAugment.from_pretrained(looking, sampling="chosen"),
+        "rawaug": RawAugment.from_pretrained("universal").to(device),
+        "rawaug, encoders": RawAugment.from_pretrained(looking, sampling="chosen").to(device),
     }
+
+
+def geometry() -> torch.nn.Module:
+    """kornia's flips and affine transform, drawn for each picture."""
+    from kornia.augmentation import RandomAffine, RandomHorizontalFlip, RandomVerticalFlip
+
+    affine = RandomAffine(degrees=15.0, translate=(0.1, 0.1), scale=(0.8, 1.2), p=1.0)
+    return torch.nn.Sequential(RandomHorizontalFlip(p=0.5), RandomVerticalFlip(p=0.5), affine)
 
 
 def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
     """What is timed, and the pixels that one run makes."""
-    generator = torch.Generator().manual_seed(0)
+    device = batch.device
+    generator = torch.Generator(device).manual_seed(0)
     pixels, small = batch[:, 0].numel(), batch[:1, :, :UNBAKED_CROP, :UNBAKED_CROP]
-    isp, network, noise = (
-        DictionaryISP.from_pretrained("universal"),
-        CycleISP().rgb2raw,
-        augmentations()["rawaug"].noise,
-    )
-    floats = [picture[None] / 255.0 for picture in batch]
-    crop = floats[0][..., :NETWORK_CROP, :NETWORK_CROP].contiguous()
+    isp, network, turned = DictionaryISP.from_pretrained("universal").to(device), CycleISP().rgb2raw, geometry()
+    network, ours = network.to(device), augmentations(device)
+    augment, floats = ours["rawaug"], batch / 255.0
+    drawn = augment.sample(batch)
+    crop = floats[:1, :, :NETWORK_CROP, :NETWORK_CROP].contiguous()
 
     def unbaked() -> object:
         clean = bayer.pack(isp.reverse(small).raw.clamp(max=1.0), isp.cfa)
-        return noise.apply_with_variance(clean, noise.sample(1, generator))
+        return augment.noise.apply_with_variance(clean, augment.noise.sample(1, torch.Generator().manual_seed(0)))
 
     runs: dict[str, tuple[Callable[[], object], int]] = {
         name: (lambda augment=augment: augment(batch), pixels)  # type: ignore[misc]
-        for name, augment in augmentations().items()
+        for name, augment in ours.items()
     }
     return runs | {
+        "rawaug, drawn before": (lambda: augment.apply(batch, drawn), pixels),
         "copy": (lambda: batch.float(), pixels),
-        "upi": (lambda: [published_upi(picture, generator) for picture in floats], pixels),
+        "kornia": (lambda: turned(floats), pixels),
+        "upi": (lambda: [published_upi(picture[None], generator) for picture in floats], pixels),
         "unbaked": (unbaked, small[:, 0].numel()),
-        "cycleisp": (lambda: network(crop), NETWORK_CROP**2),
+        "cycleisp": (lambda: network(crop), crop[:, 0].numel()),
     }
+
+
+def bandwidth(device: torch.device, megabytes: int, repeats: int) -> float:
+    """GB/s of a copy from memory to memory, bytes read plus bytes written."""
+    source = torch.ones(megabytes * 2**18, device=device)
+    target = torch.empty_like(source)
+    best = float("inf")
+    for _ in range(repeats):
+        best = min(best, seconds(lambda: target.copy_(source), device))
+    return 2 * source.numel() * 4 / best / 1e9
+
+
+def seconds(run: Callable[[], object], device: torch.device) -> float:
+    """Of one run, until the device has finished."""
+    wait = torch.cuda.synchronize if device.type == "cuda" else (lambda: None)
+    wait()
+    start = time.perf_counter()
+    run()
+    wait()
+    return time.perf_counter() - start
 
 
 @torch.no_grad()
-def measure(batch: Tensor, repeats: int) -> dict[str, dict[str, float]]:
-    """Mpix/s of each method, and how many times as fast as it ``rawaug`` is, without and with encoders."""
+def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, float]]:
+    """Mpix/s of each method, rawaug's speed as a multiple of it, and rawaug's share of the bandwidth ``gb_s``."""
     runs = methods(batch)
     best = dict.fromkeys(runs, float("inf"))
     for round_ in range(repeats):
@@ -111,89 +149,126 @@ def measure(batch: Tensor, repeats: int) -> dict[str, dict[str, float]]:
             if name in ("cycleisp", "unbaked") and round_ >= 3:
                 continue
             time.sleep(0.02)  # PyTorch's threads spin on for a while after the method before
-            start = time.perf_counter()
-            run()
-            best[name] = min(best[name], time.perf_counter() - start)
+            best[name] = min(best[name], seconds(run, batch.device))
     speed = {name: pixels / best[name] / 1e6 for name, (_, pixels) in runs.items()}
     ours = {"ratio": "rawaug", "ratio, encoders": "rawaug, encoders"}
-    return {
+    rows = {
         name: {"mpix_s": value} | {key: speed[own] / value for key, own in ours.items()}
         for name, value in speed.items()
     }
+    for name in [name for name in rows if name.startswith("rawaug")]:
+        rows[name] |= {what: speed[name] * size / 1e3 / gb_s for what, size in (("counted", COUNTED), ("moved", MOVED))}
+    return rows
 
 
-def child(task: str, threads: int, **environment: str) -> float:
+def profile(batch: Tensor) -> str:
+    """Where the time of ten augmentations goes, by PyTorch's profiler."""
+    augment = augmentations(batch.device)["rawaug"]
+    augment(batch)
+    with torch.profiler.profile() as seen:
+        for _ in range(10):
+            augment(batch)
+    order = "self_device_time_total" if batch.is_cuda else "self_cpu_time_total"
+    return seen.key_averages().table(sort_by=order, row_limit=15, max_name_column_width=50)
+
+
+def child(task: str, args: argparse.Namespace, **environment: str) -> float:
     """Run this file's ``task`` in a process of its own; the number that it prints."""
-    command = [sys.executable, __file__, "--task", task, "--threads", str(threads)]
+    command = [sys.executable, __file__, "--task", task, "--threads", str(args.threads), "--device", str(args.device)]
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | environment)
     return float(done.stdout)
 
 
-def peak_memory() -> float:
+def peak_memory(device: torch.device, height: int = 3000, width: int = 4000) -> float:
     """Peak memory that a batch of four 12-Mpix pictures adds, over the size of input plus output."""
-    augment = RawAugment.from_pretrained("universal")
-    augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    batch = torch.zeros(4, 3, 3000, 4000, dtype=torch.uint8).random_(0, 256, generator=torch.Generator())
+    augment = RawAugment.from_pretrained("universal").to(device)
+    augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8, device=device))
+    before = memory_used(device)
+    batch = torch.zeros(4, 3, height, width, dtype=torch.uint8)
+    batch = batch.random_(0, 256, generator=torch.Generator()).to(device)
     pair = augment(batch)
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     size = sum(t.numel() * t.element_size() for t in (batch, pair.noisy, pair.clean, pair.variance))
-    return (after - before) * 1024 / size
+    return (memory_used(device) - before) / size
 
 
-def first_call() -> float:
+def memory_used(device: torch.device) -> int:
+    """Bytes at the peak: of tensors on a GPU, of the whole process on a CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def first_call(device: torch.device) -> float:
     """Seconds of a process's first augmentation."""
-    augment = RawAugment.from_pretrained("universal")
-    start = time.perf_counter()
-    augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8))
-    return time.perf_counter() - start
+    augment = RawAugment.from_pretrained("universal").to(device)
+    return seconds(lambda: augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8, device=device)), device)
 
 
-def machine(threads: int) -> dict[str, object]:
+def machine(device: torch.device, threads: int) -> dict[str, object]:
+    """What the figures were measured on."""
     info = Path("/proc/cpuinfo")
-    names = (
-        [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        if info.exists()
-        else []
-    )
-    cpu = names[0] if names else platform.processor() or platform.machine()
-    return {
-        "cpu": cpu,
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    known: dict[str, object] = {
+        "cpu": names[0] if names else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": threads,
         "torch": torch.__version__,
         "python": platform.python_version(),
     }
+    if device.type == "cuda":
+        query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+        driver = subprocess.run(query, check=True, capture_output=True, text=True).stdout.split()
+        known |= {"gpu": torch.cuda.get_device_name(device), "cuda": torch.version.cuda, "driver": driver[0]}
+    return known
 
 
-def main() -> None:
+def show(title: str, rows: dict[str, dict[str, float]]) -> None:
+    """A table of :func:`measure`."""
+    print(
+        f"{title}: Mpix/s; rawaug as a multiple, without and with encoders; its bytes, counted and moved, of a copy's"
+    )
+    for name, row in rows.items():
+        line = f"  {name:22}{row['mpix_s']:10.3g}{row['ratio']:10.3g}{row['ratio, encoders']:10.3g}"
+        print(line + (f"{row['counted']:10.2f}{row['moved']:10.2f}" if "moved" in row else ""))
+
+
+def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix instead of 12")
+    parser.add_argument("--profile", action="store_true", help="also print where the time of small batches goes")
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, help="runs of each method")
     parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
-    args = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    args = arguments().parse_args()
     torch.set_num_threads(args.threads)
     if args.task:
-        print(peak_memory() if args.task == "memory" else first_call())
+        print(peak_memory(args.device) if args.task == "memory" else first_call(args.device))
         return
-    results: dict[str, object] = {"machine": machine(args.threads)}
-    print("  ".join(f"{key} {value}" for key, value in machine(args.threads).items()))
+    results: dict[str, object] = {"machine": machine(args.device, args.threads)}
+    print("  ".join(f"{key} {value}" for key, value in machine(args.device, args.threads).items()))
     # First, for a process inherits the peak of the one that starts it.
-    results["peak memory"] = {"of input and output": child("memory", args.threads)}
+    results["peak memory"] = {"of input and output": child("memory", args)}
     with tempfile.TemporaryDirectory() as folder:
-        seconds = [child("first", args.threads, NUMBA_CACHE_DIR=folder) for _ in range(2)]
-    results["first call"] = {"seconds": seconds[0], "seconds, compiled before": seconds[1]}
-    for title in ("peak memory", "first call"):
+        first = [child("first", args, NUMBA_CACHE_DIR=folder, TRITON_CACHE_DIR=folder) for _ in range(2)]
+    results["first call"] = {"seconds": first[0], "seconds, compiled before": first[1]}
+    copied = bandwidth(args.device, 64 if args.quick else 1024, 5)
+    results["bandwidth"] = {"copy, GB/s": copied}
+    for title in ("peak memory", "first call", "bandwidth"):
         print(title, results[title])
     sides = (1500, 2000) if args.quick else (3000, 4000)
     for shape, repeats in (((16, 256, 256), 5 if args.quick else 40), ((4, *sides), 2 if args.quick else 5)):
-        title = "x".join(map(str, shape))
-        results[title] = rows = measure(pictures(*shape), args.repeats or repeats)
-        print(f"{title}: Mpix/s, and rawaug's speed as a multiple, without and with encoders")
-        for name, row in rows.items():
-            print(f"  {name:18}{row['mpix_s']:10.3g}{row['ratio']:10.3g}{row['ratio, encoders']:10.3g}")
+        title, batch = "x".join(map(str, shape)), pictures(*shape).to(args.device)
+        results[title] = rows = measure(batch, args.repeats or repeats, copied)
+        show(title, rows)
+        if args.profile and len(batch) == 16:
+            print(profile(batch))
     if args.json:
         args.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

@@ -26,6 +26,8 @@ def make_originals(folder: Path) -> dict[str, list[Path]]:
         "mat5": _make_mat5(folder),
         "mat73": _make_mat73(folder),
         "safetensors": _make_safetensors(folder),
+        "npy": _make_npy(folder),
+        "recipe": _make_recipes(folder),
     }
 
 
@@ -137,6 +139,22 @@ def _make_safetensors(folder: Path) -> list[Path]:
     params = RawAugment(isp, noise=(1e-3, 1e-5)).sample(torch.zeros(3, 8, 8), torch.Generator().manual_seed(0))
     save_params(params, folder / "params.safetensors")
     return sorted(folder.glob("*.safetensors"))
+
+
+def _make_npy(folder: Path) -> list[Path]:
+    from PIL import Image
+
+    np.save(folder / "packed.npy", _numbers(0, (6, 8, 4)).astype(np.uint16))
+    Image.fromarray(_numbers(0, (12, 16, 3))).save(folder / "packed.png")
+    return [folder / "packed.npy"]
+
+
+def _make_recipes(folder: Path) -> list[Path]:
+    """Those that travel with the package, without what would be read when they are set up."""
+    shipped = Path(__file__).parents[1] / "recipes"
+    for name in ("fewshot", "unsupervised", "reconstruction", "denoisers"):
+        (folder / f"{name}.yaml").write_bytes((shipped / f"{name}.yaml").read_bytes())
+    return sorted(folder.glob("*.yaml"))
 
 
 def _numbers(seed: int, shape: tuple[int, ...]) -> np.ndarray:

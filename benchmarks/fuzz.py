@@ -1,14 +1,15 @@
 """How the readers handle damaged files: each must be read, or refused in one line that names it.
 
-    python -m benchmarks.fuzz [--count 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
+    python -m benchmarks.fuzz [--cases 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
-repository, has them. Each mutation flips bits, cuts the file short, overwrites a number in its header, exchanges or
-repeats pieces, keyed by (seed, kind, number). A worker process reads one after the other, and is restarted when a
-decoder takes it down. Counted are files that were read; that were refused as documented (ValueError or OSError of one
-line with the file's name); that crashed a decoder, by its name; and what must not be: other exceptions, more than 10 s,
-more than 2 GiB. ``--keep`` keeps all files but those of the first two columns. Exit status 1 if there is any of the
-last three.
+repository, has them. Half of the mutations know the structure of the file (benchmarks/mutations.py); the others flip
+bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmarks/damage.py); all are keyed by (seed,
+kind, number). A worker process reads one after the other, and is restarted when a decoder takes it down. Counted are
+files that were read; that were refused as documented (ValueError or OSError of one line with the file's name); that
+crashed a decoder, by its name, which the package contains (:mod:`rawaug.io.apart`); and what must not be: other
+exceptions and numbers that are not finite, more than 10 s of a processor, more than 2 GiB. ``--keep`` keeps all files
+but those of the first two columns. Exit status 1 if there is any of the last three.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.damage import make_originals, mutated
+from benchmarks.mutations import MUTATIONS
 from rawaug.seeding import derived_seed
 
-SECONDS, MEBIBYTES = 10.0, 2048.0
+SECONDS, WAITING_SECONDS, MEBIBYTES = 10.0, 120.0, 2048.0
+"""Of a processor for a file, of a wait for it, and of memory."""
 START_SECONDS = 120.0
 DECODERS = {
     "raw": "LibRaw",
@@ -42,6 +44,8 @@ DECODERS = {
     "mat5": "SciPy",
     "mat73": "HDF5",
     "safetensors": "safetensors",
+    "npy": "NumPy",
+    "recipe": "PyYAML",
 }
 """What reads each kind for us."""
 
@@ -49,85 +53,11 @@ OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]
 
 
-def readers(kind: str, path: Path) -> list[Callable[[], object]]:
-    """Every reader in the package for this kind of file."""
-    import torch
-
-    import denoisers
-    from rawaug import DictionaryISP
-    from rawaug.commands.info import describe
-    from rawaug.data.mat import read_value
-    from rawaug.data.sidd.frames import colour_of, mosaic_of
-    from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
-    from rawaug.plugin.params import load_params
-
-    def frame_of() -> RawFrame:
-        frame = read_raw(path)
-        numbers = [*frame.white_balance, *frame.daylight, *(frame.noise_profile or ()), frame.white, *frame.black]
-        for tensor in (frame.mosaic, frame.color_matrix, frame.shading_gains, torch.tensor(numbers)):
-            if not tensor.isfinite().all():
-                raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
-        return frame
-
-    def rewritten() -> None:
-        frame = frame_of()
-        write_dng(path.with_name(f"{path.stem}.out.dng"), frame, source=path)
-
-    if kind == "raw":
-        return [frame_of]
-    if kind == "dng":
-        return [lambda: read_raw_and_develop(path), rewritten]
-    if kind in ("jpeg", "picture"):
-        return [lambda: read_picture(path)]
-    if kind != "safetensors":
-        values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
-        return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
-    load = {"isp": DictionaryISP.from_pretrained, "denoiser": denoisers.load, "params": load_params}
-    kept = path.stem.split("-")[0]
-    return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
-
-
-def attempt(kind: str, path: Path) -> tuple[str, str]:
-    """``read``, ``refused`` or ``fault``, and why."""
-    outcome = "read", ""
-    for read in readers(kind, path):
-        try:
-            read()
-        except (ValueError, OSError) as error:
-            text = str(error)
-            if "\n" in text or path.stem not in text:
-                return "fault", f"{type(error).__name__} without name, or of many lines: {text!r}"
-            outcome = "refused", text
-        except Exception as error:
-            import traceback
-
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            return "fault", f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
-    return outcome
-
-
-def work() -> None:
-    """Read what standard input names, and answer each with a line of JSON; the first answer says that all is there."""
-    import faulthandler
-    import warnings
-
-    faulthandler.enable()
-    warnings.simplefilter("ignore")
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what decoders print must not come between the answers
-    attempt("dng", Path("none"))
-    print("[]", file=answers, flush=True)
-    for line in sys.stdin:
-        kind, name = json.loads(line)
-        outcome, why = attempt(kind, Path(name))
-        print(json.dumps([outcome, why]), file=answers, flush=True)
-
-
 class Worker:
-    """A process that reads files, restarted after a crash or a fault."""
+    """A process that reads files, each in at most ``seconds``, restarted after a crash or a fault."""
 
-    def __init__(self, folder: Path) -> None:
-        self.log = folder / "stderr.txt"
+    def __init__(self, folder: Path, seconds: float = WAITING_SECONDS) -> None:
+        self.log, self.seconds = folder / "stderr.txt", seconds
         self.process: subprocess.Popen[str] | None = None
 
     def read(self, kind: str, path: Path) -> tuple[str, str]:
@@ -137,9 +67,11 @@ class Worker:
         _forget_peak(process.pid)
         process.stdin.write(json.dumps([kind, str(path)]) + "\n")
         process.stdin.flush()
-        end = time.monotonic() + SECONDS
+        end, busy = time.monotonic() + self.seconds, _processor_seconds(process.pid) + SECONDS
         answered = False
-        while not answered and time.monotonic() < end and _peak_mebibytes(process.pid) < MEBIBYTES:
+        while not answered and time.monotonic() < end and _processor_seconds(process.pid) < busy:
+            if _peak_mebibytes(process.pid) >= MEBIBYTES:
+                break
             answered = bool(select.select([process.stdout], [], [], 0.05)[0])
         line = process.stdout.readline() if answered else ""
         peak = _peak_mebibytes(process.pid)
@@ -150,14 +82,15 @@ class Worker:
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
-            return "hung", f"more than {SECONDS:g} s"
+            return "hung", f"more than {SECONDS:g} s of a processor, or {self.seconds:g} s in all"
         name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
     def _start(self) -> subprocess.Popen[str]:
         with self.log.open("w") as log:
-            command, pipe = [sys.executable, "-m", "benchmarks.fuzz", "--worker"], subprocess.PIPE
-            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True)
+            command, pipe = [sys.executable, "-m", "benchmarks.attempts"], subprocess.PIPE
+            here = os.environ | {"RAWAUG_READ_SECONDS": "0"}  # this worker is what a decoder may take down
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=here)
         assert process.stdout is not None
         ready = select.select([process.stdout], [], [], START_SECONDS)[0] and process.stdout.readline()
         if not ready:
@@ -185,6 +118,15 @@ def _ends(process: subprocess.Popen[str]) -> bool:
     except subprocess.TimeoutExpired:
         return False
     return True
+
+
+def _processor_seconds(process: int) -> float:
+    """What a process has used of the processors, which other programs on the machine do not lengthen; 0 if unknown."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _forget_peak(process: int) -> None:
@@ -234,6 +176,8 @@ def _fuzz_kind(
     for original in originals:
         copy = folder / f"{original.stem.split('.')[0]}-whole{original.suffix}"
         copy.write_bytes(original.read_bytes())
+        if kind == "npy":
+            copy.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
         if (result := worker.read(kind, copy))[0] != "read":
             raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
     outcomes, reasons, slowest = Counter[str](), [], 0.0
@@ -241,7 +185,9 @@ def _fuzz_kind(
         rng = np.random.default_rng(derived_seed(seed, kind, number))
         original = originals[number % len(originals)]
         path = folder / f"{original.stem.split('.')[0]}-{number}{original.suffix}"
-        path.write_bytes(mutated(original.read_bytes(), rng))
+        path.write_bytes(_damaged(original, rng))
+        if kind == "npy":
+            path.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
         start = time.perf_counter()
         outcome, why = worker.read(kind, path)
         slowest = max(slowest, time.perf_counter() - start)
@@ -256,6 +202,13 @@ def _fuzz_kind(
     return {"mutated": count, **{o: outcomes[o] for o in OUTCOMES}, "slowest_s": round(slowest, 2), "reasons": reasons}
 
 
+def _damaged(original: Path, rng: np.random.Generator) -> bytes:
+    """The file mutated, in half of the cases as its structure suggests."""
+    whole = original.read_bytes()
+    mutate = next((mutate for end, mutate in MUTATIONS.items() if original.name.endswith(end)), None)
+    return mutated(whole, rng) if mutate is None or rng.random() < 0.5 else mutate(whole, rng)
+
+
 def print_table(results: dict[str, Any]) -> None:
     columns = ("mutated", *OUTCOMES, "slowest_s")
     print("kind         decoder      " + "".join(name.rjust(10) for name in columns))
@@ -266,21 +219,17 @@ def print_table(results: dict[str, Any]) -> None:
             print(f"{kind}: {reason}")
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=5000, help="files of all kinds together")
+    parser.add_argument("--cases", type=int, default=5000, help="files of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=DECODERS, default=list(DECODERS))
     parser.add_argument("--quick", action="store_true", help="100 files")
     parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.worker:
-        work()
-        return 0
+    args = parser.parse_args(arguments)
     start = time.perf_counter()
-    results = fuzz(args.kinds, 100 if args.quick else args.count, args.seed, args.keep)
+    results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
     print_table(results)
     absent = [kind for kind in args.kinds if kind not in results]
     print(

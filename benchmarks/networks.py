@@ -1,13 +1,16 @@
 """What a network costs: parameters, GMAC and seconds a mosaic megapixel, training steps, and PSNR for equal minutes.
 
     python -m benchmarks.networks [--networks UNet PMRID] [--batch 16] [--crop 128] [--quick]
-    python -m benchmarks.networks --device cuda --networks NAFNet --crop 256     (bf16)
+    python -m benchmarks.networks --device cuda --crop 256 --workers 8 --compile default reduce-overhead
     python -m benchmarks.networks --minutes 20 --pictures PHOTOS --validation RAW_DIR     hours: every network trained
 
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
-with it, RawAugment makes it of sRGB first. Each network runs in a process of its own, whose peak memory is reported;
-steps are timed in turn, and the fastest counts. With ``--minutes`` each network, in the form of :data:`SIZES`, is
-trained for the same time on what ``recipes/pretrain.yaml`` describes, and scored on the validation frames.
+with it, RawAugment makes it of sRGB first; with ``--workers``, RawPairs makes it in the workers of a loader. On a GPU
+the networks have the sizes of :data:`GPU_SIZES` and train in bf16. ``--compile`` times the steps once more under
+torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its
+own, whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes``
+each network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes,
+and scored on the validation frames.
 """
 
 from __future__ import annotations
@@ -15,17 +18,21 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import tempfile
+import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
 import denoisers
 import rawaug
+from benchmarks.augment import machine, memory_used
 from benchmarks.loader import fastest
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -36,6 +43,14 @@ SIZES: dict[str, dict[str, Any]] = {
     "NAFNet": {"width": 16, "encoder": [1, 1, 2], "middle": 4, "decoder": [1, 1, 1]},
 }
 """The networks in sizes for a CPU."""
+GPU_SIZES: dict[str, dict[str, Any]] = {
+    "UNet": {"width": 32},
+    "DHDN": {"width": 128},
+    "DnCNN": {"width": 64, "depth": 17},
+    "PMRID": {"variance_map": True},
+    "NAFNet": {},
+}
+"""The networks in their published sizes, the U-Net's included."""
 
 SIDE = 512
 """Packed pixels on the side of the picture that inference is timed on: a mosaic megapixel."""
@@ -61,8 +76,6 @@ def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str
 
 def trained(name: str, args: argparse.Namespace) -> dict[str, float]:
     """PSNR on validation, in RAW and sRGB, after ``args.minutes`` of training; steps are fitted to the time."""
-    import time
-
     from rawaug.data import open_pairs, open_pictures
     from rawaug.evaluation.scores import frozen_sample
     from rawaug.noise import noise_model
@@ -97,55 +110,102 @@ def trained(name: str, args: argparse.Namespace) -> dict[str, float]:
     return {"minutes": seconds / 60, "steps": steps, "psnr": scores["psnr"], "psnr_srgb": scores["psnr_srgb"]}
 
 
+Step = Callable[[rawaug.RawPair], None]
+
+
+def step_of(network: Any, optimizer: torch.optim.Optimizer, device: torch.device) -> Step:
+    """Forward, backward and Adam, in bf16 on a GPU."""
+
+    def step(pair: rawaug.RawPair) -> None:
+        optimizer.zero_grad()
+        with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+            loss = torch.nn.functional.l1_loss(network(pair.noisy, pair.variance), pair.clean)
+        loss.backward()
+        optimizer.step()
+
+    return step
+
+
+def in_workers(step: Step, srgb: Tensor, args: argparse.Namespace) -> float:
+    """Seconds a step in the middle of a pass whose pairs are made in workers and copied to the device."""
+    first, timed = 1 + 2 * args.workers, 4 * args.repeats
+    pairs = rawaug.RawPairs(list(srgb.cpu()) * (first + timed), "universal", crop=args.crop)
+    pinned = args.device.type == "cuda"
+    loader = DataLoader(pairs, args.batch, num_workers=args.workers, pin_memory=pinned)
+    start = 0.0
+    for number, pair in enumerate(loader):
+        if number == first:  # the workers have started, and what they had fetched ahead is used up
+            start = clock(args.device)
+        step(pair.map(lambda tensor: tensor.to(args.device, non_blocking=True)))
+    return (clock(args.device) - start) / timed
+
+
+def clock(device: torch.device) -> float:
+    """Seconds, once the device has finished."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def training(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str, float]:
+    """Images a second without and with augmentation, under every mode of ``args.compile`` too, and peak memory."""
+    augment = rawaug.RawAugment.from_pretrained("universal").to(args.device)
+    shape = (args.batch, 3, args.crop, args.crop)
+    srgb = torch.randint(256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8).to(args.device)
+    ready, optimizer = augment(srgb), torch.optim.Adam(network.parameters())
+    figures = dict[str, float]()
+    for mode in (None, *args.compile):
+        model = network if mode is None else torch.compile(network, mode=mode)
+        step, label = step_of(model, optimizer, args.device), "" if mode is None else f", {mode}"
+        step(ready)  # memory is found, kernels are chosen
+        if args.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(args.device)
+        runs = {"ready": lambda step=step: step(ready), "made": lambda step=step: step(augment(srgb))}
+        steps = fastest(runs, args.repeats, args.device)
+        figures |= {
+            f"images/s{label}": args.batch / steps["ready"],
+            f"images/s, augmented{label}": args.batch / steps["made"],
+            f"share of augmentation{label}": 1 - steps["ready"] / steps["made"],
+            f"peak MiB{label}": memory_used(args.device) / 2**20,
+        }
+    if args.workers:
+        step = step_of(network, optimizer, args.device)
+        figures["images/s, in workers"] = args.batch / in_workers(step, srgb, args)
+    return figures
+
+
+def ensemble(network: denoisers.Denoiser, args: argparse.Namespace) -> float:
+    """The time of eight views over that of one."""
+    noisy = torch.rand(1, 4, args.crop // 2, args.crop // 2, device=args.device)
+    one = {"noisy": noisy, "variance": 1e-3 * noisy + 1e-5}
+    views = denoisers.SelfEnsemble(network, "RGGB", views=8)
+    with torch.no_grad():
+        views(**one)
+        seconds = fastest({"one": lambda: network(**one), "eight": lambda: views(**one)}, 3 * args.repeats, args.device)
+    return seconds["eight"] / seconds["one"]
+
+
 def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
     """Of one network."""
     torch.set_num_threads(args.threads)
     if args.minutes:
         return trained(name, args)
-    network = denoisers.build(name, **SIZES[name] | ({"width": args.width} if args.width else {}))
+    sizes = GPU_SIZES if args.device.type == "cuda" else SIZES
+    network = denoisers.build(name, **sizes[name] | ({"width": args.width} if args.width else {}))
     network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     costs = inference(network.eval(), args)
-    network.train()
-    optimizer = torch.optim.Adam(network.parameters())
-    augment = rawaug.RawAugment.from_pretrained("universal").to(args.device)
-    shape = (args.batch, 3, args.crop, args.crop)
-    srgb = torch.randint(256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8).to(args.device)
-    ready = augment(srgb)
-
-    def step(pair: rawaug.RawPair) -> None:
-        optimizer.zero_grad()
-        with torch.autocast(args.device.type, torch.bfloat16, enabled=args.device.type == "cuda"):
-            loss = torch.nn.functional.l1_loss(network(pair.noisy, pair.variance), pair.clean)
-        loss.backward()
-        optimizer.step()
-
-    step(ready)  # memory is found, kernels are chosen
-    steps = fastest({"ready": lambda: step(ready), "made": lambda: step(augment(srgb))}, args.repeats, args.device)
-    one = {"noisy": ready.noisy[:1], "variance": ready.variance[:1]}
-    views = denoisers.SelfEnsemble(network.eval(), augment.isp.cfa, views=8)
-    with torch.no_grad():
-        runs = {"one": lambda: network(**one), "eight": lambda: views(**one)}
-        views(**one)
-        ensemble = fastest(runs, 3 * args.repeats, args.device)
-    if args.device.type == "cuda":
-        peak = torch.cuda.max_memory_allocated(args.device) / 2**20
-    else:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {
-        "parameters": sum(p.numel() for p in network.parameters()),
-        **costs,
-        "images/s": args.batch / steps["ready"],
-        "images/s, augmented": args.batch / steps["made"],
-        "share of augmentation": 1 - steps["ready"] / steps["made"],
-        "peak MiB": peak,
-        "8 views / 1": ensemble["eight"] / ensemble["one"],
-    }
+    steps = training(network.train(), args)
+    parameters = sum(p.numel() for p in network.parameters())
+    return {"parameters": parameters, **costs, **steps, "8 views / 1": ensemble(network.eval(), args)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--networks", nargs="+", choices=list(SIZES), default=list(SIZES))
-    parser.add_argument("--width", type=int, help="features, in place of those for a CPU")
+    parser.add_argument("--width", type=int, help="features, in place of the table's")
+    parser.add_argument("--workers", type=int, default=0, help="also make the pairs in so many workers")
+    modes = ("default", "reduce-overhead", "max-autotune")
+    parser.add_argument("--compile", nargs="*", choices=modes, default=[], help="also train under torch.compile")
     parser.add_argument("--minutes", type=float, default=0.0, help="train each for so long, and score it")
     parser.add_argument("--pictures", default="demo:", help="sRGB pictures of --minutes")
     parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
@@ -159,9 +219,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick:
         args.batch, args.repeats = 4, 1
-    shape = f"{args.batch} x {args.crop} x {args.crop}"
-    print(f"batches of {shape} ({args.device}, {args.threads} threads, torch {torch.__version__})")
-    figures = {}
+    figures: dict[str, Any] = {"machine": machine(args.device, args.threads)}
+    described = "  ".join(f"{key} {value}" for key, value in figures["machine"].items())
+    print(f"batches of {args.batch} x {args.crop} x {args.crop} ({described})")
     for name in args.networks:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as own:
             figures[name] = own.submit(measure, name, args).result()

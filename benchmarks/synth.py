@@ -25,6 +25,9 @@ from typing import Any
 import torch
 
 from rawaug.commands import synth
+from rawaug.commands.pair_files import picture_tasks
+from rawaug.commands.pair_maker import Settings
+from rawaug.commands.pair_shards import shard_tasks
 from rawaug.data import demo_pictures
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture, write_picture
@@ -54,6 +57,13 @@ def seconds(work: Callable[[Any], object], tasks: list[Any], warm: list[Any], se
         return time.perf_counter() - begin
 
 
+def planned(form: str, pictures: list[Path], folder: Path, out: Path) -> list[Any]:
+    """The tasks of a run; a shard has eight pictures, so that there are enough for all processes."""
+    if form == "webdataset":
+        return list(shard_tasks(pictures, folder, out, per_image=1, per_shard=8))
+    return list(picture_tasks(pictures, folder, out, per_image=1))
+
+
 def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dict[str, Any]:
     """Mpix/s of decoding and of each format, and each format's time over that of decoding."""
     pictures = synth._pictures(folder, Path(os.devnull))
@@ -62,10 +72,9 @@ def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dic
     for name in [*best] * repeats:
         with tempfile.TemporaryDirectory() as out:
             form: Any = "npz" if name == "decode" else name
-            settings = synth._Settings(form, "universal", weights, "cycleisp_sidd", "convex", 0)
-            tasks, warm = (list(synth._tasks(pictures, folder, Path(out) / part, 1)) for part in ("timed", "warm"))
-            warm = warm[: 4 * workers]
-            work: tuple[Any, Any, Any] = (synth._make, tasks, warm)
+            settings = Settings(form, "universal", weights, "cycleisp_sidd", "convex", 0)
+            tasks, warm = (planned(form, pictures, folder, Path(out) / part) for part in ("timed", "warm"))
+            work: tuple[Any, Any, Any] = (synth._make, tasks, warm[: 4 * workers])
             if name == "decode":
                 work = (decode, pictures, pictures[: 4 * workers])
             best[name] = min(best[name], seconds(*work, settings, workers))
@@ -77,7 +86,7 @@ def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dic
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", type=Path, nargs="?", help="folder of pictures; by default the built-in ones")
-    parser.add_argument("--formats", nargs="+", choices=("dng", "npz", "tiff"), default=["npz", "dng"])
+    parser.add_argument("--formats", nargs="+", choices=("dng", "npz", "tiff", "webdataset"), default=["npz", "dng"])
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--quick", action="store_true", help="one repeat, the built-in pictures once")

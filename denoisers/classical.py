@@ -52,9 +52,13 @@ class Classical(ABC):
         name, least = type(self).__name__, self.smallest
         if noisy.ndim != 4 or noisy.shape[1] != 4 or min(noisy.shape[-2:]) < least:
             raise ValueError(f"{name} takes packed RAW (B, 4, h >= {least}, w >= {least}), got {tuple(noisy.shape)}")
+        if not noisy.is_floating_point():
+            raise ValueError(f"{name} takes floating-point RAW, got {noisy.dtype}")
         if variance is None:
             raise ValueError(f"{name} needs the noise variance: pass it as the second argument")
-        sigmas = variance.expand_as(noisy).mean((1, 2, 3)).sqrt().tolist()
+        if not len(noisy):
+            return noisy.clone()
+        sigmas = variance.expand_as(noisy).float().mean((1, 2, 3)).sqrt().tolist()
         return torch.stack([self._one(image, sigma) for image, sigma in zip(noisy, sigmas, strict=True)])
 
     def _one(self, image: Tensor, sigma: float) -> Tensor:

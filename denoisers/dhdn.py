@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import PACKED, Denoiser, conv, require_width
+from denoisers.network import PACKED, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS
 
 LEVELS = 4
@@ -77,6 +77,7 @@ class DHDN(Denoiser):
         seed: int = 0,
     ) -> None:
         require_width(width, multiple=2)
+        require_bounded(seed)
         super().__init__(channels, variance_map, deviation, 2 ** (LEVELS - 1), {"width": width}, domain)
         sizes = [width * 2**k for k in range(LEVELS)]
         self.first = _pointwise(self.inputs, width)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, Denoiser, conv, require_width
+from denoisers.network import PACKED, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS
 
 
@@ -57,6 +57,7 @@ class DnCNN(Denoiser):
         require_width(width)
         if depth < 2:
             raise ValueError(f"depth must be at least 2, got {depth}")
+        require_bounded(seed, depth=depth)
         config = {"width": width, "depth": depth, "batch_norm": batch_norm}
         super().__init__(channels, variance_map, deviation, 1, config, domain)
         middle = [layer for _ in range(depth - 2) for layer in _layer(width, batch_norm)]

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
-from rawaug.registry import DENOISERS
+from denoisers.network import MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
+from rawaug.registry import DENOISERS, require_between
 
 
 class ChannelNorm(nn.Module):
@@ -97,6 +97,8 @@ class NAFNet(Denoiser):
         require_width(width)
         if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
             raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
+        require_between("scales", len(encoder), 1, MOST_SCALES)
+        require_bounded(seed, middle=middle, encoder=max(encoder), decoder=max(decoder))
         config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
         super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
         sizes = [width * 2**k for k in range(len(encoder) + 1)]

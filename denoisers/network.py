@@ -20,9 +20,13 @@ import torch
 from torch import Tensor, nn
 
 from denoisers.domains import DOMAINS, levels_of, relative_deviation
+from rawaug.registry import require_between
 
 PACKED = 4
 """Channels of packed RAW: R, Gr, Gb, B."""
+
+MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
+"""Larger networks are refused before they are built: a few bytes of a file or a recipe can ask for any size."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""
@@ -61,9 +65,17 @@ def pad_to_multiple(image: Tensor, stride: int) -> Tensor:
 
 
 def require_width(width: int, multiple: int = 1) -> None:
-    """Refuse a number of features that no layer can have."""
+    """Refuse a number of features that no layer can have, or that no machine could hold."""
     if width < 1 or width % multiple:
         raise ValueError(f"width must be a positive multiple of {multiple}, got {width}")
+    require_between("width", width, 1, MOST_FEATURES)
+
+
+def require_bounded(seed: int, **layers: int) -> None:
+    """Refuse what would never be built: more than :data:`MOST_LAYERS` of what is counted, or no seed of PyTorch's."""
+    require_between("seed", seed, -(2**63), 2**63 - 1)
+    for key, number in layers.items():
+        require_between(key, number, 0, MOST_LAYERS)
 
 
 class Denoiser(nn.Module, ABC):
@@ -97,6 +109,7 @@ class Denoiser(nn.Module, ABC):
         super().__init__()
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
+        require_between("channels", channels, 1, MOST_FEATURES)
         self.domain = domain
         self.channels = channels
         self.variance_map = variance_map
@@ -128,11 +141,13 @@ class Denoiser(nn.Module, ABC):
                 does not read it.
 
         Raises:
-            ValueError: if a shape is wrong, or the network was made with a noise map and ``variance`` is missing.
+            ValueError: if a shape or a type is wrong, or the network was made with a noise map and ``variance`` is
+                missing.
         """
         name = type(self).__name__
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
+        self._require_type(noisy, "noisy")
         if not self.reads_variance:
             return noisy + self._correction(noisy)
         if variance is None:
@@ -140,6 +155,7 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
+        self._require_type(variance, "variance")
         if self.domain == "linear":
             return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
@@ -148,11 +164,23 @@ class Denoiser(nn.Module, ABC):
         correction = self._correction(signal, noise_map)
         correction = correction if noise_map is None else noise_map * correction
         denoised = domain.inverse(signal + correction, *levels)
-        return torch.where(variance > 0, denoised, noisy)
+        return torch.where(variance > 0, denoised, noisy).to(noisy.dtype)
 
     def _correction(self, signal: Tensor, noise_map: Tensor | None = None) -> Tensor:
         features = signal if noise_map is None else torch.cat([signal, noise_map], dim=1)
-        return self.residual(pad_to_multiple(features, self.stride))[..., : signal.shape[-2], : signal.shape[-1]]
+        correction = self.residual(pad_to_multiple(features.to(self._dtype), self.stride))
+        return correction[..., : signal.shape[-2], : signal.shape[-1]]
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return next((p.dtype for p in self.parameters()), torch.get_default_dtype())
+
+    def _require_type(self, image: Tensor, what: str) -> None:
+        """Weights and RAW are of one type, but for mixed precision, which converts by itself."""
+        if not image.is_floating_point():
+            raise ValueError(f"{what} must be floating-point RAW with white at 1, got {image.dtype}")
+        if image.dtype != self._dtype and not torch.is_autocast_enabled(image.device.type):
+            raise ValueError(f"{what} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_width
+from denoisers.network import PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS
 
 PUBLISHED_WIDTH = 16
@@ -116,6 +116,7 @@ class PMRID(Denoiser):
         seed: int = 0,
     ) -> None:
         require_width(width)
+        require_bounded(seed)
         super().__init__(channels, variance_map, deviation, 16, {"width": width}, domain)
         sizes = [width, 4 * width, 8 * width, 16 * width, 32 * width]
         self.conv0 = _named(conv(self.inputs, width))

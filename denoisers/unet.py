@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.network import LEAK, PACKED, Denoiser, conv, require_width
-from rawaug.registry import DENOISERS
+from denoisers.network import LEAK, MOST_SCALES, PACKED, Denoiser, conv, require_bounded, require_width
+from rawaug.registry import DENOISERS, require_between
 
 PUBLISHED_WIDTH = 32
 """Features of the first scale in the paper."""
@@ -60,8 +60,8 @@ class UNet(Denoiser):
         seed: int = 0,
     ) -> None:
         require_width(width)
-        if scales < 1:
-            raise ValueError(f"scales must be at least 1, got {scales}")
+        require_between("scales", scales, 1, MOST_SCALES)
+        require_bounded(seed)
         config = {"width": width, "scales": scales}
         super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), config, domain)
         sizes = [width * 2**k for k in range(scales)]

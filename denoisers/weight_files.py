@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from denoisers.catalogue import DENOISERS, build
 from denoisers.network import Denoiser
+from rawaug.files import parse_object, read_tensors, write_tensors
 
 FORMAT, KIND = "rawaug", "denoiser"
 
@@ -33,8 +33,6 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
         ValueError: if the class is not registered, or ``info`` is not JSON-serialisable.
         FileNotFoundError: if the folder does not exist.
     """
-    from safetensors.torch import save_file
-
     path = Path(path)
     name = DENOISERS.name_of(type(model))
     if name is None:
@@ -43,16 +41,11 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
     try:
-        texts = {"config": json.dumps(model.config), "info": json.dumps(info)}
+        texts = {"config": json.dumps(model.config), "info": json.dumps(info, allow_nan=False)}
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: info must be JSON-serialisable: {error}") from None
-    tensors = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        save_file(tensors, unfinished, metadata={"format": FORMAT, "kind": KIND, "model": name, **texts})
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+        raise ValueError(f"{path}: info must be JSON-serialisable, its numbers finite: {error}") from None
+    tensors = {key: value.detach().cpu() for key, value in model.state_dict().items()}
+    write_tensors(tensors, {"format": FORMAT, "kind": KIND, "model": name, **texts}, path)
 
 
 def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
@@ -73,7 +66,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    metadata, tensors = _read(path)
+    metadata, tensors = read_tensors(path, "train or copy it again")
     if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     config, info = (_parse(path, metadata, key) for key in ("config", "info"))
@@ -95,21 +88,8 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     return model.eval(), info
 
 
-def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            return file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise ValueError(f"{path}: not a safetensors file: {str(error).splitlines()[0]}") from None
-
-
 def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
     try:
-        value = json.loads(metadata.get(key, ""))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: metadata {key!r} is not JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise ValueError(f"{path}: metadata {key!r} must be a JSON object, got {type(value).__name__}")
-    return value
+        return parse_object(metadata.get(key, ""))
+    except ValueError as error:
+        raise ValueError(f"{path}: metadata {key!r}: {error}") from None

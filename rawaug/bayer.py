@@ -85,6 +85,8 @@ class CFA(str, Enum):
 def _require_even(height: int, width: int) -> None:
     if height % 2 or width % 2:
         raise ValueError(f"a Bayer mosaic must have even sides, got {height} x {width}; crop the last row or column")
+    if min(height, width) < 2:
+        raise ValueError(f"a Bayer mosaic must be at least 2 x 2, got {height} x {width}")
 
 
 def _require_channels(image: Tensor, channels: int, what: str) -> None:
@@ -108,6 +110,7 @@ def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
     """Packed planes ``(..., 4, H/2, W/2)`` to the mosaic ``(..., 1, H, W)``; the inverse of :func:`pack`."""
     _require_channels(packed, 4, "packed RAW")
     *lead, _, height, width = packed.shape
+    _require_even(2 * height, 2 * width)
     mosaic = packed.new_empty(*lead, 1, 2 * height, 2 * width)
     for k, (i, j) in enumerate(CFA(cfa).sites):
         mosaic[..., 0, i::2, j::2] = packed[..., k, :, :]

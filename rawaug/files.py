@@ -1,20 +1,29 @@
 """Files: written whole or not at all, hashed, and safetensors whose errors fit one line.
 
 Weights, parameters and states are safetensors (https://huggingface.co/docs/safetensors) with texts in their header;
-``format`` is ``rawaug`` and ``kind`` says what is in the file.
+``format`` is ``rawaug`` and ``kind`` says what is in the file. What others made is data, checked as it is read: numbers
+must be finite, in tensors and in JSON.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+import math
+import os
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The folder of the shipped ISPs."""
@@ -23,6 +32,9 @@ WEIGHTS = Path(__file__).parent / "weights"
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A path beside ``path`` to write to, which takes its place when the block ends without an error.
+
+    The file has the rights that the user's umask gives. It is locked while the block runs: another process that writes
+    the same ``path`` takes another name, and what a killed process left is written over, and so removed.
 
     Example:
         >>> import tempfile
@@ -34,18 +46,84 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
+    with _claimed(path) as partial:
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _claimed(path: Path) -> Iterator[Path]:
+    """An empty file beside ``path`` that no other process writes to."""
+    key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may be as long as a name can be
+    if fcntl is None:
+        yield path.with_name(f".{key}.{os.getpid()}.partial")
+        return
+    for number in count():
+        partial = path.with_name(f".{key}.{number}.partial")
+        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if _lock(descriptor, partial):
+                os.ftruncate(descriptor, 0)
+                yield partial
+                return
+        finally:
+            os.close(descriptor)  # which unlocks
+
+
+def _lock(descriptor: int, partial: Path) -> bool:
+    """Whether the file is ours now; not if another process has it, or had it and has put it in its place since."""
     try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(descriptor), partial.stat())
+    except (BlockingIOError, FileNotFoundError):
+        return False
+
+
+def to_json(value: Any, indent: int | None = None) -> str:
+    """JSON, which has no infinity and no NaN: they become null."""
+    return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    return [_finite(inner) for inner in value] if isinstance(value, (list, tuple)) else value
+
+
+def parse_object(text: str) -> dict[str, Any]:
+    """A JSON object from a file that others may have made.
+
+    Raises:
+        ValueError: in one line, if it is something else, too deeply nested, or has a number that is not finite.
+    """
+
+    def refuse(number: str) -> float:
+        raise ValueError(f"{number} is not a finite number")
+
+    def finite(number: str) -> float:
+        return float(number) if math.isfinite(float(number)) else refuse(number)
+
+    try:
+        value = json.loads(text, parse_constant=refuse, parse_float=finite)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON: {error}") from None
+    except RecursionError:
+        raise ValueError("not JSON that can be read: too deeply nested") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"must be a JSON object, got {type(value).__name__}")
+    return value
 
 
 def write_json(value: Any, path: str | Path) -> None:
     """Write JSON, whole or not at all, making its folder."""
+    text = to_json(value, indent=1)
     with replacing(path) as partial:
-        partial.write_text(json.dumps(value, indent=1) + "\n")
+        partial.write_text(f"{text}\n", encoding="utf-8")
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: str | Path) -> None:
@@ -60,17 +138,25 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
         partial.write_bytes(len(ordered).to_bytes(8, "little") + ordered + content[end:])
 
 
-def read_tensors(path: str | Path, advice: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+def read_tensors(
+    path: str | Path, advice: str, infinite: Collection[str] = ()
+) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Header and tensors of a safetensors file, on the CPU.
 
+    Args:
+        path: the file.
+        advice: ends the messages.
+        infinite: names of tensors in which infinity has a meaning.
+
     Raises:
-        ValueError: if it cannot be read, ending in ``advice``.
+        ValueError: if it cannot be read, or a value is not finite; ending in ``advice``.
     """
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a readable safetensors file ({error}); {advice}") from error
+    header, tensors = _opened(path, advice, tensors=True)
+    for name, tensor in tensors.items():
+        values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own
+        if not (values.isfinite().all() or (name in infinite and not values.isnan().any())):
+            raise ValueError(f"{path}: tensor {name} has values that are not finite; {advice}")
+    return header, tensors
 
 
 def read_header(path: str | Path) -> dict[str, str]:
@@ -79,14 +165,20 @@ def read_header(path: str | Path) -> dict[str, str]:
     Raises:
         ValueError: if it is not a safetensors file written by rawaug.
     """
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            header = dict(file.metadata() or {})
-    except (SafetensorError, OSError) as error:
-        raise ValueError(f"{path}: not a readable safetensors file ({error}); fit or train it again") from error
-    if header.get("format") != "rawaug":
+    header, _ = _opened(path, "fit or train it again", tensors=False)
+    if header.get("format") != "rawaug" or "kind" not in header:
         raise ValueError(f"{path}: not a rawaug file; give one written by rawaug fit or rawaug run")
     return header
+
+
+def _opened(path: str | Path, advice: str, tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            names = file.keys() if tensors else ()
+            return dict(file.metadata() or {}), {name: file.get_tensor(name) for name in names}
+    except (SafetensorError, OSError, ValueError, TypeError, RuntimeError, KeyError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: not a readable safetensors file ({reason}); {advice}") from error
 
 
 def find_weights(name: str | Path, *more: Path) -> Path:

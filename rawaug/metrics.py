@@ -10,6 +10,7 @@ use_sample_covariance=False, data_range=1)``.
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -18,14 +19,25 @@ PATCH = 256
 """Side of the mosaic patches over which an ISP's PSNR_r is averaged."""
 
 
-def _require_same_shape(a: Tensor, b: Tensor) -> None:
+def _compared(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Both in float32, or in float64 where one is: half precision would lose squares below 6e-8, from 72 dB on."""
     if a.shape != b.shape:
         raise ValueError(f"images differ in shape: {tuple(a.shape)} and {tuple(b.shape)}")
+    if not (a.is_floating_point() and b.is_floating_point()):
+        raise ValueError(f"images must be floating point with data range 1, got {a.dtype} and {b.dtype}")
+    if a.ndim < 2 or 0 in a.shape[1:]:
+        raise ValueError(f"images must be a batch (B, ...) of one or more values each, got {tuple(a.shape)}")
+    dtype = torch.float64 if torch.float64 in (a.dtype, b.dtype) else torch.float32
+    return a.to(dtype), b.to(dtype)
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``."""
-    _require_same_shape(a, b)
+    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal.
+
+    Raises:
+        ValueError: if shapes differ, a picture has no values, or they are not floating point.
+    """
+    a, b = _compared(a, b)
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 
 
@@ -34,8 +46,11 @@ def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
 
     Whole patches from the top left; the remainder at the right and the bottom is left out. A side shorter than a patch
     is the patch's side.
+
+    Raises:
+        ValueError: as :func:`psnr`.
     """
-    _require_same_shape(a, b)
+    a, b = _compared(a, b)
     size = (min(patch, a.shape[-2]), min(patch, a.shape[-1]))
     error = F.avg_pool2d((a - b) ** 2, size)
     return (-10.0 * error.log10()).flatten(1).mean(1)
@@ -45,14 +60,14 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     """SSIM of each picture of a batch: ``(B, C, H, W)`` to ``(B,)``.
 
     Raises:
-        ValueError: if a side is shorter than the window.
+        ValueError: as :func:`psnr`, and if a side is shorter than the window.
     """
-    _require_same_shape(a, b)
-    if min(a.shape[-2:]) < WINDOW:
-        raise ValueError(f"SSIM needs sides of at least {WINDOW}, got {a.shape[-2]} x {a.shape[-1]}")
+    a, b = _compared(a, b)
+    if a.ndim != 4 or min(a.shape[-2:]) < WINDOW:
+        raise ValueError(f"SSIM needs (B, C, H, W) with sides of at least {WINDOW}, got {tuple(a.shape)}")
     from kornia.metrics import ssim as ssim_map
 
-    return ssim_map(a, b, WINDOW, max_val=1.0, padding="valid").flatten(1).mean(1)
+    return ssim_map(a, b, WINDOW, max_val=1.0, eps=0.0, padding="valid").flatten(1).mean(1)
 
 
 def worst_and_best_quarter(values: list[float]) -> tuple[float, float]:

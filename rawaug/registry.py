@@ -45,6 +45,8 @@ def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
     """
     if isinstance(spec, str):
         return spec, {}
+    if not isinstance(spec, Mapping):
+        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {spec!r}")
     settings = spec.get("settings") or {}
     if not isinstance(spec.get("name"), str) or not isinstance(settings, Mapping) or spec.keys() - {"name", "settings"}:
         raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {dict(spec)}")
@@ -76,6 +78,28 @@ def checked_settings(
         if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
             raise ValueError(f"{label} needs the setting {key!r}")
     return {key: _of_type(value, parameters[key], f"{label}: {key}") for key, value in settings.items()}
+
+
+def require_between(key: str, value: object, least: float, most: float) -> None:
+    """Refuse a number that nobody means, before anything is built with it.
+
+    Args:
+        key: of the setting, which opens the message.
+        value: a whole number where both bounds are, else any number.
+        least, most: the bounds, both allowed.
+
+    Raises:
+        ValueError: if it is out of bounds, or no such number.
+
+    Example:
+        >>> require_between("width", 10**9, 1, 4096)
+        Traceback (most recent call last):
+        ValueError: width must be a whole number from 1 to 4096, got 1000000000
+    """
+    whole = isinstance(least, int) and isinstance(most, int)
+    kind = (int,) if whole else (int, float)
+    if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
+        raise ValueError(f"{key} must be a {'whole ' * whole}number from {least} to {most}, got {value!r:.100}")
 
 
 def nearest(name: object, known: Iterable[str]) -> str:

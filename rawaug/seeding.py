@@ -43,12 +43,17 @@ def rank_key() -> tuple[int, ...]:
 
 @contextmanager
 def initialised_from(seed: int) -> Iterator[None]:
-    """Layers made inside draw their weights from ``seed``; PyTorch's global state is afterwards what it was.
+    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then what it was.
 
     Example:
         >>> with initialised_from(0):
         ...     layer = torch.nn.Linear(3, 3)
     """
+    default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        yield
+        torch.set_default_dtype(torch.float32)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(default)

@@ -1,4 +1,8 @@
-"""One thread a process, for two processes test at once (``make test``); and where real camera files lie, if any do."""
+"""One thread a process, for two processes test at once (``make test``); which tests need a GPU; and where real camera
+files lie, if any do.
+
+Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,26 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
 import torch
 
 from rawaug import registry
+from rawaug.data.pair import Pair
 
 torch.set_num_threads(1)
+multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests with the mark ``gpu`` are skipped without a CUDA device."""
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="no CUDA device"))
 
 
 @pytest.fixture(scope="session")
@@ -33,3 +49,15 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds
+
+
+@pytest.fixture
+def given(registries: list[registry.Registry]) -> list[Pair]:
+    """What is opened as ``"given:"``, whatever the split: a list to be filled."""
+    pairs: list[Pair] = []
+
+    @registry.DATASETS.register("given")
+    def opened(path: str = "", split: str = "") -> list[Pair]:
+        return pairs
+
+    return pairs

@@ -14,6 +14,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 OPTIONAL = {
     "datasets": "pip install rawaug[test]",
     "pytorch_lightning": "pip install rawaug[test]",
+    "ray": "pip install 'ray[data]'",
     "webdataset": "pip install rawaug[test]",
 }
 """Libraries that some snippets show rawaug with, and what installs them."""

@@ -11,9 +11,11 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -30,13 +32,24 @@ from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.files import sha256
 from rawaug.io import RawFrame, read_raw, write_dng
-from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.io.apart import apart
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import (
+    EldLevels,
+    FixedLevels,
+    MeasuredLevels,
+    camera_law,
+    camera_names,
+    estimate_noise,
+    noise_levels,
+)
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
-Noise = str | Sequence[float]
-"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name (taken at the file's ISO), or two variances."""
+Noise = str | Sequence[float] | MeasuredLevels
+"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
 
 _NO_NOISE = (0.0, 0.0)
 
@@ -56,13 +69,15 @@ def run(
         source: a RAW file, or a folder of them.
         out: output DNG, or output folder.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser.
-        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        noise: auto (NoiseProfile, else estimate), profile, estimate, camera (the law that the denoiser was trained
+            for), an ISP's .safetensors (the law in it), a measured camera's name, or [shot_var, read_var].
         self_ensemble: average eight views, at eight times the cost.
     """
+    law = stored_noise(noise, denoiser)
     if Path(source).is_dir():
-        print_denoised(denoise_folder(source, out, denoiser, noise, self_ensemble))
+        print_denoised(denoise_folder(source, out, denoiser, law, self_ensemble))
     else:
-        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, noise, self_ensemble)]))
+        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, law, self_ensemble)]))
 
 
 @dataclass(frozen=True)
@@ -123,6 +138,8 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     Raises:
         ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
     """
+    if isinstance(noise, MeasuredLevels):
+        return *_of_law(noise, frame), "camera"
     if not isinstance(noise, str):
         fixed = FixedLevels(*noise)
         return fixed.shot_var, fixed.read_var, "given"
@@ -158,6 +175,37 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     return float(shot_var), float(read_var), noise
 
 
+def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
+    """The law at the frame's ISO.
+
+    Raises:
+        ValueError: if the law is of another camera, or does not reach the ISO.
+    """
+    known = {law.camera, frame.camera} - {"unknown"}
+    if len(known) > 1:
+        raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
+    try:
+        return law.at(frame.iso)
+    except ValueError as error:
+        raise ValueError(f"{frame.name}: {error}; pass --noise estimate or --noise '[shot_var, read_var]'") from None
+
+
+def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
+    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such file, or no law in it.
+    """
+    if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
+        return noise
+    stored = denoisers.load(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
+    law = stored.get("noise")
+    if not isinstance(law, Mapping):
+        file = denoiser if noise == "camera" else noise
+        raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
+    return camera_law(law)
+
+
 def denoise_file(
     source: str | Path,
     out: str | Path,
@@ -189,14 +237,21 @@ def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
     return model.to(memory_format=torch.channels_last), CFA(info.get("cfa", "RGGB"))  # type: ignore[call-overload]
 
 
-def _denoise_file(source: Path, out: Path, loaded: tuple[Denoiser, CFA], noise: Noise, self_ensemble: bool) -> Denoised:
+def _denoise_file(
+    source: Path,
+    out: Path,
+    loaded: tuple[Denoiser, CFA],
+    noise: Noise,
+    self_ensemble: bool,
+    read: Callable[[Path], RawFrame] = read_raw,
+) -> Denoised:
     start = time.perf_counter()
     if out.suffix.lower() != ".dng":
         raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
     model, cfa = loaded
-    frame = read_raw(source)
+    frame = read(source)
     shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
     mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
     below = _clip_below_zero(mosaic, frame)
@@ -228,6 +283,8 @@ def denoise_folder(
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
+    A file that cannot be read, or whose decoder crashes or hangs, is named and counted.
+
     Raises:
         FileNotFoundError: if there is no such file of weights.
         ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
@@ -237,19 +294,25 @@ def denoise_folder(
     targets = _targets(source, out)
     loaded = _load(weights)
     settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
-    require_same_settings(out / "denoise.json", {**settings, "noise": noise if isinstance(noise, str) else list(noise)})
+    require_same_settings(out / "denoise.json", {**settings, "noise": _as_json(noise)})
     result = DenoisedFolder()
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists():
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble))
+            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
     return result
+
+
+def _as_json(noise: Noise) -> Any:
+    if isinstance(noise, MeasuredLevels):
+        return noise.spec()
+    return noise if isinstance(noise, str) else list(noise)
 
 
 def _targets(source: Path, out: Path) -> dict[Path, Path]:
@@ -272,8 +335,8 @@ def print_denoised(result: DenoisedFolder) -> None:
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{done.out}: {levels}, {done.seconds:.1f} s{clipped}")
+        print(f"{printable(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for file, reason in result.broken.items():
-        print(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}")
+        print(printable(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}"))

@@ -13,6 +13,8 @@ from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairSettings
+from rawaug.data.readable import Readable
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
@@ -22,6 +24,7 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     network_method,
+    require_numbers,
     row_of,
     score_classical,
     score_method,
@@ -48,12 +51,13 @@ def run(
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
+    settings: PairSettings,
 ) -> None:
     """PSNR and SSIM of an ISP or a denoiser.
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
-        data: folder of RAW files, one file, or kind:path.
+        data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs.
         self_ensemble: also score the average over eight views (denoisers).
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
@@ -63,31 +67,41 @@ def run(
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
+        settings: of pairs:PATH.
     """
+<<<<<<< HEAD
     result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views)
+=======
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **vars(settings))
+>>>>>>> main
     print_scores(result)
     if json:
         write_json(result, json)
     if report:
         print(f"page: {report}")
+    require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
 
 
 def evaluate(
     weights: str | Path,
-    data: str,
+    data: str | Sequence[Pair],
     self_ensemble: bool = False,
     noise: NoiseSpec | None = None,
     seed: int = 0,
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+<<<<<<< HEAD
     views: Literal[4, 8] | None = None,
+=======
+    **settings: Any,
+>>>>>>> main
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
     Args:
         weights: an ISP's or a denoiser's; the file says which.
-        data: a folder of RAW files, or ``kind:path``.
+        data: a folder of clean RAW files, ``kind:path``, or a sequence of pairs.
         self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
@@ -95,16 +109,22 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+<<<<<<< HEAD
         views: of the self-ensemble, 4 or 8; given alone it asks for one.
+=======
+        settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
+>>>>>>> main
 
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, or what is asked for
-            is for denoisers and the file is an ISP's.
+        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
+            is for denoisers and the file is an ISP's, or no frame can be read. Some that cannot are named under
+            ``broken``.
     """
     classical = installed_classical(classical)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
-    pairs = open_pairs(data, split="test")
+    pairs = Readable(open_pairs(data, split="test", **settings))
+    data = data if isinstance(data, str) else f"{len(pairs)} pairs"
     if kind == "isp":
         if self_ensemble or views or noise is not None or classical or report is not None:
             raise ValueError(
@@ -113,22 +133,40 @@ def evaluate(
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
         result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
+        _require_some(pairs)
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(device)
+<<<<<<< HEAD
         at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
         ensemble = views or (8 if self_ensemble else 1)
         result = _denoiser_result(model, pairs, levels, cfa, seed, ensemble, classical, at_test)
+=======
+        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        _require_some(pairs)
+>>>>>>> main
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
+<<<<<<< HEAD
             methods["denoised"] = network_method(model, cfa, at_test=at_test)
             for pair in shown_on_page(pairs):
+=======
+            methods["denoised"] = network_method(model, cfa)
+            for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
+>>>>>>> main
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
+    if pairs.broken:
+        result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
     return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
+
+
+def _require_some(pairs: Readable) -> None:
+    if len(pairs.broken) == len(pairs):
+        raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
 
 
 def _denoiser_result(

@@ -4,9 +4,11 @@ r"""A RAW pair on disk, in one of three formats, and the parameters that replay 
 format  files                                  content
 ======  =====================================  ====================================================================
 dng     ``NAME_clean.dng NAME_noisy.dng``      16 bits, as a camera would; opens in a RAW developer
-npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, ``shot_var``, ...
-tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1
+npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, and statements
+tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1; statements in its description
 ======  =====================================  ====================================================================
+
+The statements are ``cfa``, ``white_balance``, ``color_matrix``, ``shot_var`` and ``read_var``, as far as known.
 
 ``NAME.safetensors`` is written last: a pair is there when its parameters are. A DNG's black level is as high as the
 darkest noisy value needs, so that nothing is clipped at black; the clean file has the same levels.
@@ -16,26 +18,29 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug._version import __version__
+from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
 from rawaug.extras import extra
-from rawaug.files import find_weights, read_header, replacing, sha256, write_tensors
-from rawaug.io import GainMap, RawFrame, read_picture, write_dng
+from rawaug.files import digest, read_header, replacing, write_tensors
+from rawaug.io import GainMap, RawFrame, write_dng
 from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
 from rawaug.isp.stages import place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
-from rawaug.plugin.pictures import even_sided
 
-Format = Literal["dng", "npz", "tiff"]
+LONGEST_STEM = 200
+"""Bytes of a picture's name in those of its pairs, which have at most 255."""
 
 _WHITE = 65535
 _BLACK_STEP = 256
@@ -43,15 +48,77 @@ _SHADING_NODES = (25, 33)
 
 
 @dataclass(frozen=True)
-class Origin:
-    """What a pair was made from; with its parameters it replays the pair."""
+class PictureTask:
+    """A picture, its name as the key of its draws, where its pairs go, and the numbers that are missing and wanted."""
 
-    picture: str
-    picture_sha256: str
-    isp: str
-    isp_sha256: str
-    noise: str | list[float]
-    version: str = __version__
+    picture: Path
+    key: str
+    stem: Path
+    numbers: tuple[int, ...]
+    per_image: int
+
+    @property
+    def pictures(self) -> int:
+        """It is about one."""
+        return 1
+
+    @property
+    def broken(self) -> dict[str, str]:
+        """None: what cannot be read is tried again."""
+        return {}
+
+    @property
+    def existing(self) -> int:
+        """Pairs that are there already."""
+        return self.per_image - len(self.numbers)
+
+    @property
+    def todo(self) -> bool:
+        """Whether one is missing."""
+        return bool(self.numbers)
+
+    def make(self, maker: PairMaker) -> Outcome:
+        """Write the missing pairs."""
+        try:
+            pairs = maker.pairs(self.picture, self.key, self.numbers)
+        except (OSError, ValueError) as error:
+            return Outcome(0, {self.key: str(error)})
+        origin = maker.origin(self.picture)
+        for number, pair in pairs:
+            write_pair(_numbered(self.stem, number), pair, maker.augment, maker.settings.format, origin)
+        return Outcome(len(self.numbers), {})
+
+
+def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
+    """One a picture. Pictures that differ in their extension alone keep it in the names of their pairs.
+
+    Raises:
+        ValueError: if the pairs of two pictures would have the same names.
+    """
+    stems = Counter(picture.with_suffix("") for picture in pictures)
+    taken: dict[Path, Path] = {}
+    for picture in pictures:
+        bare = picture.with_suffix("")
+        own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
+        if taken.setdefault(own, picture) != picture:
+            raise ValueError(
+                f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
+            )
+        stem = out / own.relative_to(source).with_name(_short(own.name))
+        missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
+        yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, tuple(missing), per_image)
+
+
+def _short(name: str) -> str:
+    """The name, or its beginning and a hash where it leaves no room for the endings of the pairs' files."""
+    encoded = os.fsencode(name)
+    if len(encoded) <= LONGEST_STEM:
+        return name
+    return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
+
+
+def _numbered(stem: Path, number: int) -> Path:
+    return stem.with_name(f"{stem.name}_{number}")
 
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
@@ -61,8 +128,9 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
     elif format == "npz":
         _write_npz(stem, pair, augment)
     else:
-        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment)
-        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment)
+        stated = _stated(pair, augment)
+        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment.isp.cfa, stated)
+        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment.isp.cfa, stated)
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
     write_tensors(pair.params.tensors(), header, params_file(stem))
 
@@ -92,41 +160,43 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     if "origin" not in header:
         raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
     origin = Origin(**json.loads(header["origin"]))
-    augment = augmentation(str(isp or origin.isp), origin.noise)
-    found = Path(picture or origin.picture)
-    if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
-        raise ValueError(f"{params}: the ISP {isp or origin.isp} is not the one this pair was made with")
-    srgb = even_sided(read_picture(found))
-    if sha256(found) != origin.picture_sha256:
-        raise ValueError(f"{params}: the picture {found} has changed since this pair was made")
-    pair: RawPair = augment.apply(srgb, drawn)
-    return pair
-
-
-def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
-    """The augmentation with these settings."""
-    return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)
+    return replayed(drawn, origin, params, picture, isp)
 
 
 def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def _write_tiff(path: Path, packed: Tensor, augment: RawAugment) -> None:
+def _write_tiff(path: Path, packed: Tensor, cfa: bayer.CFA, stated: dict[str, Any]) -> None:
     with extra("raw"):
         import tifffile
 
-    mosaic = bayer.unpack(packed, augment.isp.cfa)[0].numpy()
+    mosaic = bayer.unpack(packed, cfa)[0].numpy()
     with replacing(path) as partial:
-        tifffile.imwrite(partial, mosaic, photometric="minisblack", metadata=None)
+        tifffile.imwrite(
+            partial, mosaic, photometric="minisblack", metadata=None, description=json.dumps(stated, sort_keys=True)
+        )
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    noise = pair.params.noise
-    arrays: dict[str, Any] = {key: noise[key].numpy() for key in ("shot_var", "read_var") if key in noise}
-    arrays |= {"clean": pair.clean.numpy(), "noisy": pair.noisy.numpy(), "cfa": np.array(str(augment.isp.cfa))}
+    stated = {
+        key: np.array(value, None if key == "cfa" else np.float32) for key, value in _stated(pair, augment).items()
+    }
+    arrays: dict[str, Any] = {**stated, "clean": pair.clean.numpy(), "noisy": pair.noisy.numpy()}
     with replacing(_beside(stem, ".npz")) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)
+
+
+def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
+    """What :mod:`rawaug.data.mosaic_files` reads beside a mosaic; a colour that no camera has is left out."""
+    noise = pair.params.noise
+    stated: dict[str, Any] = {"cfa": str(augment.isp.cfa)}
+    stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
+    try:
+        white_balance, matrix, _ = _color(pair, augment)
+    except (ValueError, RuntimeError):
+        return stated
+    return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
 
 
 def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.extras import extra
 from rawaug.io import encode_srgb, read_picture
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
@@ -30,7 +31,9 @@ _MAXIMUM = 768
 
 
 @COMMANDS.register("preview")
-def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0) -> None:
+def run(
+    picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0, max_pixels: int = MAX_PIXELS
+) -> None:
     """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
     Args:
@@ -39,12 +42,20 @@ def run(picture: str, *, out: str, isp: str = "universal", count: int = 8, seed:
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
         seed: of these.
+        max_pixels: a larger picture is refused before it is decoded.
     """
-    for path in preview(picture, isp, out, count, seed):
+    for path in preview(picture, isp, out, count, seed, max_pixels):
         print(path)
 
 
-def preview(picture: str | Path, weights: str | Path, out: str | Path, count: int = 8, seed: int = 0) -> list[Path]:
+def preview(
+    picture: str | Path,
+    weights: str | Path,
+    out: str | Path,
+    count: int = 8,
+    seed: int = 0,
+    max_pixels: int = MAX_PIXELS,
+) -> list[Path]:
     """Draw both figures.
 
     Args:
@@ -53,6 +64,7 @@ def preview(picture: str | Path, weights: str | Path, out: str | Path, count: in
         out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
         count: number of augmented RAWs to plot.
         seed: of these.
+        max_pixels: a larger picture is refused before it is decoded.
 
     Returns:
         The two paths.
@@ -60,7 +72,7 @@ def preview(picture: str | Path, weights: str | Path, out: str | Path, count: in
     if count < 0:
         raise ValueError(f"count must be at least 0, got {count}")
     isp = DictionaryISP.from_pretrained(weights)
-    whole = even_sided(read_picture(picture))
+    whole = even_sided(read_picture(picture, max_pixels))
     out = Path(out) if Path(out).suffix else Path(f"{out}.png")
     out.parent.mkdir(parents=True, exist_ok=True)
     atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")

@@ -1,7 +1,8 @@
-"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, in parallel.
+"""``rawaug synth``: RAW pairs on disk from a folder of sRGB pictures, in parallel, on one machine or on many.
 
 What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
-run is stopped and started again, and with however many workers, the same files come out, each made once.
+run is stopped and started again, and with however many workers on however many machines, the same files come out, each
+made once.
 """
 
 from __future__ import annotations
@@ -12,36 +13,30 @@ import os
 import signal
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
-from rawaug.commands.pair_files import (
-    Format,
-    Origin,
-    augmentation,
-    params_file,
-    replay,
-    write_pair,
-)
+from rawaug.commands import pair_shards
+from rawaug.commands.pair_files import picture_tasks, replay
+from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task
+from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
-from rawaug.io import read_picture
-from rawaug.plugin.augment import RawAugment, Sampling
-from rawaug.plugin.pictures import even_sided
+from rawaug.io.apart import prepare
+from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.plugin.augment import Sampling
+from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
-from rawaug.seeding import keyed_generator
 
-__all__ = ["Synthesis", "print_synthesis", "replay", "synth"]
+__all__ = ["Synthesis", "print_synthesis", "replay", "replay_sample", "synth"]
 
 
 @COMMANDS.register("synth")
@@ -56,42 +51,28 @@ def run(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
+    shard: str = "1/1",
+    per_shard: int = PER_SHARD,
 ) -> None:
     """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
     Args:
         pictures: folder of sRGB pictures.
         out: output folder.
-        format: 16-bit DNG, packed float32 NPZ or float32 TIFF.
+        format: 16-bit DNG, packed float32 NPZ, float32 TIFF, or tar shards for WebDataset and Hugging Face.
         per_image: pairs per picture.
         isp: ISP file, or the name of a shipped ISP.
         noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
         sampling: how camera settings are drawn.
         seed: random seed.
         workers: number of processes; by default one per core.
+        max_pixels: larger pictures are refused before they are decoded.
+        shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
+        per_shard: pictures per tar file, with --format webdataset.
     """
-    print_synthesis(synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers))
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
-
-    format: Format
-    isp: str
-    isp_sha256: str
-    noise: str | list[float]
-    sampling: Sampling
-    seed: int
-
-
-class _Task(NamedTuple):
-    """A picture, its name as the key of its draws, where its pairs go, and the numbers of those that are missing."""
-
-    picture: Path
-    key: str
-    stem: Path
-    numbers: tuple[int, ...]
+    made = synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers, max_pixels, shard, per_shard)
+    print_synthesis(made)
 
 
 @dataclass
@@ -116,20 +97,26 @@ def synth(
     sampling: Sampling = "convex",
     seed: int = 0,
     workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
+    shard: str = "1/1",
+    per_shard: int = PER_SHARD,
 ) -> Synthesis:
     """Make ``per_image`` pairs of every picture of a folder and its subfolders; existing pairs are kept.
 
     Args:
         source: the folder of sRGB pictures.
-        out: the folder of pairs, ``SUBFOLDER/PICTURE_NUMBER...``; see :mod:`rawaug.commands.pair_files`.
-        format: dng, npz or tiff.
-        per_image: pairs per picture; may grow from run to run.
+        out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
+        format: dng, npz, tiff or webdataset.
+        per_image: pairs per picture; may grow from run to run, but not in shards.
         isp: name of a shipped ISP, or an ISP's file.
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
         sampling: of camera settings, as in :class:`rawaug.RawAugment`.
         seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
+        max_pixels: larger pictures are refused before they are decoded.
+        shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
+        per_shard: pictures in a tar file.
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
@@ -139,30 +126,69 @@ def synth(
     start = time.perf_counter()
     weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
     levels = noise if isinstance(noise, str) else list(noise)
-    settings = _Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
+    settings = Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
-    if format not in ("dng", "npz", "tiff") or per_image < 1:
-        raise ValueError(f"format must be dng, npz or tiff and per_image at least 1, got {format} and {per_image}")
+    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
+        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
+        raise ValueError(f"{wanted}, got {format} and {per_image}")
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
-    augmentation(weights, levels, sampling)  # raises for a wrong name here, not in a worker
-    require_same_settings(out / "synth.json", vars(settings))
-    result = Synthesis(out, pictures=len(pictures))
-    tasks = list(_tasks(pictures, source, out, per_image))
-    result.existing = len(pictures) * per_image - sum(len(task.numbers) for task in tasks)
-    todo = [task for task in tasks if task.numbers]
-    bar = progress(_done(todo, settings, workers), label="synth", unit="picture", total=len(todo), leave=True)
-    for task, error in bar:
-        if error is None:
-            result.made += len(task.numbers)
-        else:
-            result.broken[task.key] = error
-    result.broken = dict(sorted(result.broken.items()))
+    part, parts = part_of(shard)
+    PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
+    result = Synthesis(out)
+    if format == "webdataset":
+        shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
+        fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
+        require_same_settings(out / "synth.json", _portable(settings) | fixed)
+        _work_off(shards[part - 1 :: parts], settings, max_pixels, workers, result)
+        pair_shards.finish(shards, settings, out)
+    else:
+        tasks = list(picture_tasks(pictures, source, out, per_image))
+        require_same_settings(out / "synth.json", vars(settings))
+        _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
     result.seconds = time.perf_counter() - start
-    if len(result.broken) == len(pictures):
-        raise ValueError(f"{source}: none of its {len(pictures)} pictures can be read; {min(result.broken.values())}")
+    if result.pictures and len(result.broken) == result.pictures:
+        count, reason = result.pictures, min(result.broken.values())
+        raise ValueError(f"{source}: none of its {count} pictures can be read; {reason}")
     return result
+
+
+def part_of(shard: str) -> tuple[int, int]:
+    """K and N of ``"K/N"``.
+
+    Raises:
+        ValueError: unless 1 <= K <= N.
+
+    Example:
+        >>> part_of("3/32")
+        (3, 32)
+    """
+    first, _, second = shard.partition("/")
+    if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
+        raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")
+    return int(first), int(second)
+
+
+def _portable(settings: Settings) -> dict[str, object]:
+    """The settings of shards, which machines that have the ISP's file in different places share."""
+    return {**vars(settings), "isp": Path(settings.isp).name}
+
+
+def _work_off(
+    tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None, result: Synthesis
+) -> None:
+    """Do what is to be done, and count."""
+    result.pictures = sum(task.pictures for task in tasks)
+    result.existing = sum(task.existing for task in tasks)
+    for task in tasks:
+        result.broken |= task.broken
+    todo = [task for task in tasks if task.todo]
+    outcomes = _done(todo, settings, max_pixels, workers)
+    for outcome in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
+        result.made += outcome.made
+        result.broken |= outcome.broken
+    result.broken = dict(sorted(result.broken.items()))
 
 
 def _pictures(source: Path, out: Path) -> list[Path]:
@@ -174,26 +200,6 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     if not pictures:
         raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
     return pictures
-
-
-def _tasks(pictures: list[Path], source: Path, out: Path, per_image: int) -> Iterator[_Task]:
-    """Pictures that differ in their extension alone keep it in the names of their pairs."""
-    stems = Counter(picture.with_suffix("") for picture in pictures)
-    taken: dict[Path, Path] = {}
-    for picture in pictures:
-        bare = picture.with_suffix("")
-        own = bare if stems[bare] == 1 else bare.with_name(picture.name.replace(".", "_"))
-        if taken.setdefault(own, picture) != picture:
-            raise ValueError(
-                f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
-            )
-        stem = out / own.relative_to(source)
-        missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
-        yield _Task(picture, picture.relative_to(source).as_posix(), stem, tuple(missing))
-
-
-def _numbered(stem: Path, number: int) -> Path:
-    return stem.with_name(f"{stem.name}_{number}")
 
 
 def require_same_settings(path: Path, settings: dict[str, object]) -> None:
@@ -216,38 +222,37 @@ def require_same_settings(path: Path, settings: dict[str, object]) -> None:
 
 # -- processes --------------------------------------------------------------------------------------------------------
 
-_augment: RawAugment
-_settings: _Settings
+_maker: PairMaker
 
 
-def _done(tasks: list[_Task], settings: _Settings, workers: int | None) -> Iterator[tuple[_Task, str | None]]:
-    """Each task as it finishes, with the reason if it failed."""
+def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
+    """Of each task as it finishes."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    prepare()
     if workers < 1:
-        _prepare(settings)
-        yield from ((task, _make(task)) for task in tasks)
+        _prepare(settings, max_pixels)
+        yield from map(_make, tasks)
         return
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
-    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings,))
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings, max_pixels))
     try:
-        futures = {pool.submit(_make, task): task for task in tasks}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+        for future in as_completed([pool.submit(_make, task) for task in tasks]):
+            yield future.result()
     except BrokenProcessPool:
         raise OSError("a worker died, perhaps out of memory; run it again to resume, with fewer --workers") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _start_worker(settings: _Settings) -> None:
+def _start_worker(settings: Settings, max_pixels: int) -> None:
     """A worker has one thread, leaves the interrupt to the parent, and ends when the parent has died."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     torch.set_num_threads(1)
-    _prepare(settings)
+    _prepare(settings, max_pixels)
 
 
 def _end_with(parent: BaseProcess) -> None:
@@ -255,24 +260,13 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-def _prepare(settings: _Settings) -> None:
-    global _augment, _settings
-    _settings = settings
-    _augment = augmentation(settings.isp, settings.noise, settings.sampling)
+def _prepare(settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
+    global _maker
+    _maker = PairMaker(settings, max_pixels)
 
 
-def _make(task: _Task) -> str | None:
-    """Make the missing pairs of a picture; the reason if it cannot be read."""
-    try:
-        srgb = even_sided(read_picture(task.picture))
-    except (OSError, ValueError) as error:
-        return str(error)
-    s = _settings
-    origin = Origin(str(task.picture), sha256(task.picture), s.isp, s.isp_sha256, s.noise)
-    for number in task.numbers:
-        params = _augment.sample(srgb, keyed_generator(s.seed, "synth", task.key, number))
-        write_pair(_numbered(task.stem, number), _augment.apply(srgb, params), _augment, s.format, origin)
-    return None
+def _make(task: Task) -> Outcome:
+    return task.make(_maker)
 
 
 def print_synthesis(result: Synthesis) -> None:
@@ -281,4 +275,4 @@ def print_synthesis(result: Synthesis) -> None:
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"unreadable: {reason}")
+        print(f"unreadable: {printable(reason)}")

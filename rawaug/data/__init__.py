@@ -7,7 +7,8 @@ clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writ
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
@@ -18,7 +19,9 @@ from rawaug.data.demo.dead_leaves import dead_leaves
 from rawaug.data.demo.demo_pairs import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
 from rawaug.data.fivek import fivek_pairs
+from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.rawir import Rawir
@@ -26,7 +29,7 @@ from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.data.sidd.submission import check_submission, write_submission
 from rawaug.data.zurich import Zurich
-from rawaug.registry import DATASETS, PICTURES, Registry, nearest
+from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
     "DataReport",
@@ -34,6 +37,7 @@ __all__ = [
     "Dnd",
     "DndCrop",
     "Pair",
+    "PairFolder",
     "PictureFolder",
     "RawFolder",
     "Rawir",
@@ -59,29 +63,58 @@ __all__ = [
 _SPLITS = ("train", "validation", "test")
 
 
-def open_pairs(spec: str, split: str = "test") -> Sequence[Pair]:
+def open_pairs(
+    spec: str | Path | Sequence[Pair], split: str = "test", as_clean: bool = True, **settings: Any
+) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
 
     Args:
-        spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"demo:"``, ``"demo:train"``,
-            ``"sidd:SIDD_Medium_Raw"``, ``"zurich:Zurich-RAW-to-DSLR:test"`` (with the split last).
+        spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"pairs:MY_PAIRS"``,
+            ``"demo:"``, ``"demo:train"``, ``"sidd:SIDD_Medium_Raw"``, ``"zurich:Zurich-RAW-to-DSLR:test"`` (with the
+            split last). A sequence of pairs is taken as it is.
         split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
+        as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
+        settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
-        FileNotFoundError, ValueError: if there is no such kind, split, file or folder.
+        FileNotFoundError, ValueError: if there is no such kind, split, file, folder or setting, or noisy/clean pairs
+            are opened as a bare folder.
 
     Example:
         >>> len(open_pairs("demo:validation"))
         4
     """
-    kind, path = _kind_and_path(spec)
+    settings = {key: value for key, value in settings.items() if value is not None}
+    if not isinstance(spec, (str, Path)):
+        return _as_they_are(spec, settings)
+    kind, path = _kind_and_path(str(spec))
     if kind is None:
-        return RawFolder(path)
-    reader = _reader(DATASETS, spec, kind, path, "a RAW file or folder")
+        _require_none(settings, spec)
+        folder = RawFolder(path)
+        require_no_pairs(folder, str(spec), as_clean)
+        return folder
+    reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, named = _path_and_split(path)
-    pairs: Sequence[Pair] = reader(path, named or split)
+    chosen = checked_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
+    pairs: Sequence[Pair] = reader(path, named or split, **chosen)
     return pairs
+
+
+def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence[Pair]:
+    _require_none(settings, "a sequence of pairs")
+    if isinstance(pairs, LazyPairs):
+        return pairs
+    if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
+        raise ValueError(
+            f"data must be a path, kind:path or a non-empty sequence of rawaug.data.Pair, got {type(pairs).__name__}"
+        )
+    return pairs
+
+
+def _require_none(settings: Mapping[str, Any], spec: object) -> None:
+    if settings:
+        raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
 
 
 def open_pictures(spec: str, min_side: int = 2) -> Sequence[Tensor] | PictureFolder:

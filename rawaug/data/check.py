@@ -1,14 +1,12 @@
 """Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
 Everything is read once, as training would read it. A folder is recognised by its publisher's file
-names; anything else is a folder of RAW files, of pictures, or both. Reading takes place in a separate process: where a
-damaged file crashes its decoder, the file is named and a new process continues. (RAW
-files are read in this one: LibRaw's threads do not survive a fork.)
+names; anything else is a folder of RAW files, of pictures, or both. Files are decoded apart (:mod:`rawaug.io.apart`):
+one that crashes its decoder, or hangs, is named and the rest is read.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
 from collections import Counter
@@ -19,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from rawaug.data import picture_folder, raw_folder
 from rawaug.data.dnd import Dnd
 from rawaug.data.fivek import CAMERAS, fivek_numbers
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.rawir import Rawir
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
@@ -33,9 +31,11 @@ from rawaug.data.sidd.scenes import is_scene
 from rawaug.data.sidd.submission import check_submission
 from rawaug.data.zurich import Zurich
 from rawaug.io import RawFrame, read_raw
+from rawaug.io.apart import apart
+from rawaug.printable import printable
 
 _SHOWN = 6
-_CRASHES = 5
+_PAIRS = "pairs:"
 
 
 @dataclass
@@ -45,7 +45,7 @@ class PartReport:
     Attributes:
         what: the kind of data.
         items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
-        sizes, cfas, cameras, levels: how often each occurs among those that could be read.
+        sizes, cfas, cameras, iso, levels: how often each occurs among those that could be read.
         signal: least and greatest value of RAW.
         broken: one line per damaged file, with its name.
     """
@@ -56,13 +56,14 @@ class PartReport:
     sizes: Counter[str] = field(default_factory=Counter)
     cfas: Counter[str] = field(default_factory=Counter)
     cameras: Counter[str] = field(default_factory=Counter)
+    iso: Counter[str] = field(default_factory=Counter)
     levels: Counter[str] = field(default_factory=Counter)
     signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: PartReport) -> None:
         """Add another report's counts; a damaged file of many blocks is one line."""
-        for name in ("sizes", "cfas", "cameras", "levels"):
+        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
             getattr(self, name).update(getattr(other, name))
         if other.signal is not None:
             low, high = self.signal or other.signal
@@ -72,7 +73,7 @@ class PartReport:
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} examined"
         lines = [f"{self.what}: {self.items}{examined}"]
-        for name in ("sizes", "cfas", "cameras", "levels"):
+        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
             counts: Counter[str] = getattr(self, name)
             if counts:
                 more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
@@ -81,7 +82,7 @@ class PartReport:
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
-        return "\n".join([*lines, *(f"    {line}" for line in self.broken)])
+        return "\n".join([*lines, *(f"    {printable(line)}" for line in self.broken)])
 
 
 @dataclass
@@ -96,20 +97,28 @@ class DataReport:
         return [line for part in self.parts for line in part.broken]
 
     def __str__(self) -> str:
-        return "\n".join([str(self.path), *map(str, self.parts)])
+        return "\n".join([printable(self.path), *map(str, self.parts)])
 
 
-def check(path: str | Path, first: int | None = None) -> DataReport:
+def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
     """Identify the data in a folder (or a SIDD submission) and read it.
 
     Args:
-        path: a folder, a RAW file, or a SIDD submission.
+        path: a folder, a RAW file, a SIDD submission, or ``pairs:PATH``.
         first: read at most this many items of each kind.
+        settings: of :class:`rawaug.data.PairFolder`, for noisy/clean pairs; None is left out.
 
     Raises:
         FileNotFoundError: if there is no such path.
-        ValueError: if it contains no known data.
+        ValueError: if it contains no known data, or settings are given and it is not ``pairs:PATH``.
     """
+    settings = {key: value for key, value in settings.items() if value is not None}
+    if str(path).startswith(_PAIRS):
+        folder = Path(str(path).removeprefix(_PAIRS))
+        opened = PairFolder(folder, **settings)
+        return DataReport(folder, [_part("noisy/clean pairs", lambda: opened, first)])
+    if settings:
+        raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
@@ -149,6 +158,9 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
     files = [path] if path.is_file() else [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
+    if path.is_dir() and looks_like_pairs(files):
+        yield "noisy/clean pairs", lambda: PairFolder(path)
+        return
     raws = sorted(file for file in files if file.suffix.lower() in raw_folder.EXTENSIONS)
     numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
     if raws:
@@ -177,7 +189,7 @@ class _RawFrames(Sequence[RawFrame]):
         return len(self.files)
 
     def __getitem__(self, index: int) -> RawFrame:  # type: ignore[override]
-        return read_raw(self.files[index])
+        return apart(read_raw, self.files[index])
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
@@ -190,55 +202,19 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
-    found = _facts(items, part.examined)
-    for facts in found:
-        part.add(facts)
-    if len(found) < part.examined:
-        part.broken.append(f"stopped after {_CRASHES} crashes; replace these files first")
-        part.examined = len(found)
+    for index in range(part.examined):
+        part.add(_facts(items, index))
     return part
 
 
-class _Facts(Dataset[PartReport]):
-    """One report per item."""
-
-    def __init__(self, items: Any) -> None:
-        self.items = items
-
-    def __getitem__(self, index: int) -> PartReport:
-        facts = PartReport("")
-        try:
-            _take(facts, self.items.read(index) if isinstance(self.items, PictureFolder) else self.items[index])
-        except (OSError, ValueError) as error:
-            facts.broken.append(" ".join(str(error).split()))
-        return facts
-
-
-def _facts(items: Any, count: int) -> list[PartReport]:
-    """The facts of the first items, read in a forked process where that can be."""
-    fork = {"num_workers": 1, "prefetch_factor": 1, "multiprocessing_context": "fork"}
-    forks = "fork" in multiprocessing.get_all_start_methods() and not isinstance(items, _RawFrames)
-    apart: dict[str, Any] = fork if forks else {}
-    found: list[PartReport] = []
-    crashes = 0
-    while len(found) < count and crashes < _CRASHES:
-        loader = DataLoader(
-            _Facts(items), None, sampler=range(len(found), count), collate_fn=lambda facts: facts, **apart
-        )
-        try:
-            for facts in loader:
-                found.append(facts)  # one by one: what was found before a crash stays
-        except RuntimeError as error:
-            if not (crash := re.search(r"DataLoader worker.*(killed by signal.*|exited.*)", str(error))):
-                raise
-            crashes += 1
-            found.append(PartReport("", broken=[f"{_name(items, len(found))}: crashes the decoder ({crash[1]})"]))
-    return found
-
-
-def _name(items: Any, index: int) -> str:
-    names = getattr(items, "names", None)
-    return f"number {index + 1}" if names is None else f"{names[index]}"
+def _facts(items: Any, index: int) -> PartReport:
+    """A report on one item."""
+    facts = PartReport("")
+    try:
+        _take(facts, items.read(index) if isinstance(items, PictureFolder) else items[index])
+    except (OSError, ValueError) as error:
+        facts.broken.append(" ".join(str(error).split()))
+    return facts
 
 
 def _take(part: PartReport, item: Any) -> None:
@@ -256,4 +232,6 @@ def _take(part: PartReport, item: Any) -> None:
         part.levels[f"shot_var {item.shot_var:.1e}, read_var {item.read_var:.1e}"] += 1
     if camera := getattr(item, "camera", None):
         part.cameras[camera] += 1
+    if iso := getattr(item, "iso", None):
+        part.iso[f"{iso:g}"] += 1
     part.signal = raw.min().item(), raw.max().item()

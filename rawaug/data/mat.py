@@ -1,4 +1,4 @@
-"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header.
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header; read apart.
 
 A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
 naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
@@ -7,6 +7,7 @@ naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,9 +16,12 @@ from typing import Any
 import numpy as np
 
 from rawaug.extras import extra
+from rawaug.io.apart import apart
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
+MAX_BYTES = 2**30
+"""Larger variables are refused before they are read: those of the published datasets have at most 0.5 GiB."""
 _DAMAGE = (
     *(ArithmeticError, AttributeError, LookupError, MemoryError, NameError, OSError, RuntimeError),
     *(TypeError, ValueError),
@@ -43,6 +47,29 @@ def mat_version(path: str | Path) -> str:
     raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
 
 
+def variables(path: str | Path) -> list[str]:
+    """The names of a file's variables.
+
+    Raises:
+        FileNotFoundError, ValueError, OSError: as :func:`read_array`.
+    """
+    return apart(_variables, Path(path))
+
+
+def _variables(path: Path) -> list[str]:
+    if mat_version(path) == "5":
+        from scipy.io import whosmat
+
+        with _as_os_error(path):
+            return [name for name, *_ in whosmat(path)]
+    with _as_os_error(path):
+        with extra("data"):
+            import h5py
+
+        with h5py.File(path, "r") as file:
+            return [name for name in file if not name.startswith("#")]
+
+
 def read_array(path: str | Path, name: str) -> np.ndarray:
     """The numeric array ``name``, axes and type as in MATLAB.
 
@@ -54,7 +81,7 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
         >>> read_array("0001_NOISY_RAW_010.MAT", "x").shape  # doctest: +SKIP
         (3000, 5328)
     """
-    value = _read(Path(path), name, plain=False)
+    value = apart(_read, Path(path), name, False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
     return value
@@ -67,7 +94,7 @@ def read_value(path: str | Path, name: str) -> Any:
     Raises:
         FileNotFoundError, ValueError, OSError: as :func:`read_array`.
     """
-    return _read(Path(path), name, plain=True)
+    return apart(_read, Path(path), name, True)
 
 
 def _read(path: Path, name: str, plain: bool) -> Any:
@@ -80,17 +107,34 @@ def _read(path: Path, name: str, plain: bool) -> Any:
         with h5py.File(path, "r") as file:
             if name not in file:
                 raise _missing(path, name, [key for key in file if not key.startswith("#")])
-            return _plain(file[name], file) if plain else np.ascontiguousarray(file[name][()].T)
+            node = _member(file, name)
+            return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
 
 
 def _read_5(path: Path, name: str, plain: bool) -> Any:
     from scipy.io import loadmat, whosmat
 
     with _as_os_error(path):
-        variables = loadmat(path, variable_names=[name], simplify_cells=plain)
-        if name not in variables:
-            raise _missing(path, name, [found for found, *_ in whosmat(path)])
-        return variables[name]
+        shapes = {found: shape for found, shape, _ in whosmat(path)}
+        if name not in shapes:
+            raise _missing(path, name, list(shapes))
+        _require_size(8 * math.prod(shapes[name]), name)
+        return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
+
+
+def _require_size(size: int, name: str) -> None:
+    if not 0 <= size <= MAX_BYTES:
+        raise ValueError(f"{name} declares {size} bytes, above the limit of {MAX_BYTES}")
+
+
+def _member(group: Any, name: str) -> Any:
+    """What a group itself holds under a name: links of HDF5 can lead to any file on this machine."""
+    with extra("data"):
+        import h5py
+
+    if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name} is a link, not a variable")
+    return group[name]
 
 
 @contextmanager
@@ -117,18 +161,26 @@ def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
     return _Missing(f"{path}: has no variable {name}; its variables are: {', '.join(existing) or 'none'}")
 
 
+def _values(node: Any) -> Any:
+    """All of a dataset of HDF5, which is in the file itself, and no larger than it may be."""
+    if node.external or node.is_virtual:
+        raise ValueError(f"{node.name} is stored in another file")
+    _require_size(node.size * node.dtype.itemsize, node.name)
+    return node[()]
+
+
 def _plain(node: Any, file: Any) -> Any:
     """An HDF5 node of a 7.3 file as plain values."""
     with extra("data"):
         import h5py
 
     if isinstance(node, h5py.Group):
-        fields = {key: _plain(node[key], file) for key in node}
+        fields = {key: _plain(_member(node, key), file) for key in node}
         # the fields of a struct array refer to their values, and unlike cells they have no class of their own
         if fields and all(_refers(node[key]) and "MATLAB_class" not in node[key].attrs for key in node):
             return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
         return fields
-    value = node[()]
+    value = _values(node)
     if _refers(node):
         return [_plain(file[reference], file) for reference in np.ravel(value, order="F")]
     if node.attrs.get("MATLAB_class") == b"char":

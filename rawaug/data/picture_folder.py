@@ -19,7 +19,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
+from rawaug.io.apart import apart, prepare
 from rawaug.io.picture_files import MAX_PIXELS, read_picture
+from rawaug.printable import printable
 
 EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
 _COUNTERS = 64
@@ -30,8 +32,9 @@ _log = logging.getLogger(__name__)
 class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
-    After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
-    a warning; :attr:`skipped` and :meth:`report` list them at any time.
+    Files are decoded apart (:mod:`rawaug.io.apart`): one that crashes its decoder, or hangs, is skipped like any other
+    damaged one. After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far
+    are logged as a warning; :attr:`skipped` and :meth:`report` list them at any time.
 
     Args:
         path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
@@ -65,6 +68,7 @@ class PictureFolder(Dataset[Tensor]):
         self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
         self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._reasons: dict[int, str] = {}
+        prepare()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -87,7 +91,7 @@ class PictureFolder(Dataset[Tensor]):
             FileNotFoundError, OSError, ValueError: if it cannot be used.
         """
         file = self.path / self.names[index]
-        picture = read_picture(file, self.max_pixels)
+        picture = apart(read_picture, file, self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
             raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
@@ -107,9 +111,11 @@ class PictureFolder(Dataset[Tensor]):
     def report(self) -> str:
         """What was skipped so far, one line a file."""
         skipped = self.skipped
+        folder = printable(self.path)
         if not skipped:
-            return f"{self.path}: none of {len(self)} pictures skipped so far"
-        return "\n".join([f"{self.path}: {len(skipped)} of {len(self)} pictures skipped", *skipped.values()])
+            return f"{folder}: none of {len(self)} pictures skipped so far"
+        lines = map(printable, skipped.values())
+        return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
 
     def _judged(self, index: int) -> Tensor | None:
         """The picture, or None and a mark where it is damaged."""

@@ -14,6 +14,7 @@ from rawaug.bayer import turn_back
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
+from rawaug.io.apart import apart
 
 EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
@@ -56,18 +57,24 @@ class RawFolder(LazyPairs):
         if missing:
             raise FileNotFoundError(f"{missing[0]}: no such RAW file")
         if not self.files:
-            raise ValueError(f"{path}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}")
+            raise ValueError(
+                f"{path}: contains no RAW file; supported extensions are {', '.join(EXTENSIONS)}; "
+                "noisy/clean pairs of other formats are read as pairs:PATH"
+            )
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr = adjust_maximum_thr
         super().__init__(_names(self.files))
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        return (self.files[index],)
 
     def read(self, index: int) -> Pair:
         """The frame of ``files[index]``, developed, or with its camera's JPEG."""
         file = self.files[index]
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
-            frame = read_raw(file)
-            srgb = turn_back(read_picture(jpeg), frame.upright_view)
+            frame = apart(read_raw, file)
+            srgb = turn_back(apart(read_picture, jpeg), frame.upright_view)
             size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
@@ -75,7 +82,7 @@ class RawFolder(LazyPairs):
                 return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
-        return _pair(self.names[index], *read_raw_and_develop(file, self.adjust_maximum_thr), registered=True)
+        return _pair(self.names[index], *apart(read_raw_and_develop, file, self.adjust_maximum_thr), registered=True)
 
 
 def _centre(image: Tensor, height: int, width: int) -> Tensor:
@@ -103,6 +110,7 @@ def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
         color_matrix=frame.color_matrix,
         camera=frame.camera,
         registered=registered,
+        iso=frame.iso,
     )
 
 

@@ -16,15 +16,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import read_picture
+from rawaug.io.apart import apart
 from rawaug.registry import DATASETS
 
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
+
+_DAMAGE = (ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError)
+"""What NumPy raises for headers that say anything."""
+_MAGIC = b"\x93NUMPY"
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
 
@@ -66,25 +72,47 @@ class Rawir(LazyPairs):
 
     def read(self, index: int) -> Pair:
         file, picture = self.files[index], self.pictures[index]
-        try:
-            numbers = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise OSError(f"{file}: cannot be read as an array ({error}); copy it again") from error
-        if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u":
-            raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
-        white = self.white or WHITE[picture.suffix.lower()]
-        if numbers.max() > white:
-            raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
-        packed = torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
         return Pair(
             name=self.names[index],
-            srgb=read_picture(picture),
-            raw=unpack(packed, CFA.RGGB),
+            srgb=apart(read_picture, picture),
+            raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             white_balance=(1.0, 1.0, 1.0),
             color_matrix=torch.eye(3),
             registered=not _is_p20(file),
         )
+
+
+def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
+    """Packed RAW ``(4, h, w)`` of an ``.npy`` file, white at 1; the picture beside it says which white level.
+
+    Raises:
+        OSError: if the file is damaged.
+        ValueError: if its array is of another kind, or exceeds white.
+    """
+    numbers = _array(file)
+    if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
+        raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
+    white = white or WHITE[picture.suffix.lower()]
+    if numbers.max() > white:
+        raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
+    return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
+
+
+def _array(file: Path) -> np.ndarray:
+    """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory.
+
+    Raises:
+        OSError: if it is damaged.
+    """
+    try:
+        with file.open("rb") as opened:
+            if opened.read(len(_MAGIC)) != _MAGIC:  # NumPy would open an archive of arrays, or a pickle
+                raise ValueError("does not begin as one")
+        return np.load(file, mmap_mode="r", allow_pickle=False)
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{file}: cannot be read as an array ({reason}); copy it again") from error
 
 
 def picture_beside(file: Path) -> Path:

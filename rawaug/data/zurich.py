@@ -22,6 +22,7 @@ from rawaug.bayer import CFA
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import read_picture
+from rawaug.io.apart import apart
 from rawaug.io.picture_files import read_plane
 from rawaug.registry import DATASETS
 
@@ -67,7 +68,7 @@ class Zurich(LazyPairs):
 
     def read(self, index: int) -> Pair:
         file = self.files[index]
-        numbers = read_plane(file)
+        numbers = apart(read_plane, file)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(
@@ -76,7 +77,7 @@ class Zurich(LazyPairs):
         light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
         return Pair(
             name=self.names[index],
-            srgb=read_picture(self.folder / "canon" / f"{file.stem}.jpg"),
+            srgb=apart(read_picture, self.folder / "canon" / f"{file.stem}.jpg"),
             raw=torch.from_numpy(np.minimum(light, 1))[None],
             cfa=CFA.RGGB,
             white_balance=(1.0, 1.0, 1.0),

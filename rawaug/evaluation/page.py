@@ -114,7 +114,7 @@ def _write(path: Path, title: str, parts: Sequence[str], settings: Mapping[str, 
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
-    path.write_text(f"{text}</body></html>\n", encoding="utf-8")
+    path.write_text(f"{text}</body></html>\n", encoding="utf-8", errors="backslashreplace")
     return path
 
 
@@ -192,6 +192,12 @@ def _images_table(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> 
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:
-            cells = rows.setdefault(image["name"], [f"{image['psnr_noisy']:.2f} / {image['ssim_noisy']:.4f}"])
-            cells.append(f"{image['psnr']:.2f} / {image['ssim']:.4f}")
+            cells = rows.setdefault(image["name"], [_both(image, "_noisy")])
+            cells.append(_both(image, ""))
     return _table(["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows)
+
+
+def _both(image: Mapping[str, Any], suffix: str) -> str:
+    """PSNR / SSIM, a dash for what is no number."""
+    figures = ((image.get(f"psnr{suffix}"), 2), (image.get(f"ssim{suffix}"), 4))
+    return " / ".join("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)

@@ -7,7 +7,8 @@ more on sRGB, after one fixed development (:func:`rawaug.data.development.develo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -32,8 +33,12 @@ from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
 
+<<<<<<< HEAD
 Run = Callable[..., Tensor]
 """``run(noisy, variance) -> denoised``, packed RAW."""
+=======
+SHOWN_FAULTS = 5
+>>>>>>> main
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -225,15 +230,42 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
+<<<<<<< HEAD
     ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame.
     """
     images = [{key: value for key, value in vars(score).items() if value is not None} for score in scores]
     result: dict[str, Any] = {"images": images}
     if flagged := sum(bool(score.levels_from_clean) for score in scores):
         result["levels_from_clean"] = flagged
+=======
+    So is a score that is no number, such as the PSNR of two equal frames; it is named under ``no_numbers``.
+    """
+    images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
+    result: dict[str, Any] = {"images": images}
+    wrong: list[str] = []
+>>>>>>> main
     for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
-        known = [value for score in scores if (value := getattr(score, key)) is not None]
+        known = []
+        for image, score in zip(images, scores, strict=True):
+            value = getattr(score, key)
+            if value is not None and math.isfinite(value):
+                image[key] = value
+                known.append(value)
+            elif value is not None:
+                wrong.append(f"{score.name}: {key} is {value}")
         if known:
             result[key] = sum(known) / len(known)
             result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
-    return result
+    return result | ({"no_numbers": wrong} if wrong else {})
+
+
+def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
+    """Make known what summaries had to leave out, once all else is printed and written.
+
+    Raises:
+        ValueError: if a frame could not be read, or a score is no number.
+    """
+    faults = [fault for one in summaries for key in ("broken", "no_numbers") for fault in one.get(key, ())]
+    if faults:
+        more = f"; and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""
+        raise ValueError(f"left out of the means: {'; '.join(faults[:SHOWN_FAULTS])}{more}")

@@ -18,6 +18,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
 from rawaug.extras import extra
+from rawaug.printable import printable
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
@@ -53,7 +54,8 @@ def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
         for axis, (title, packed) in zip(line, row.panels.items(), strict=True):
             panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
-            axis.set_title(f"{title}\n{row.captions.get(title, '')}", fontsize=9)
+            caption = f"{printable(title)}\n{printable(row.captions.get(title, ''))}"
+            axis.set_title(caption, fontsize=9, parse_math=False)
             axis.set_axis_off()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
@@ -121,13 +123,14 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
     """Print a table: a name and figures in each row, a line between sections."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title)
+    table = Table(title=Text(printable(title)))
     for k, column in enumerate(head):
         table.add_column(column, justify="right" if k else "left")
     for rows in sections:
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*(Text(printable(cell)) for cell in row))  # Text: brackets are no markup
         table.add_section()
     console = Console()
     (console if console.is_terminal else Console(width=WIDTH)).print(table)

@@ -62,8 +62,7 @@ class Ablation:
 
 def smoke_ablation(ablation: Ablation) -> Ablation:
     """The ablation in seconds, on the demo camera."""
-    tiny = replace(ablation.fit, steps=2, pixels=512, batch=128)
-    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", fit=tiny)
+    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", fit=ablation.fit.smoke())
 
 
 def ablate(ablation: Ablation) -> dict[str, Any]:

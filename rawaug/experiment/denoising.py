@@ -7,9 +7,10 @@ a stopped run resumes.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -19,11 +20,14 @@ from denoisers.network import Denoiser
 from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
-from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
-from rawaug.data.lazy import LazyPairs
+from rawaug.data import PictureFolder
+from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
+<<<<<<< HEAD
 from rawaug.data.remembered import Remembered
 from rawaug.data.select import selected
+=======
+>>>>>>> main
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -31,17 +35,20 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     network_method,
+    require_numbers,
     row_of,
     score_method,
     summary,
 )
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
+from rawaug.experiment.rehearsal import rehearse
 from rawaug.extras import extra
-from rawaug.files import digest, find_weights, fingerprint, sha256, write_json
+from rawaug.files import find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
@@ -55,18 +62,43 @@ Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
 
 
-def run(recipe: Recipe) -> Results:
+def run(
+    recipe: Recipe,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    validation: Sequence[Pair] | None = None,
+    test: Sequence[Pair] | None = None,
+) -> Results:
     """Run a recipe; the results by arm, one entry a seed, as in ``results.json``.
 
     Of several processes (``devices``) the first one writes; the others return empty lists.
+
+    Args:
+        recipe: what is run.
+        pairs, validation, test: in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name. With
+            ``pairs`` alone a part of them is held out for validation.
     """
-    return _Run(recipe).all_stages()
+    given = {"pairs": pairs, "validation": validation, "test": test}
+    return _Run(recipe, {key: frames for key, frames in given.items() if frames is not None}).all_stages()
+
+
+def dry_run(recipe: Recipe) -> None:
+    """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
+
+    Raises:
+        OSError, ValueError: for the first thing found wrong.
+    """
+    prepared = _Run(recipe)
+    print("\n".join(prepared.plan.lines(recipe)))
+    rehearse(recipe, prepared.plan)
+    print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
 
 
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})) -> None:
+        recipe = with_given_pairs(recipe, given)
         self.recipe, self.data = recipe, recipe.data
         self.folder = Path(recipe.out) / recipe.name
         self.classical = installed_classical(recipe.classical)
@@ -76,6 +108,7 @@ class _Run:
             first_network(recipe.network_of(arm), seed=0)
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
+<<<<<<< HEAD
         self.test = _first(open_pairs(self.data.test), self.data.test_count)
         source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
         self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
@@ -84,10 +117,24 @@ class _Run:
         self.pictures = Remembered(pictures, self.data.memory_mb) if self.data.memory_mb else pictures
         self.pairs = selected(source, self.data.count, self.data.select)
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+=======
+        self.plan = plan = planned(recipe, given)
+        self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
+        self.pairs: list[Pair] = []
+
+    def read(self) -> None:
+        """The frames into memory; what they lack is found before anything is fitted."""
+        if _leads():
+            print("\n".join(self.plan.lines(self.recipe)))
+        self.pairs = list(self.plan.pairs)
+        if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+>>>>>>> main
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+        require_usable(self.recipe, self.pairs, self.validation)
 
     def all_stages(self) -> Results:
         recipe = self.recipe
+        self.read()
         results: Results = {arm: [] for arm in recipe.arms}
         models: dict[str, Denoiser] = {}
         for seed in range(recipe.seed, recipe.seed + recipe.seeds):
@@ -115,7 +162,7 @@ class _Run:
             isp.info["key"] = sha256(weights)
             return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
-        settings = {**asdict(self.recipe.isp), "seed": seed}
+        settings = {**self.recipe.isp.key(), "seed": seed}
         measure = self.recipe.noise == "camera"
         key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
         if path.is_file():
@@ -148,7 +195,7 @@ class _Run:
         model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
         if not _leads():
             return model
-        levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
+        levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
         info |= {} if recipe.arms[arm].sees_clean else {"estimator": recipe.arms[arm].estimator}
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
@@ -228,16 +275,14 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
+        runs = [run[kind] for arm in results.values() for run in arm for kind in ("plain", "self_ensemble")]
+        require_numbers([*runs, *classical.values()])
 
 
 def _settings(part: Any) -> dict[str, Any]:
     """Of a part of the recipe; keys that came later are left out where they are null: older runs stay what they are."""
     later = ("start", "denoiser", "learning_rate")
     return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
-
-
-def _first(pairs: Sequence[Pair], count: int | None) -> Sequence[Pair]:
-    return pairs if count is None else pairs[:count]
 
 
 def _leads() -> bool:
@@ -256,24 +301,6 @@ def _device(accelerator: str) -> torch.device:
     return Fabric(accelerator=accelerator, devices=1).device
 
 
-def _require_unseen(test: Sequence[Pair], others: dict[str, Sequence[Pair]]) -> None:
-    """Refuse test frames that are also among the frames of training or validation."""
-    unseen = _identities(test)
-    for part, pairs in others.items():
-        seen = unseen & _identities(pairs)
-        if seen:
-            raise ValueError(f"data.test: {min(seen)} is also in data.{part}; test on unseen frames")
-
-
-def _identities(pairs: Sequence[Pair]) -> set[str]:
-    """Identifies frames without reading them: the path of a file, else the name."""
-    if isinstance(pairs, RawFolder):
-        return {str(file.resolve()) for file in pairs.files}
-    if isinstance(pairs, LazyPairs):
-        return set(pairs.names)
-    return {pair.name for pair in pairs}
-
-
 def _discard_other_checkpoint(place: Path, key: str) -> None:
     """A checkpoint of other settings cannot be gone on from."""
     place.mkdir(parents=True, exist_ok=True)
@@ -282,22 +309,3 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
     stamp.write_text(key)
-
-
-def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage depends on, by frame, without reading files again.
-
-    Path, size and modification time of RAW files; names of a dataset's frames; samples of the content of frames in
-    memory.
-    """
-    if isinstance(pairs, RawFolder):
-        return [f"{file.resolve()} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in pairs.files]
-    if isinstance(pairs, LazyPairs):
-        return list(pairs.names)
-    return [_sampled(pair) for pair in pairs]
-
-
-def _sampled(pair: Pair) -> str:
-    known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
-    images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
-    return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]

@@ -10,14 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import score_denoiser
 from rawaug.isp.model import DictionaryISP
@@ -44,8 +46,8 @@ class DownstreamConfig:
         methods: families to compare.
         test: RAW frames of unseen cameras; folders, or ``kind:path``.
         test_crop: side of the central crop scored of each test frame; null for the whole frame.
-        exposure: lowest and highest exposure in stops at which the dictionary ISP's RAW is drawn, for the test cameras'
-            headroom is not known; UPI's published distributions have theirs.
+        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
+            headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
         noise: preset, in training and on the test frames.
         denoiser: the network.
         train: the loop.
@@ -71,13 +73,25 @@ class DownstreamConfig:
         )
 
 
+class DownstreamScore(NamedTuple):
+    """PSNR in dB, in RAW and developed to sRGB."""
+
+    psnr: float
+    psnr_srgb: float
+
+
 def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
-    noise, cfa = noise_model(config.noise), CFA(model.cfa)
-    crops = _crops(model, pictures, noise, config)
+    net = trained_on(_crops(model, pictures, noise_model(config.noise), config), config, place, seed)
+    return score_on(net, config, CFA(model.cfa)).psnr
+
+
+def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) -> Denoiser:
+    """A denoiser trained on these samples, and watched by others of them."""
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
     drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
     watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
+<<<<<<< HEAD
     net = train(
         stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
     )
@@ -85,6 +99,18 @@ def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConf
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in test]
     scores = [score.psnr for score, *_ in score_denoiser(net, frames, noise, cfa, 0, 1, "PSNR_d")]
     return sum(scores) / len(scores)
+=======
+    folder = place / f"seed{seed}"
+    return train(stream, watched, config.denoiser, config.train, folder, seed, label=f"{place.name} {seed}")
+
+
+def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamScore:
+    """Mean scores on the test frames; their noise is frozen with seed 0."""
+    pairs = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
+    frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
+    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, False, "PSNR_d")]
+    return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
+>>>>>>> main
 
 
 @singledispatch
@@ -95,7 +121,7 @@ def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, con
 @_crops.register
 def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
     """By the plugin, so that each crop keeps its place in its frame."""
-    augment = RawAugment(model, noise, exposure=config.exposure)
+    augment = RawAugment(model, noise, exposure=None if model.config.cameras else config.exposure)
     return PictureCrops(RawPairs(pictures, augment, config.train.crop))
 
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
-from rawaug.experiment.denoising import run
+from rawaug.experiment.denoising import dry_run, run
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 
@@ -20,15 +21,17 @@ class Kind(NamedTuple):
         settings: dataclass of its keys.
         run: does it.
         smoke: its settings in a form of seconds.
+        dry_run: says what would be done and tries what could fail late; None where it cannot be had.
     """
 
     settings: type[Any]
     run: Callable[[Any], Any]
     smoke: Callable[[Any], Any]
+    dry_run: Callable[[Any], None] | None = None
 
 
 KINDS = {
-    "training": Kind(Recipe, run, smoke),
+    "training": Kind(Recipe, run, smoke, dry_run),
     "reconstruction": Kind(Comparison, compare, smoke_comparison),
     "ablation": Kind(Ablation, ablate, smoke_ablation),
     "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep),
@@ -41,14 +44,8 @@ def kind_of(recipe: str | Path) -> str:
     Raises:
         ValueError: if the file cannot be read as YAML, or there is no such kind.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(Path(recipe).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{recipe}: not a YAML file ({reason}); see the recipes in the package") from error
+    content = read_yaml(recipe)
     kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
     if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"{recipe}: unknown experiment {kind!r}; use one of {', '.join(KINDS)}")
+        raise ValueError(f"{recipe}: unknown experiment {kind!r:.80}; use one of {', '.join(KINDS)}")
     return kind

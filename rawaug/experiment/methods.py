@@ -1,7 +1,8 @@
 """The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
 A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best possible weights (oracle), the limit of the dictionaries.
+samples, and with the best possible weights (oracle), the limit of the dictionaries. A shipped ISP, or the file of one,
+is a method that is not fitted.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
+from rawaug.files import find_weights
 from rawaug.isp import conditioning
 from rawaug.isp.baselines import BASELINES, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
@@ -54,6 +56,17 @@ class Fitted(NamedTuple):
     parameters: int
 
 
+def is_method(family: str) -> bool:
+    """Whether this is a family to fit, or an ISP that exists: the name of a shipped one or a file."""
+    if family in FAMILIES:
+        return True
+    try:
+        find_weights(family)
+    except FileNotFoundError:
+        return False
+    return True
+
+
 def learns_by_descent(family: str) -> bool:
     """Whether a family trains on crops: it has a budget, and needs pairs that are registered pixel by pixel."""
     return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
@@ -64,6 +77,11 @@ def fit_family(
 ) -> Fitted:
     """Fit a family to pairs of one CFA; methods that learn by descent have a budget of (seconds, crop, batch)."""
     start = time.perf_counter()
+    if family not in FAMILIES:
+        isp = DictionaryISP.from_pretrained(family)
+        if isp.cfa != CFA(pairs[0].cfa):
+            raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
+        return Fitted(isp, 0.0, isp.reverse_parameters)
     if family.startswith("dictionary"):
         isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
         return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
@@ -141,7 +159,8 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 def _oracle(isp: DictionaryISP, pair: Pair) -> ISPParams:
     """The weights that come closest to the frame's RAW, by descent on its logarithmic error."""
     pixels, _ = sample_pixels([pair], 16384, seed=0)
-    logits = [torch.zeros(1, n, requires_grad=True) for n in (isp.config.colour_atoms, isp.config.gain_atoms)]
+    atoms = (isp.config.colour_atoms, isp.config.gain_atoms, isp.config.tone_atoms)
+    logits = [torch.zeros(1, n, requires_grad=True) for n in atoms if n]
     optimiser = torch.optim.Adam(logits, lr=0.1)
     for _ in range(ORACLE_STEPS):
         params = isp.params_from_weights(*(value.softmax(1) for value in logits))

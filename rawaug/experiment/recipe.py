@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
+from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import PairSettings
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
+
+HELD_OUT = "auto"
+"""``data.validation`` that is a part of ``data.pairs``."""
+_PAIRS = "pairs:"
 
 
 @dataclass
-class DataConfig:
+class DataConfig(PairSettings):
     """Where pictures come from.
 
     Args:
-        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``; null for none.
+        pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``, such as ``pairs:PATH`` for
+            noisy/clean pairs; null for none.
         count: number of pairs to use; null for all.
         select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
             folders.
         pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
         memory_mb: size in megabytes of the cache of decoded pictures.
-        validation: validation pairs, of which self-supervised arms see only the noisy frames; null validates on RAW
-            made from the pictures and keeps the final weights.
+        validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
+            fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
+            and keeps the final weights.
         validation_crop: side of the central crop used of each validation frame; null for the whole frame.
         test: test pairs; no earlier stage sees them.
         test_count: number of pairs to use; null for all.
@@ -40,6 +50,21 @@ class DataConfig:
     test: str = "demo:test"
     test_count: int | None = None
 
+    def __post_init__(self) -> None:
+        if self.validation == HELD_OUT and self.pairs is None:
+            raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
+        given = [key for key, value in self._pair_settings().items() if value is not None]
+        specs = (self.pairs, self.validation, self.test)
+        if given and not any(isinstance(spec, str) and spec.startswith(_PAIRS) for spec in specs):
+            raise ValueError(f"data.{given[0]}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
+
+    def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
+        """What the reader of ``spec`` is given."""
+        return self._pair_settings() if isinstance(spec, str) and spec.startswith(_PAIRS) else {}
+
+    def _pair_settings(self) -> dict[str, Any]:
+        return {setting.name: getattr(self, setting.name) for setting in fields(PairSettings)}
+
 
 @dataclass
 class ArmConfig:
@@ -47,7 +72,7 @@ class ArmConfig:
 
     Args:
         augmented: share of every batch that comes from sRGB pictures through the ISP, 0 to 1.
-        sampling: convex, perturb or chosen, see :class:`rawaug.RawAugment`.
+        sampling: convex, independent, perturb or chosen, see :class:`rawaug.RawAugment`.
         zoom: of supervised arms: half of the crops of pictures are enlarged by up to this factor, see
             :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
@@ -60,7 +85,7 @@ class ArmConfig:
     """
 
     augmented: float = 0.0
-    sampling: Literal["convex", "perturb", "chosen"] = "convex"
+    sampling: Literal["convex", "independent", "perturb", "chosen"] = "convex"
     zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
@@ -74,7 +99,10 @@ class ArmConfig:
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
             raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
-        name, settings = name_and_settings(self.estimator)
+        try:
+            name, settings = name_and_settings(self.estimator)
+        except ValueError as error:
+            raise ValueError(f"estimator: {error}") from None
         for key in ("alpha", "correct", "gamma"):
             if (old := getattr(self, key)) is not None:
                 settings[key] = old
@@ -137,8 +165,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        if self.seeds < 1:
-            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
+        require_between("seed", self.seed, -(2**63), 2**62)
+        require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:
             self.train = replace(self.train, steps=self.steps)
         if self.data.pairs is None and self.camera is None:
@@ -180,7 +208,7 @@ def smoke(recipe: Recipe) -> Recipe:
             pairs=recipe.data.pairs and "demo:train",
             validation=recipe.data.validation and "demo:validation",
         ),
-        isp=replace(recipe.isp, steps=2, pixels=512, batch=128),
+        isp=recipe.isp.smoke(),
         denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
@@ -190,6 +218,47 @@ def smoke(recipe: Recipe) -> Recipe:
         device="cpu",
         devices=1,
     )
+
+
+def shipped_recipes() -> dict[str, Path]:
+    """The recipes that travel with the package, by name."""
+    shipped = Path(str(resources.files("rawaug"))) / "recipes"
+    folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
+    return {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
+
+
+def recipe_list() -> str:
+    """The shipped recipes, a line each: name and what its file opens with."""
+    known = {name: file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, file in _listed()}
+    width = max(map(len, known)) + 2
+    return "\n".join(f"  {name:<{width}}{title}" for name, title in known.items())
+
+
+def _listed() -> list[tuple[str, Path]]:
+    """Those at the top first."""
+    return sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))
+
+
+def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
+    """What a recipe's file sets, by the keys of the command line such as ``data.count``; arms are one key.
+
+    Raises:
+        ValueError: if it sets a key that ``settings``, a dataclass, does not have.
+    """
+    found: dict[str, Any] = {}
+    hints = get_type_hints(settings)
+    for key, value in (read_yaml(file) or {}).items():
+        if key not in hints:
+            raise ValueError(f"{file}: unknown key {key}{nearest(key, hints)}")
+        if not is_dataclass(hints[key]):
+            found[key] = value
+            continue
+        inner = get_type_hints(hints[key])
+        for name, setting in (value or {}).items():
+            if name not in inner:
+                raise ValueError(f"{file}: unknown key {key}.{name}{nearest(name, inner)}")
+            found[f"{key}.{name}"] = setting
+    return found
 
 
 def find_recipe(name: str) -> Path:
@@ -202,12 +271,9 @@ def find_recipe(name: str) -> Path:
         >>> find_recipe("sidd/fewshot").name
         'fewshot.yaml'
     """
-    path = Path(name)
+    path, known = Path(name), shipped_recipes()
     if path.is_file():
         return path
-    shipped = Path(str(resources.files("rawaug"))) / "recipes"
-    folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
-    known = {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]

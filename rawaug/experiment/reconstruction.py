@@ -29,6 +29,7 @@ from rawaug.experiment.methods import (
     ROWS,
     cycle_psnr,
     fit_family,
+    is_method,
     learns_by_descent,
     mosaic_only_psnr,
     score_rows,
@@ -52,7 +53,8 @@ class Comparison:
         data: the pairs, of one CFA; methods that train on crops need them registered.
         noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
-        methods: families to fit: dictionary, dictionary-encoders and the baselines.
+        methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
+            a shipped one's name or a file.
         seconds: training budget of methods trained by gradient descent, without file reading.
         crop, batch: of these methods' training: small ones give more steps to a short budget.
         longer: factor of a second, longer budget for them; 0 for none.
@@ -85,9 +87,10 @@ class Comparison:
     out: str = "runs"
 
     def __post_init__(self) -> None:
-        unknown = [method for method in self.methods if method not in FAMILIES]
+        unknown = [method for method in self.methods if not is_method(method)]
         if unknown or not self.methods:
-            raise ValueError(f"methods: {unknown or 'none'}; choose from {', '.join(FAMILIES)}")
+            listed = ", ".join(FAMILIES)
+            raise ValueError(f"methods: {unknown or 'none'}; choose from {listed}, or name an ISP or its file")
         if self.seeds < 1:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
@@ -99,7 +102,6 @@ class Comparison:
 def smoke_comparison(comparison: Comparison) -> Comparison:
     """The comparison in seconds, on the demo camera."""
     downstream = comparison.downstream and comparison.downstream.smoke()
-    tiny = replace(comparison.fit, steps=2, pixels=512, batch=128)
     quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
     return replace(
         comparison,
@@ -110,7 +112,7 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
         longer=0.0,
         patches=1,
         seeds=1,
-        fit=tiny,
+        fit=comparison.fit.smoke(),
         downstream=downstream,
     )
 
@@ -205,7 +207,7 @@ class _Comparison:
         seeds = range(settings.seed, settings.seed + settings.seeds)
         budget = (settings.seconds, settings.crop, settings.batch)
         parts = (
-            asdict(self.fit),
+            self.fit.key(),
             settings.noise,
             downstream and asdict(downstream),
             settings.data,
@@ -220,17 +222,17 @@ class _Comparison:
         if downstream:
             samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
             trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
-            place = self.folder / f"{family}-denoisers-{trained}"
+            place = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
             result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
         write_json(result, path)
         return result
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
-        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
+        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
 
     def _path(self, stem: str) -> Path:
-        return self.folder / f"{stem}.json"
+        return self.folder / f"{stem.replace('/', '_')}.json"
 
 
 def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rawaug.extras import extra
-from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, damage_as_os_error
+from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, opened_tiff
 
 _DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
@@ -88,7 +88,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
         import tifffile
 
     try:
-        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff, path.open("rb") as file:
+        with opened_tiff(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
             dng = any(_DNG_VERSION in page.tags for page in pages)
@@ -122,12 +122,15 @@ def _read(file: BinaryIO, order: str, pointer: int) -> list[Entry]:
     """The directory whose offset is stored at ``pointer``."""
     (start,) = _unpack(file, order + "I", pointer)
     (count,) = _unpack(file, order + "H", start)
-    entries = []
+    entries, left = [], file.seek(0, SEEK_END)
     for place in range(start + 2, start + 2 + 12 * count, 12):
         code, dtype, values = _unpack(file, order + "HHI", place)
         if code in _POINTERS or not 0 < dtype < len(_SIZES):
             continue
         size = _SIZES[dtype] * values
+        left -= size
+        if left < 0:
+            raise ValueError(f"values of tag {code} and others are larger than the file")
         file.seek(place + 8 if size <= 4 else _unpack(file, order + "I", place + 8)[0])
         entries.append(Entry(code, dtype, values, file.read(size)))
     return entries

@@ -25,8 +25,10 @@ from rawaug.bayer import turn
 from rawaug.extras import extra
 from rawaug.io.icc import to_srgb
 
-MAX_PIXELS = 2**28
-"""Larger pictures (16384 x 16384) are refused by default, since a few header bytes can claim any size."""
+MAX_PIXELS = 2**26
+"""Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
+
+MAX_CHANNELS = 4
 
 _VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
 """Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
@@ -146,8 +148,7 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
-    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
-        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
+    require_utf8(path)
     source = oiio.ImageInput.open(str(path))
     if source is None:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
@@ -166,6 +167,16 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
     return pixels, spec
 
 
+def require_utf8(path: Path) -> None:
+    """Refuse a name that the libraries cannot be given.
+
+    Raises:
+        OSError: if it is not UTF-8.
+    """
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
+
+
 def _floating() -> tuple[Any, ...]:
     with extra("raw"):
         import OpenImageIO as oiio
@@ -175,11 +186,11 @@ def _floating() -> tuple[Any, ...]:
 
 def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
     """Refuse what would fill the memory before anything is decoded."""
-    if spec.width * spec.height * spec.depth > max_pixels:
-        raise ValueError(
-            f"{path}: declares {spec.height} x {spec.width} pixels, above the limit of {max_pixels}; "
-            "split it, or raise max_pixels"
-        )
+    pixels = spec.width * spec.height * spec.depth
+    if pixels > max_pixels or pixels * spec.nchannels > MAX_CHANNELS * max_pixels:
+        size = f"{spec.height} x {spec.width} pixels"
+        size += f" of {spec.nchannels} channels" if pixels <= max_pixels else ""
+        raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
 
 
 def _require_srgb(spec: Any, path: Path) -> None:

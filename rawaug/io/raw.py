@@ -27,11 +27,15 @@ from torch import Tensor
 from rawaug.bayer import CFA
 from rawaug.extras import extra
 from rawaug.io.gain_map import GainMap, gains_at_sites
+from rawaug.io.picture_files import require_utf8
 from rawaug.io.shot import UNKNOWN, Exposure, camera_of, exposure_of
 from rawaug.io.tiff_tags import TiffTags, read_tiff_tags
 
 XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _TYPICAL_COLOR_MATRIX = np.array([[1.60, -0.45, -0.15], [-0.25, 1.60, -0.35], [0.00, -0.50, 1.50]])
+
+MAX_PIXELS = 200_000_000
+"""Larger mosaics are refused before they are decoded; the largest sensors have 150 million sites."""
 
 _developed_in: int | None = None
 """The process that last used LibRaw's OpenMP threads: they do not survive a fork."""
@@ -154,6 +158,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such RAW file")
+    require_utf8(path)
     try:
         with rawpy.imread(str(path)) as raw:
             tags = read_tiff_tags(path)
@@ -162,6 +167,9 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
                 raise OSError(
                     f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic_end} bytes; copy it again"
                 )
+            if raw.sizes.raw_height * raw.sizes.raw_width > MAX_PIXELS:
+                declared = f"{raw.sizes.raw_height} x {raw.sizes.raw_width}"
+                raise ValueError(f"{path}: declares {declared} pixels, above the limit of {MAX_PIXELS}; copy it again")
             raw.unpack()
             yield raw, tags
     except rawpy.LibRawError as error:

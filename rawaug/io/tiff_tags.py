@@ -17,6 +17,7 @@ import numpy as np
 
 from rawaug.extras import extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
+from rawaug.io.tiff_directories import require_no_circle
 
 _MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
 _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50715, 50716)
@@ -60,7 +61,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
         import tifffile
 
     try:
-        with damage_as_os_error(path), tifffile.TiffFile(path) as tiff:
+        with opened_tiff(path) as tiff:
             pages = list(all_pages(tiff.pages))
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
@@ -70,6 +71,23 @@ def read_tiff_tags(path: Path) -> TiffTags:
             return TiffTags(make, model, _noise_profile(pages), _mosaic_end(mosaics), black, maps)
     except tifffile.TiffFileError:
         return TiffTags()
+
+
+@contextmanager
+def opened_tiff(path: Path) -> Iterator[Any]:
+    """tifffile's file, once its directories are known to end; damage becomes one OSError that names the file.
+
+    Raises:
+        OSError: if the tags are damaged.
+        tifffile.TiffFileError: if it is no TIFF.
+    """
+    with extra("raw"):
+        import tifffile
+
+    with damage_as_os_error(path):
+        require_no_circle(path)
+        with tifffile.TiffFile(path) as tiff:
+            yield tiff
 
 
 @contextmanager

@@ -41,6 +41,8 @@ class CameraSampler:
         cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
         kelvin: lowest and highest colour temperature of the light.
         lamps: share of fluorescent and LED lamps.
+        consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
+            and gains are drawn one by one.
 
     Raises:
         ValueError: if fewer than one is to be mixed.
@@ -54,12 +56,13 @@ class CameraSampler:
         tones_mixed: int = TONES_MIXED,
         kelvin: tuple[float, float] = (WARMEST, COLDEST),
         lamps: float = LAMP_SHARE,
+        consistent: bool = True,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
             raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
         self.cameras, self.tone_atoms = cameras, tone_atoms
         self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
-        self.kelvin, self.lamps = kelvin, lamps
+        self.kelvin, self.lamps, self.consistent = kelvin, lamps, consistent
 
     @torch.no_grad()
     def sample(self, batch: int, generator: torch.Generator) -> ISPParams:
@@ -69,6 +72,8 @@ class CameraSampler:
             ValueError: if no light gives a camera plausible gains.
         """
         weights, balance = self._cameras_in_light(batch, generator)
+        if not self.consistent:
+            _, balance = self._cameras_in_light(batch, generator)
         matrix = self.cameras.combine(weights)
         gains = (balance / balance.amin(dim=1, keepdim=True)).to(matrix)
         tones = none = gains[:, :0]

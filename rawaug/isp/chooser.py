@@ -82,7 +82,7 @@ def _folded(encoder: Encoder, maps: list[Tensor]) -> Encoder:
     first = encoder.layers[0]
     assert isinstance(first, nn.Conv2d) and first.bias is not None
     weight = first.weight.unflatten(1, (-1, 3))
-    folded = nn.Conv2d(3 * len(maps), first.out_channels, 3, stride=2, padding=1)
+    folded = nn.Conv2d(3 * len(maps), first.out_channels, 3, stride=2, padding=1, dtype=weight.dtype)
     folded.weight.copy_(torch.cat([torch.einsum("onixy,nij->ojxy", weight, atoms) for atoms in maps], dim=1))
     folded.bias = first.bias
     encoder.layers[0] = folded

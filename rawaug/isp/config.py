@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from rawaug.bayer import CFA
 from rawaug.isp.stages import HIGHLIGHT_KNEE
+from rawaug.registry import require_between
+
+MOST_ATOMS, MOST_CAMERAS, MOST_FEATURES, MOST_STAGES = 2048, 2**16, 1024, 32
+"""More are refused before anything is built: a few bytes of a file can ask for any size."""
 
 POINTWISE_STAGES = ("tone", "gamma", "colour", "gains", "shading")
 """The stages of the paper between sRGB and the mosaic, in reverse order; the k-th makes x_k."""
@@ -44,12 +48,26 @@ class ISPConfig:
     def __post_init__(self) -> None:
         CFA(self.cfa)
         for key in ("stages", "encoder_widths"):  # a recipe or a file gives lists
+            if not isinstance(getattr(self, key), (tuple, list)):
+                raise ValueError(f"{key} must be a list, got {getattr(self, key)!r:.100}")
             object.__setattr__(self, key, tuple(getattr(self, key)))
+        if len(self.stages) > MOST_STAGES or not all(isinstance(stage, str) for stage in self.stages):
+            raise ValueError(f"stages must be at most {MOST_STAGES} names, got {self.stages!r:.100}")
+        for key in ("encoders", "attention"):
+            if not isinstance(getattr(self, key), bool):
+                raise ValueError(f"{key} must be true or false, got {getattr(self, key)!r:.100}")
+        for key in ("colour_atoms", "gain_atoms"):
+            require_between(key, getattr(self, key), 1, MOST_ATOMS)
+        require_between("tone_atoms", self.tone_atoms, 0, MOST_ATOMS)
+        require_between("cameras", self.cameras, 0, MOST_CAMERAS)
+        for width in self.encoder_widths:
+            require_between("encoder_widths", width, 1, MOST_FEATURES)
+        require_between("knee", self.knee, 0.0, 1.0)
         wrong = [stage for stage in self.stages if self.stages.count(stage) > 1]
         if wrong or not self.stages:
             raise ValueError(f"stages: {wrong or 'none'}; choose one or more, each at most once")
-        if len(self.encoder_widths) != 3 or min(self.colour_atoms, self.gain_atoms, *self.encoder_widths) < 1:
-            raise ValueError("encoder_widths must be three numbers; they and the numbers of atoms must be at least 1")
+        if len(self.encoder_widths) != 3:
+            raise ValueError(f"encoder_widths must be three numbers, got {self.encoder_widths!r:.100}")
         if (self.tone_atoms > 0) != ("curve" in self.stages):
             raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
         if not 0.0 <= self.knee < 1.0:

@@ -187,7 +187,7 @@ def project_to_simplex(weights: Tensor) -> Tensor:
 
 def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Tensor:
     """Dictionary augmentation: ``w + strength * N(0, I)``, brought back to the simplex; ``(B, N)`` to ``(B, N)``."""
-    noise = torch.randn(weights.shape, generator=generator, device=generator.device).to(weights)
+    noise = torch.randn(weights.shape, generator=generator, device=generator.device, dtype=torch.float32).to(weights)
     return project_to_simplex(weights + strength * noise)
 
 
@@ -197,7 +197,7 @@ def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor
     Normalised exponentials are the flat Dirichlet distribution. Uniform weights do not fill the hull evenly: the more
     atoms, the more of the mixtures are near its middle.
     """
-    uniform = torch.rand(batch, atoms, generator=generator, device=generator.device)
+    uniform = torch.rand(batch, atoms, generator=generator, device=generator.device, dtype=torch.float32)
     exponential = -torch.log1p(-uniform)
     return exponential / exponential.sum(dim=1, keepdim=True)
 

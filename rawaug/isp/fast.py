@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, unpack
 from rawaug.isp.chooser import Chooser
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
@@ -91,19 +91,20 @@ class BakedISP(nn.Module):
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.
         """
         require_batch(srgb, params, place)
-        camera = self._camera(srgb, params, place)
-        if srgb.dtype != torch.uint8:
-            srgb = srgb.float()
-        if fallback.usable(srgb):  # imported late, for Triton may be missing
-            return fallback.kernel_or(
-                lambda: import_module("rawaug.kernels.raw_triton").unprocess(srgb, camera, white),
-                lambda: raw_torch.unprocess(srgb, camera, white),
-            )
-        if srgb.device.type != "cpu" or not compiled.available():
-            return raw_torch.unprocess(srgb, camera, white)
-        from rawaug.kernels import raw_numba
+        return _pass(srgb, self._camera(srgb, params, place), white)
 
-        return raw_numba.unprocess(srgb, camera, white)
+    @torch.no_grad()
+    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """RAW of all three colours at every site, ``(B, 3, H, W)``, for mosaics other than Bayer's.
+
+        Three passes, one a colour. Arguments and errors are those of the call.
+        """
+        require_batch(srgb, params, place)
+        camera, rgb = self._camera(srgb, params, place), []
+        for colour in range(3):
+            sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
+            rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), white), CFA.RGGB))
+        return torch.cat(rgb, dim=1)
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> raw_torch.Camera:
         batch, _, height, width = srgb.shape
@@ -125,6 +126,22 @@ class BakedISP(nn.Module):
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
         knee, where = self.config.knee, torch.tensor(sites)
         return raw_torch.Camera(table, curves, self.attention, colour, knee, frame, shading, where)
+
+
+def _pass(srgb: Tensor, camera: raw_torch.Camera, white: float) -> Tensor:
+    """By the kernel for the device of ``srgb``."""
+    if srgb.dtype != torch.uint8:
+        srgb = srgb.float()
+    if fallback.usable(srgb):  # imported late, for Triton may be missing
+        return fallback.kernel_or(
+            lambda: import_module("rawaug.kernels.raw_triton").unprocess(srgb, camera, white),
+            lambda: raw_torch.unprocess(srgb, camera, white),
+        )
+    if srgb.device.type != "cpu" or not compiled.available():
+        return raw_torch.unprocess(srgb, camera, white)
+    from rawaug.kernels import raw_numba
+
+    return raw_numba.unprocess(srgb, camera, white)
 
 
 def bakeable(order: Sequence[Stage]) -> bool:

@@ -6,7 +6,6 @@ and what is off is left out, which changes no output.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,10 +13,12 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.files import read_tensors, write_tensors
+from rawaug.files import parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp.config import ISPConfig
 
 _ADVICE = "fit or copy it again"
+_INFINITE = ("colour.spread",)
+"""A width, which is infinite where the light says nothing of the colour."""
 _OLD_NAMES = {
     "shading.": "stages.shading.mask.",
     **{
@@ -37,7 +38,7 @@ _OLD_NAMES = {
 
 def write_isp(config: ISPConfig, info: Mapping[str, Any], state: Mapping[str, Tensor], path: str | Path) -> None:
     """Write an ISP's file, whole or not at all."""
-    header = {"format": "rawaug", "kind": "isp", "config": json.dumps(asdict(config)), "info": json.dumps(info)}
+    header = {"format": "rawaug", "kind": "isp", "config": to_json(asdict(config)), "info": to_json(info)}
     write_tensors(state, header, path)
 
 
@@ -47,14 +48,13 @@ def read_isp(path: Path) -> tuple[ISPConfig, dict[str, Any], dict[str, Tensor]]:
     Raises:
         ValueError: if the file is not that of an ISP, or its header is damaged.
     """
-    header, state = read_tensors(path, _ADVICE)
+    header, state = read_tensors(path, _ADVICE, _INFINITE)
     if header.get("kind") != "isp":
         raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
     try:
-        settings: dict[str, Any] = json.loads(header["config"])
-        config = ISPConfig(**settings)
-        info = dict(json.loads(header.get("info", "{}")))
-    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        config = ISPConfig(**parse_object(header["config"]))
+        info = parse_object(header.get("info", "{}"))
+    except (LookupError, TypeError, ValueError) as error:
         raise damaged(path, error) from error
     if any(key.startswith("reverse_networks.") for key in state):
         state = _translated(state, config)
@@ -66,7 +66,8 @@ def read_isp(path: Path) -> tuple[ISPConfig, dict[str, Any], dict[str, Tensor]]:
 
 def damaged(path: Path, error: Exception) -> ValueError:
     """What to raise for a configuration that no ISP can have."""
-    return ValueError(f"{path}: its configuration is damaged ({str(error).splitlines()[0]}); {_ADVICE}")
+    reason = " ".join(str(error).split())
+    return ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}")
 
 
 def misfit(path: Path, key: str) -> ValueError:

@@ -114,11 +114,6 @@ class DictionaryISP(ReverseISP):
         for stage in self.ordered_stages:
             stage.config = config
 
-    @property
-    def encoders_in_use(self) -> bool:
-        """Whether the encoders look at the picture."""
-        return self.config.encoders
-
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
         """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
 
@@ -143,14 +138,15 @@ class DictionaryISP(ReverseISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
+    def draw_setting(self, batch: int, generator: torch.Generator, consistent: bool = True) -> ISPParams:
         """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
 
         A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
-        atoms with uniform weights.
+        atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
+        a fitted camera they always have weights of their own.
         """
         if isinstance(self.colour, CameraDictionary):
-            return CameraSampler(self.colour, self.config.tone_atoms).sample(batch, generator)
+            return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent).sample(batch, generator)
         config, device = self.config, self.colour.matrices.device
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
@@ -218,9 +214,23 @@ class DictionaryISP(ReverseISP):
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, the picture or a gain is out of range, or
                 what is given is for another number of pictures.
         """
-        if srgb.ndim != 4 or srgb.shape[1] != 3:
-            raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
-        x = stages.display_referred(srgb)
+        if srgb.ndim != 4 or srgb.shape[1] != 3 or min(srgb.shape[2:]) < 2:
+            raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
+        with self._float32(srgb):
+            return self._reverse(
+                stages.display_referred(srgb), params, white_balance, digital_gain, raw_samples, place, intermediates
+            )
+
+    def _reverse(
+        self,
+        x: Tensor,
+        params: ISPParams | None,
+        white_balance: Tensor | tuple[float, ...] | None,
+        digital_gain: Tensor | float | None,
+        raw_samples: Tensor | None,
+        place: Tensor | None,
+        intermediates: bool,
+    ) -> ISPResult:
         params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
         if len(params.gains) != len(x):
             raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
@@ -229,6 +239,19 @@ class DictionaryISP(ReverseISP):
         seen: dict[str, Tensor] = {}
         x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
         return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
+
+    def _float32(self, like: Tensor) -> torch.autocast:
+        """RAW is float32, in mixed precision too.
+
+        Raises:
+            ValueError: if the ISP is not, or is on another device.
+        """
+        own = self.gain.log_gains
+        if own.dtype != torch.float32:
+            raise ValueError(f"RAW is float32, but this ISP was converted to {own.dtype}; call isp.float()")
+        if own.device != like.device:
+            raise ValueError(f"the picture is on {like.device} but the ISP is on {own.device}; call isp.to(...)")
+        return torch.autocast(like.device.type, enabled=False)
 
     def reverse_pixels(
         self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
@@ -250,12 +273,13 @@ class DictionaryISP(ReverseISP):
         intermediates: bool = False,
     ) -> ISPResult:
         """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
-        x5 = bayer.demosaic(raw, self.cfa)
-        if params is None:
-            params = self.choose_forward(self._unshaded(x5, place))
-        params = conditioning.with_white_balance(self, params, white_balance, None)
-        seen: dict[str, Tensor] = {"x5": x5}
-        srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
+        with self._float32(raw):
+            x5 = bayer.demosaic(stages.scene_referred(raw), self.cfa)
+            if params is None:
+                params = self.choose_forward(self._unshaded(x5, place))
+            params = conditioning.with_white_balance(self, params, white_balance, None)
+            seen: dict[str, Tensor] = {"x5": x5}
+            srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
 
     def forward_pixels(
@@ -322,5 +346,8 @@ class DictionaryISP(ReverseISP):
         if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
             raise misfit(path, wrong[0])
         isp.load_state_dict(state)
+        for name, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
+            if not atoms.isfinite().all():
+                raise damaged(path, ValueError(f"its {name} atoms are not finite"))
         isp.info = info
         return isp.eval()

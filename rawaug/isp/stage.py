@@ -160,5 +160,5 @@ def stage_class(name: str) -> type[Stage]:
 
 def node_colours(nodes: int) -> Tensor:
     """The colours ``(1, 3, N, N * N)`` at the nodes of a table, axes B, G, R."""
-    axis = torch.linspace(0.0, 1.0, nodes)
+    axis = torch.linspace(0.0, 1.0, nodes, dtype=torch.float32)
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)

@@ -45,6 +45,8 @@ def display_referred(srgb: Tensor) -> Tensor:
     Raises:
         ValueError: if it is not.
     """
+    if srgb.layout != torch.strided:
+        raise ValueError(f"a picture must be a dense tensor, got {srgb.layout}; call to_dense()")
     if srgb.dtype not in (torch.uint8, torch.float32):
         raise ValueError(f"a picture must be uint8 or float32 in [0, 1], got {srgb.dtype}; convert it first")
     require_display_range(srgb)
@@ -62,6 +64,19 @@ def require_display_range(image: Tensor) -> None:
         raise ValueError(
             f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
         )
+
+
+def scene_referred(raw: Tensor) -> Tensor:
+    """RAW ``(B, 1, H, W)`` as float32, looked at on the CPU as :func:`display_referred` does.
+
+    Raises:
+        ValueError: if it has another shape or is no floating-point RAW, or a value is not finite.
+    """
+    if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
+        raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
+    if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):
+        raise ValueError(f"RAW must be finite, got NaN or infinity in {damaged} of {raw.numel()} values")
+    return raw.float()
 
 
 class ToneNetwork(nn.Module):
@@ -147,8 +162,8 @@ def place_in_frame(
     """
     full_height, full_width = frame or (height, width)
     half_diagonal = 0.5 * (full_height**2 + full_width**2) ** 0.5
-    y = (torch.arange(height) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
-    x = (torch.arange(width) + (offset[1] + 0.5 - full_width / 2)) / half_diagonal
+    y = (torch.arange(height, dtype=torch.float32) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
+    x = (torch.arange(width, dtype=torch.float32) + (offset[1] + 0.5 - full_width / 2)) / half_diagonal
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
 
 
@@ -171,7 +186,7 @@ class GaussianMask(nn.Module):
     @property
     def precision(self) -> Tensor:
         """Sigma^-1, ``(2, 2)``, positive semi-definite by construction."""
-        factor = torch.zeros(2, 2, device=self.factor.device)
+        factor = torch.zeros(2, 2, device=self.factor.device, dtype=self.factor.dtype)
         rows, columns = torch.tensor([0, 1, 1]), torch.tensor([0, 0, 1])
         factor = factor.index_put((rows, columns), self.factor)
         return factor @ factor.T

@@ -34,9 +34,14 @@ class UnbakedISP(nn.Module):
     @torch.no_grad()
     def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
         """sRGB to clean packed RAW."""
+        return bayer.pack_rgb(self.colours(srgb, params, place, white), self.isp.cfa)
+
+    @torch.no_grad()
+    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """RAW of all three colours at every site, ``(B, 3, H, W)``."""
         require_batch(srgb, params, place)
         x5 = self.isp.reverse_pixels(as_float(srgb), params, None if place is None else _coordinates(srgb, place))
-        return bayer.pack(bayer.mosaic(x5, self.isp.cfa), self.isp.cfa).clamp_(max=white)
+        return x5.clamp(max=white)
 
 
 def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
@@ -53,7 +58,8 @@ def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
 def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:
     """Of the pixels of turned crops in their full frames, ``(B, 2, H, W)``."""
     height, width = srgb.shape[-2:]
-    frames = torch.tensor([frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()], device=srgb.device)
+    corners = [frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()]
+    frames = torch.tensor(corners, device=srgb.device, dtype=torch.float32)
     start, down, right = frames.reshape(-1, 3, 2, 1, 1).unbind(1)
     rows = torch.arange(height, device=srgb.device)[:, None]
     return start + down * rows + right * torch.arange(width, device=srgb.device)

@@ -47,6 +47,8 @@ def shot_read(
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
     signal, out = clean.detach().contiguous().numpy(), noisy.numpy()
+    if not noisy.numel():
+        return noisy, variance
     var = variance.numpy() if with_variance else None  # then no code is compiled for it
     variances = levels.detach().to("cpu", torch.float32).numpy()
     key = np.array([(k & 0xFFFFFFFF, k >> 32) for k in keys], dtype=np.uint32)

@@ -33,7 +33,7 @@ _EXP2 = tuple(np.float32(c) for c in (1.8775839e-3, 8.9893471e-3, 0.055826288, 0
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     """sRGB ``(B, 3, H, W)``, uint8 or float32 on the CPU, to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
     batch, _, height, width = srgb.shape
-    raw = torch.empty(batch, 4, height // 2, width // 2)
+    raw = torch.empty(batch, 4, height // 2, width // 2, dtype=torch.float32)
     if not raw.numel():
         return raw
     picture, out = srgb.detach().contiguous().numpy(), raw.numpy()
@@ -72,7 +72,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
 
 def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
     """uint8 ``(B, 3, H, W)`` on the CPU, averaged to ``(B, 3, height, width)`` and looked up in the table: x2."""
-    x2 = torch.empty(len(srgb), 3, height, width)
+    x2 = torch.empty(len(srgb), 3, height, width, dtype=torch.float32)
     picture, nodes, out = srgb.detach().contiguous().numpy(), table.contiguous().numpy(), x2.numpy()
     rows, columns = _windows(srgb.shape[2], height), _windows(srgb.shape[3], width)
 

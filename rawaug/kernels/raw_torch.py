@@ -74,7 +74,7 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
     batch, _, height, width = srgb.shape
-    raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device)
+    raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device, dtype=torch.float32)
     pictures, rows = batch, height
     if srgb.device.type == "cpu":
         pictures, rows = 1, max(2, _BAND // max(width, 1) // 2 * 2)

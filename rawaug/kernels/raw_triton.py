@@ -20,7 +20,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     """sRGB ``(B, 3, H, W)``, uint8 or float32 in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
     batch, _, height, width = srgb.shape
     h, w = height // 2, width // 2
-    raw = torch.empty(batch, 4, h, w, device=srgb.device)
+    raw = torch.empty(batch, 4, h, w, device=srgb.device, dtype=torch.float32)
     nodes = max(camera.table.shape[0], camera.attention.shape[0])
     entries = camera.curves.shape[1] if camera.curves.numel() else 0
     scale = ((entries or nodes) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)

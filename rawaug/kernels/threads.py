@@ -4,10 +4,14 @@ Its loops share a tensor out among the threads, and the ends of a share are work
 middle: the last bit of a power or an exponential depends on the number of threads. One thread gives the same bits
 everywhere. Where a step is so small that more threads gain nothing, it also spares the tenfold loss that they bring on
 a busy machine.
+
+A child of a fork stays on one thread: the threads of OpenMP, on which PyTorch's loops run, do not survive a fork, and a
+loop that waits for them never ends. DataLoader's workers are on one thread anyway.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -29,3 +33,12 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def _after_fork() -> None:
+    if torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

@@ -45,6 +45,7 @@ class Compose(NoiseModel):
         if not models or len(set(streams)) < len(streams):
             raise ValueError(f"Compose needs one or more noise models of different kinds, got {streams}")
         self.models = list(models)
+        self.by_plane = any(model.by_plane for model in models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         params: Params = {}
@@ -127,7 +128,7 @@ class EldNoise(Compose):
     def __init__(self, camera: str, iso: Iso = None) -> None:
         self.law = EldLevels(camera, iso)
         shapes = self.law.camera["tukey_lambda_shape"]
-        self.shapes = torch.tensor(shapes)
+        self.shapes = torch.tensor(shapes, dtype=torch.float32)
         tails = TukeyLambdaNoise(FixedLevels(0, 0), (min(shapes), max(shapes)))
         bias = ColourBias(self.law.camera["colour_bias_sd_dn"] / self.law.white_dn)
         rounding = Quantisation(bits=14, black_level=2**14 - 1 - int(self.law.white_dn))

@@ -9,6 +9,7 @@ import numpy as np
 
 from rawaug.extras import extra
 from rawaug.noise.estimate import NoiseEstimate
+from rawaug.printable import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +62,7 @@ def plot_noise(
             axes.legend(fontsize=8)
         else:
             axes.set(xlim=(line[0], 1.0), ylim=(variance[used].min() / 3, 3 * variance[used].max()))
-    figure.suptitle(title)
+    figure.suptitle(printable(title), parse_math=False)
     if path is not None:
         figure.savefig(Path(path), dpi=120)
     return figure

@@ -39,11 +39,13 @@ def published() -> dict[str, Any]:
 def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
     low, high = (math.log(limit) for limit in limits)
-    return torch.exp(low + (high - low) * torch.rand(batch, generator=generator, device=generator.device))
+    return torch.exp(
+        low + (high - low) * torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32)
+    )
 
 
 def _normal(batch: int, generator: torch.Generator) -> Tensor:
-    return torch.randn(batch, generator=generator, device=generator.device)
+    return torch.randn(batch, generator=generator, device=generator.device, dtype=torch.float32)
 
 
 class FixedLevels:
@@ -61,8 +63,11 @@ class FixedLevels:
         self.shot_var, self.read_var = float(shot_var), float(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        device = generator.device
-        return torch.full((batch,), self.shot_var, device=device), torch.full((batch,), self.read_var, device=device)
+        shot_var, read_var = (
+            torch.full((batch,), level, device=generator.device, dtype=torch.float32)
+            for level in (self.shot_var, self.read_var)
+        )
+        return shot_var, read_var
 
 
 class MixedLevels:

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from rawaug.kernels import compiled, fallback
+from rawaug.kernels.eager import eager
 from rawaug.kernels.philox import normals
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.poisson import poisson
@@ -47,6 +48,8 @@ class NoiseModel(ABC):
     """
 
     stream: ClassVar[str]
+    by_plane = False
+    """Whether the four planes differ in more than their signal: such noise knows packed Bayer RAW alone."""
 
     @abstractmethod
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -71,6 +74,7 @@ class NoiseModel(ABC):
         only the noisy one is known, and it is what UPI's networks are given (Brooks et al. 2019).
         """
 
+    @eager
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         """Noisy RAW ``(B, 4, h, w)`` of clean packed RAW ``(B, 4, h, w)``: clipped at white, not at black. Pure.
@@ -157,11 +161,13 @@ class ShotReadNoise(ShotReadModel):
         torch.Size([2, 4, 8, 8])
     """
 
+    @eager
     @torch.no_grad()
     def apply(self, clean: Tensor, params: Params) -> Tensor:
         require_batch(clean, params)
         return self._disturbed(clean, params, white=1.0)[0]
 
+    @eager
     @torch.no_grad()
     def apply_with_variance(self, clean: Tensor, params: Params) -> tuple[Tensor, Tensor]:
         require_batch(clean, params)

@@ -34,7 +34,11 @@ def _require_not_negative(**values: Range) -> None:
 def _draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
     if isinstance(value, tuple):
         return log_uniform(value, batch, generator)
-    return torch.full((batch,), float(value), device=generator.device)
+    return torch.full((batch,), float(value), device=generator.device, dtype=torch.float32)
+
+
+def _normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(shape, generator=generator, device=generator.device, dtype=torch.float32)
 
 
 def tukey_lambda_variance(shape: float) -> float:
@@ -65,14 +69,14 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         low, high = self.shape
-        uniform = torch.rand(batch, generator=generator, device=generator.device)
+        uniform = torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32)
         return super().sample(batch, generator) | {"tukey_lambda": low + (high - low) * uniform}
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
         for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
-            u = torch.rand(picture.shape, generator=generator, device=like.device)
+            u = torch.rand(picture.shape, generator=generator, device=like.device, dtype=torch.float32)
             picture.copy_(_tukey_lambda(u, shape).mul_(math.sqrt(read_var / tukey_lambda_variance(shape))))
         return noise
 
@@ -127,7 +131,7 @@ class BlackOffset(_FixedPattern):
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"black_offset": self.sd * torch.randn(batch, generator=generator, device=generator.device)}
+        return {"black_offset": self.sd * _normal(generator, batch)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         return torch.add(clean, per_picture(params["black_offset"], clean), out=out)
@@ -137,13 +141,14 @@ class ColourBias(_FixedPattern):
     """An offset N(0, sd^2) of each of R, Gr, Gb and B in each picture; it shows as a cast in the shadows."""
 
     stream = "colour_bias"
+    by_plane = True
 
     def __init__(self, sd: float) -> None:
         _require_not_negative(sd=sd)
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"colour_bias": self.sd * torch.randn(batch, 4, generator=generator, device=generator.device)}
+        return {"colour_bias": self.sd * _normal(generator, batch, 4)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         return torch.add(clean, params["colour_bias"].to(clean)[:, :, None, None], out=out)
@@ -173,7 +178,8 @@ class DefectPixels(_FixedPattern):
         noisy = clean.clone() if out is None else out.copy_(clean)
         for i, generator in enumerate(self.generators(params, clean.device)):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
-            place, current = torch.rand((2, *clean.shape[1:]), generator=generator, device=clean.device).to(clean)
+            drawn = torch.rand((2, *clean.shape[1:]), generator=generator, device=clean.device, dtype=torch.float32)
+            place, current = drawn.to(clean)
             noisy[i].masked_fill_(place < dead, 0.0)
             noisy[i] += torch.where(place >= 1 - hot, current, 0.0)
         return noisy
@@ -197,7 +203,7 @@ class Quantisation(NoiseModel):
         self.quantum = 1 / (2**bits - 1 - black_level)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"quantum": torch.full((batch,), self.quantum, device=generator.device)}
+        return {"quantum": _draw(self.quantum, batch, generator)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         quantum = per_picture(params["quantum"], clean)

@@ -15,24 +15,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, get_args, overload
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
+from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.isp.camera_sampling import EXPOSURE
 from rawaug.isp.dictionary import perturb
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
-from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.kernels.eager import eager
+from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
+from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
-Sampling = Literal["convex", "perturb", "chosen"]
+Sampling = Literal["convex", "independent", "perturb", "chosen"]
 
 
 class RawAugment(nn.Module):
@@ -46,14 +50,21 @@ class RawAugment(nn.Module):
             ``"camera"`` for the levels that were measured when the ISP was fitted.
         sampling: ``"convex"`` draws without looking at the picture: of an ISP of published cameras, such as
             ``universal``, a camera in a light, with the gains that follow, and a mixture of tone curves; of a fitted
-            camera uniform convex combinations of the atoms. ``"perturb"`` adds Gaussian noise to the weights that the
-            ISP chooses; ``"chosen"`` takes these as they are.
+            camera uniform convex combinations of the atoms. ``"independent"`` is the same with the gains of another
+            camera in another light, to see what consistency is worth. ``"perturb"`` adds Gaussian noise to the weights
+            that the ISP chooses; ``"chosen"`` takes these as they are.
         strength: of ``"perturb"``: standard deviation on the weights.
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
         exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
             default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
             above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
+        cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
+            like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
+
+    Raises:
+        ValueError: if a setting is unknown or out of range, or the noise is one of Bayer's planes and the pattern has
+            none.
 
     Example:
         >>> augment = RawAugment(DictionaryISP(), noise="cycleisp_sidd")
@@ -72,10 +83,15 @@ class RawAugment(nn.Module):
         strength: float = 0.1,
         seed: int = 0,
         exposure: tuple[float, float] | None = None,
+        cfa: str | None = None,
     ) -> None:
         super().__init__()
-        if sampling not in ("convex", "perturb", "chosen"):
-            raise ValueError(f"sampling {sampling!r} is unknown; use one of convex, perturb, chosen")
+        self.pattern = None if cfa is None else pattern(cfa)
+        if self.pattern is not None and self.pattern.name in CFA.__members__:
+            isp, self.pattern = deepcopy(isp), None
+            isp.configure(cfa=str(cfa))
+        if sampling not in get_args(Sampling):
+            raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
         if exposure is None:
@@ -86,6 +102,8 @@ class RawAugment(nn.Module):
         self.baked = frozen(reverse_pass(isp))
         self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
+        if self.pattern is not None and self.noise.by_plane:
+            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
         self.sampling = sampling
         self.strength = strength
         self.seed = seed
@@ -116,6 +134,7 @@ class RawAugment(nn.Module):
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
+    @eager
     @torch.no_grad()
     def sample(self, srgb: Any, generator: torch.Generator | None = None, place: Tensor | None = None) -> AugmentParams:
         """Draw parameters for a batch; for a single picture without the leading B.
@@ -135,8 +154,8 @@ class RawAugment(nn.Module):
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
-        if self.sampling == "convex":
-            return self.isp.draw_setting(len(srgb), generator)
+        if self.sampling in ("convex", "independent"):
+            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
@@ -148,9 +167,10 @@ class RawAugment(nn.Module):
         if not any(self.exposure):
             return setting
         low, high = self.exposure
-        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator)
+        stops = low + (high - low) * torch.rand(len(setting.gains), 1, generator=generator, dtype=torch.float32)
         return setting._replace(gains=setting.gains * torch.exp2(-stops).to(setting.gains))
 
+    @eager
     @torch.no_grad()
     def apply(self, srgb: Any, params: AugmentParams | None = None) -> Any:
         """The :class:`RawPair` that ``params`` describe: pure, bit for bit the same at every call.
@@ -171,14 +191,25 @@ class RawAugment(nn.Module):
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
-            clean = self.baked(srgb, params.isp, params.place, white=1.0)
+            clean = self._clean(srgb, params)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
+            if self.pattern is None:
+                return RawPair(noisy, clean, variance, params)
+            noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
             return RawPair(noisy, clean, variance, params)
+
+    def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
+        """Clean RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
+        if self.pattern is None:
+            return self.baked(srgb, params.isp, params.place, white=1.0)
+        rgb = self.baked.colours(srgb, params.isp, params.place, white=1.0)
+        return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
 
     @overload
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...
     @overload
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any: ...
+    @eager
     @torch.no_grad()
     def forward(self, batch: Any, generator: torch.Generator | None = None, key: str | int | None = None) -> Any:
         """Sample, then apply.
@@ -261,7 +292,7 @@ def _float32(like: Tensor) -> torch.autocast:
 
 
 def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels in its file.
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` is the law in its file, at any measured ISO.
 
     Raises:
         ValueError: if none were measured, or the name is unknown.
@@ -270,4 +301,4 @@ def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
         return noise_model(noise)
     if "noise" not in isp.info:
         raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
-    return noise_model((isp.info["noise"]["shot_var"], isp.info["noise"]["read_var"]))
+    return ShotReadNoise(camera_law(isp.info["noise"]))

@@ -129,7 +129,10 @@ class RawPairs(Dataset[Any]):
             raise TypeError(
                 f"the index must be an integer, got {type(index).__name__}; for slices use torch.utils.data.Subset"
             )
-        index = range(len(self))[index]  # IndexError ends iteration
+        try:
+            index = range(len(self))[index]
+        except IndexError:  # ends iteration
+            raise IndexError(f"there is no picture {index}: the dataset has {len(self)}") from None
         return self.draw(index, self._generator(*self._epochs.key(index)))
 
     def draw(self, index: int, generator: torch.Generator) -> Any:

@@ -15,7 +15,8 @@ the count by a fixed epoch: a draw is then a pure function of (seed, epoch, inde
 from __future__ import annotations
 
 import math
-from typing import Any
+from operator import index
+from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -30,11 +31,32 @@ MAX_WORKERS = 128
 """Workers of a loader whose passes can be counted."""
 
 
+MAX_COUNTED = 2**30
+"""Pictures of a dataset whose visits can be counted."""
+
+
+def checked_epoch(epoch: SupportsIndex) -> int:
+    """An epoch, or the number of a batch, as an integer of 63 bits: what a shared counter holds.
+
+    Raises:
+        ValueError: if it is none.
+
+    Example:
+        >>> checked_epoch(3)
+        3
+    """
+    if not isinstance(epoch, SupportsIndex) or not 0 <= index(epoch) < 2**63:
+        raise ValueError(f"an epoch is an integer from 0 to 2^63 - 1, got {epoch!r}")
+    return index(epoch)
+
+
 class _Epochs:
     """Counts in shared memory, and an epoch that may be pinned instead."""
 
     def __init__(self, *shape: int) -> None:
         self._pinned = torch.full((1,), _COUNTED).share_memory_()
+        if math.prod(shape) > MAX_COUNTED:
+            raise ValueError(f"visits of at most {MAX_COUNTED} pictures can be counted, the dataset has {shape[0]}")
         self._counts = torch.zeros(shape, dtype=torch.int32).share_memory_()
         self._rank: tuple[int, ...] = ()
 
@@ -48,11 +70,9 @@ class _Epochs:
         """All draws belong to ``epoch`` from now on.
 
         Raises:
-            ValueError: if the epoch is negative.
+            ValueError: if it is no epoch.
         """
-        if epoch < 0:
-            raise ValueError(f"an epoch is at least 0, got {epoch}")
-        self._pinned[0] = epoch
+        self._pinned[0] = checked_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
         """:func:`rawaug.seeding.rank_key`; in a spawned worker, which is no part of the process group, the parent's."""
@@ -70,7 +90,7 @@ class _Epochs:
     def _check(self, state: dict[str, Any], *names: str) -> None:
         if set(state) != {"epoch", *names}:
             raise ValueError(f"a state has epoch, {', '.join(names)}; got {', '.join(map(str, state)) or 'nothing'}")
-        self._pinned[0] = _COUNTED if state["epoch"] is None else state["epoch"]
+        self._pinned[0] = _COUNTED if state["epoch"] is None else checked_epoch(state["epoch"])
 
 
 class Visits(_Epochs):

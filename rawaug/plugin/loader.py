@@ -20,6 +20,7 @@ from torch.utils.data import IterableDataset
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import augmentation, crop_size, placed, random_place
+from rawaug.plugin.epochs import checked_epoch
 from rawaug.plugin.params import RawPair, require_keys
 from rawaug.plugin.pictures import (
     even_sided,
@@ -78,8 +79,11 @@ class WrappedLoader:
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
         data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
         an epoch.
+
+        Raises:
+            ValueError: if either is not an integer from 0 to 2^63 - 1.
         """
-        self._next = self._at = Position(epoch, start)
+        self._next = self._at = Position(checked_epoch(epoch), checked_epoch(start))
         if hasattr(self.loader, "set_epoch"):
             self.loader.set_epoch(epoch)
 

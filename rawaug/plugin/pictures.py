@@ -18,6 +18,7 @@ from torch import Tensor
 from rawaug.isp.stages import as_float, require_display_range
 
 _CHANNELS = (1, 3, 4)
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
 
@@ -153,6 +154,8 @@ def replaced(sample: Any, where: Where, value: Any) -> Any:
 def _as_tensor(picture: Any) -> Tensor:
     """Values as they are, in the type that PyTorch has for them."""
     if isinstance(picture, Tensor):
+        if picture.layout != torch.strided:
+            raise ValueError(f"a picture must be a dense tensor, got {picture.layout}; call to_dense()")
         return picture.as_subclass(Tensor)
     if hasattr(picture, "getbands"):
         if picture.mode not in _PIL_AS_RGB + _PIL_AS_IS:
@@ -176,7 +179,7 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
         return image
     if image.dtype == torch.uint16:
         return image.float() / 65535.0
-    if not image.is_floating_point():
+    if image.dtype not in _FLOATS:
         raise ValueError(f"a picture must be uint8, uint16 or float in [0, 1], got {image.dtype}; convert it first")
     require_display_range(image)
     return image.float()

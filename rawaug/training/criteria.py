@@ -59,24 +59,37 @@ class Charbonnier(nn.Module):
         return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
 
 
+def linear(loss: Criterion, sample: Sample) -> Criterion:
+    """``loss`` as it is."""
+    return loss
+
+
+def stabilised(loss: Criterion, sample: Sample) -> Criterion:
+    """``loss`` where the noise has deviation 1 in shadow and light alike."""
+    levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
+    return lambda denoised, clean: loss(*(root.forward(y, *levels) / Anscombe.scale for y in (denoised, clean)))
+
+
+def mixed(loss: Criterion, sample: Sample) -> Criterion:
+    """The mean of ``stabilised`` and ``loss`` in units of the noise's mean deviation."""
+    in_root = stabilised(loss, sample)
+    deviation = sample.variance.sqrt().mean((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    return lambda denoised, clean: 0.5 * (in_root(denoised, clean) + loss(denoised / deviation, clean / deviation))
+
+
+WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
+    "linear": linear,
+    "stabilised": stabilised,
+    "mixed": mixed,
+}
+
+
 def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
     """``loss`` with light and shade weighed as ``weigh`` says, for the noise of ``sample``'s pictures ``(B, 4, h, w)``.
 
     Raises:
         ValueError: if there is no such weighing.
     """
-    if weigh == "linear":
-        return loss
-    if weigh not in ("stabilised", "mixed"):
-        raise ValueError(f"train.weigh {weigh!r} is unknown; use one of linear, stabilised, mixed")
-    levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
-
-    def stabilised(denoised: Tensor, clean: Tensor) -> Tensor:
-        a, b = (root.forward(y, *levels) / Anscombe.scale for y in (denoised, clean))
-        return loss(a, b)
-
-    def mixed(denoised: Tensor, clean: Tensor) -> Tensor:
-        deviation = sample.variance.sqrt().mean((1, 2, 3), keepdim=True).clamp_min(1e-12)
-        return 0.5 * (stabilised(denoised, clean) + loss(denoised / deviation, clean / deviation))
-
-    return stabilised if weigh == "stabilised" else mixed
+    if weigh not in WEIGHINGS:
+        raise ValueError(f"train.weigh {weigh!r} is unknown; use one of {', '.join(WEIGHINGS)}")
+    return WEIGHINGS[weigh](loss, sample)

@@ -6,7 +6,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from rawaug.files import fingerprint
-from rawaug.registry import LOSSES
+from rawaug.registry import LOSSES, require_between
+
+MOST = 2**31
+"""Of steps, samples and processes."""
 
 
 @dataclass
@@ -69,13 +72,19 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for key in ("steps", "batch", "halve_every", "validate_every", "checkpoint_every"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"train.{key} must be at least 1, got {getattr(self, key)}")
-        LOSSES.make(self.loss)
+            require_between(f"train.{key}", getattr(self, key), 1, MOST)
+        for key in ("crop", "warmup", "workers"):
+            require_between(f"train.{key}", getattr(self, key), 0, MOST)
+        for key in ("learning_rate", "clip_norm"):
+            require_between(f"train.{key}", getattr(self, key), 0.0, float(MOST))
+        try:
+            LOSSES.make(self.loss)
+        except ValueError as error:
+            raise ValueError(f"train.loss: {error}") from None
         if self.crop < 8 or self.crop % 2:
             raise ValueError(f"train.crop must be even and at least 8, got {self.crop}")
-        if not 0.0 <= self.ema < 1.0 or min(self.warmup, self.workers, self.clip_norm) < 0:
-            raise ValueError("train: ema must be in [0, 1), and warmup, workers and clip_norm at least 0")
+        if not 0.0 <= self.ema < 1.0:
+            raise ValueError(f"train.ema must be in [0, 1), got {self.ema}")
 
 
 SAME_WEIGHTS = frozenset({"workers", "compile", "checkpoint_every"})

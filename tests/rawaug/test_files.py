@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from rawaug.files import (
     digest,
     find_weights,
     fingerprint,
+    parse_object,
     read_header,
     read_tensors,
     replacing,
@@ -69,3 +72,49 @@ def test_weights_are_found_by_name_and_by_path(tmp_path: Path) -> None:
 def test_hashes() -> None:
     assert digest(b"abc") == digest(b"a", b"bc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1}) != fingerprint({"a": 2, "b": 1})
+
+
+def test_two_writers_of_one_file_do_not_meet_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / ("n" * 251 + ".txt")  # as long as a name can be
+    with replacing(path) as first:
+        first.write_text("first")
+        with replacing(path) as second:
+            assert second != first
+            second.write_text("second")
+        left = first.read_text()
+    assert left == path.read_text() == "first"
+    with replacing(path) as partial:
+        abandoned = partial.name
+    (tmp_path / abandoned).write_text("half of a file, and the process was killed")
+    with replacing(path) as partial:
+        assert partial.name == abandoned and partial.read_text() == ""
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_has_the_rights_of_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_json({}, tmp_path / "a.json")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o640
+
+
+def test_numbers_of_others_are_finite_and_ours_are_written_so(tmp_path: Path) -> None:
+    write_json({"psnr": [float("nan"), 1.0], "more": {"a": float("inf")}}, tmp_path / "a.json")
+    assert json.loads((tmp_path / "a.json").read_text()) == {"psnr": [None, 1.0], "more": {"a": None}}
+    for text, reason in (
+        ('{"a": NaN}', "NaN is not a finite number"),
+        ('{"a": -1e400}', "-1e400 is not"),
+        ('{"a":' * 100_000, "too deeply nested"),
+        ("[1]", "must be a JSON object, got list"),
+        ("{", "not JSON"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            parse_object(text)
+    write_tensors({"a": torch.tensor([1.0, torch.nan])}, {"format": "rawaug", "kind": "x"}, tmp_path / "a.safetensors")
+    with pytest.raises(ValueError, match="tensor a has values that are not finite; copy it again"):
+        read_tensors(tmp_path / "a.safetensors", "copy it again")
+    write_tensors({"a": torch.ones(1)}, {"format": "rawaug"}, tmp_path / "a.safetensors")
+    with pytest.raises(ValueError, match="not a rawaug file"):  # it says no kind
+        read_header(tmp_path / "a.safetensors")

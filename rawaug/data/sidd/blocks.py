@@ -14,9 +14,10 @@ colour, and the pair says so (``rendered`` is False): it can test a denoiser, bu
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -34,6 +35,11 @@ from rawaug.registry import DATASETS
 
 BLOCKS = 32
 """Blocks of a frame."""
+
+MOST_FRAMES = 1000
+"""Of SIDD+, which has 32."""
+
+T = TypeVar("T")
 
 _NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
 
@@ -65,6 +71,26 @@ class NoisyBlock(NamedTuple):
     cfa: CFA
 
 
+class Once(Generic[T]):
+    """What ``read`` gives, read when it is first asked for; a file found damaged then is not read again."""
+
+    def __init__(self, read: Callable[[], T]) -> None:
+        self.read = read
+        self.value: T | None = None
+        self.fault: Exception | None = None
+
+    def __call__(self) -> T:
+        if self.fault is not None:
+            raise self.fault
+        if self.value is None:
+            try:
+                self.value = self.read()
+            except (OSError, ValueError) as error:
+                self.fault = error
+                raise
+        return self.value
+
+
 class SiddBlocks(LazyPairs):
     """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB, pictures 0.5 GB) once the first is read.
 
@@ -86,9 +112,13 @@ class SiddBlocks(LazyPairs):
         self.path = Path(path)
         self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
+<<<<<<< HEAD
         self._blocks: tuple[Tensor, Tensor] | None = None
         self._pictures: dict[str, Tensor] = {}
         self._frame: tuple[int, _Frame] | None = None
+=======
+        self._all = Once(self._read_all)
+>>>>>>> main
         super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
 
     def read(self, index: int) -> Pair:
@@ -106,6 +136,7 @@ class SiddBlocks(LazyPairs):
         pictures = {key: turned_like(every[scene], clean, shot.cfa, what) for key, every in self._pictures.items()}
         return _Frame(shot.cfa, shot.camera, levels, known is None, self._colours.get(shot.name), **pictures)
 
+<<<<<<< HEAD
     def _all(self) -> tuple[Tensor, Tensor]:
         if self._blocks is None:
             clean, noisy = (_blocks_of_scenes(file) for file in self.files)
@@ -118,6 +149,14 @@ class SiddBlocks(LazyPairs):
                     side = (clean.shape[-2], clean.shape[-1])
                     self._pictures[key] = read_block_pictures(file, (len(HELD_BACK), BLOCKS), side)
         return self._blocks
+=======
+    def _read_all(self) -> tuple[Tensor, Tensor]:
+        clean, noisy = (_blocks_of_scenes(file) for file in self.files)
+        _require_same_shape(clean, noisy, self.files[1])
+        self._levels = noise_level_functions(self.path)
+        self._colours = _colours(self.path)
+        return clean, noisy
+>>>>>>> main
 
 
 class SiddPlusBlocks(LazyPairs):
@@ -137,6 +176,7 @@ class SiddPlusBlocks(LazyPairs):
         path = self.path = Path(path)
         self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
         patterns = find_file(path, "siddplus_*bayer_patterns.csv")
+<<<<<<< HEAD
         with patterns.open(encoding="utf-8-sig", newline="") as stream:
             self.cfas = [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
         self._blocks: tuple[Tensor, Tensor] | None = None
@@ -164,6 +204,25 @@ class SiddPlusBlocks(LazyPairs):
             levels = captured_noise(clean.numpy(), noisy.numpy())
             self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
         return _pair(self.names[index], block, clean, noisy, self._frame[1])
+=======
+        self.cfas = _patterns(patterns)
+        self._all = Once(self._read_all)
+        super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
+
+    def read(self, index: int) -> Pair:
+        frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
+        clean, noisy = self._all()
+        levels = captured_noise(clean[frame].numpy(), noisy[frame].numpy())
+        cfa = self.cfas[index // BLOCKS]
+        return _pair(self.names[index], clean[index], noisy[index], cfa, _NO_COLOUR, levels, "SIDD+")
+>>>>>>> main
+
+    def _read_all(self) -> tuple[Tensor, Tensor]:
+        clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
+        _require_same_shape(clean, noisy, self.files[1])
+        if len(clean) != len(self):
+            raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
+        return clean, noisy
 
 
 class SiddBenchmark(Sequence[NoisyBlock]):
@@ -183,17 +242,15 @@ class SiddBenchmark(Sequence[NoisyBlock]):
     def __init__(self, path: str | Path) -> None:
         self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
-        self._blocks: Tensor | None = None
+        self._all = Once(partial(_blocks_of_scenes, self.file))
 
     def __len__(self) -> int:
         return len(HELD_BACK) * BLOCKS
 
     def __getitem__(self, index: int) -> NoisyBlock:  # type: ignore[override]
         scene, block = divmod(range(len(self))[index], BLOCKS)
-        if self._blocks is None:
-            self._blocks = _blocks_of_scenes(self.file)
         frame = self.scenes[scene]
-        return NoisyBlock(f"{frame.name}_{block:02d}", self._blocks[scene, block], frame.cfa)
+        return NoisyBlock(f"{frame.name}_{block:02d}", self._all()[scene, block], frame.cfa)
 
     def __iter__(self) -> Iterator[NoisyBlock]:
         return (self[index] for index in range(len(self)))
@@ -239,8 +296,21 @@ def find_file(path: Path, pattern: str) -> Path:
     return found[0]
 
 
+<<<<<<< HEAD
 def _file_if_any(path: Path, name: str) -> Path | None:
     return find_file(path, name) if any(path.rglob(name)) else None
+=======
+def _patterns(file: Path) -> list[CFA]:
+    """A pattern for each frame of 32 blocks."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            names = [row[0].strip().upper() for row in csv.reader(stream) if row]
+        if len(names) > MOST_FRAMES:
+            raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
+        return [CFA(name) for name in names]
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"{file}: is no list of patterns, one for each frame ({error}); copy it again") from None
+>>>>>>> main
 
 
 def _blocks_of_scenes(file: Path) -> Tensor:

@@ -30,6 +30,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.select import FrameLabel
 from rawaug.data.sidd.scenes import HELD_BACK, SiddScene, is_scene
 from rawaug.io import read_picture
+from rawaug.io.apart import apart
 from rawaug.io.picture_files import view_of_orientation
 
 _FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
@@ -85,9 +86,17 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
+<<<<<<< HEAD
         pictures = {kind: _turned_back(files[kind], view) for kind in ("GT_SRGB", "NOISY_SRGB") if kind in files}
         known = self.levels.get(scene.name)
         shot_var, read_var = known or measured_levels(clean, noisy)
+=======
+        if "GT_SRGB" in files:
+            srgb = _even(turn_back(apart(read_picture, files["GT_SRGB"]), view))
+        else:
+            srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
+        shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
+>>>>>>> main
         return Pair(
             name=self.names[index],
             srgb=pictures["GT_SRGB"] if "GT_SRGB" in pictures else develop_mosaic(clean, scene.cfa, gains, matrix),

@@ -40,6 +40,7 @@ class Descent:
         key: what the state belongs to; a file with another key is not used.
         seed: of what the steps draw.
         progress: show progress bars.
+        report_steps: a stage reports, and is watched, this often; None is 50.
 
     Attributes:
         watched: what the watched stages scored, by name.
@@ -48,8 +49,11 @@ class Descent:
         ValueError: if the file at ``path`` cannot be read.
     """
 
-    def __init__(self, path: Path | None, key: str, seed: int, progress: bool) -> None:
+    def __init__(
+        self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int | None = None
+    ) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
+        self.report_steps = report_steps or REPORT_STEPS
         self.watched: dict[str, Watched] = {}
         self._steps: dict[str, int] = {}
         self._tensors: dict[str, Tensor] = {}
@@ -74,7 +78,7 @@ class Descent:
             tensors: what is optimised.
             steps: of Adam.
             learning_rate: at the start; falls to 0 by half a cosine.
-            report: called every 50 steps and after the last; its text goes to the progress bar.
+            report: called every ``report_steps`` steps and after the last; its text goes to the progress bar.
             watch: a score, taken at the start and as often; the tensors come back that had the highest.
         """
         optimiser = torch.optim.Adam(list(tensors.values()), lr=learning_rate)
@@ -91,7 +95,7 @@ class Descent:
             optimiser.zero_grad(set_to_none=True)
             value.backward()
             optimiser.step()
-            if (step + 1) % REPORT_STEPS == 0 or step + 1 == steps:
+            if (step + 1) % self.report_steps == 0 or step + 1 == steps:
                 scores = "" if report is None else report()
                 scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
                 bar.set_postfix_str(f"loss {value.item():.2e} {scores}", refresh=False)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.stage import stage_class
+from rawaug.registry import require_between
+
+MOST = 2**31
+"""Of steps and pixels."""
 
 _SWITCH = ("auto", "on", "off")
 
@@ -33,6 +37,7 @@ class FitConfig:
             and keeps them if they beat the constants on held-out frames.
         joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
             else 0. Kept only if held-out frames improve.
+        curve_steps: steps of the first stage, which fits the tone curve; None is 150.
         noisy: fit on the captured noisy RAW of the pairs.
         seed: random seed of the drawn pixels and initial networks.
         isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
@@ -49,6 +54,7 @@ class FitConfig:
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
     joint_steps: int | None = None
+    curve_steps: int | None = None
     noisy: bool = False
     seed: int = 0
     isp: dict[str, Any] = field(default_factory=dict)
@@ -58,16 +64,27 @@ class FitConfig:
         """``atoms``, as far as the size allows."""
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
+    def key(self) -> dict[str, Any]:
+        """What a fit depends on; keys that came later are left out where null: older fits stay what they are."""
+        return {key: value for key, value in asdict(self).items() if key != "curve_steps" or value is not None}
+
+    def smoke(self) -> FitConfig:
+        """In a second."""
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128)
+
     def __post_init__(self) -> None:
-        for key in ("atoms", "pixels", "batch"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key} must be at least 1, got {getattr(self, key)}")
+        for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0}.items():
+            if getattr(self, key) is not None:
+                require_between(key, getattr(self, key), least, MOST)
+        require_between("seed", self.seed, -(2**63), 2**63 - 1)
+        require_between("reach", self.reach, 1.0, float(MOST))
+        require_between("learning_rate", self.learning_rate, 0.0, float(MOST))
         for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
             raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
+        if self.curve_steps is not None and self.curve_steps < 0:
+            raise ValueError(f"curve_steps must be at least 0, got {self.curve_steps}")
         if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")
-        if self.steps < 0 or self.reach < 1:
-            raise ValueError(f"steps must be at least 0 and reach at least 1, got {self.steps} and {self.reach}")

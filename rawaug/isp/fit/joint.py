@@ -25,11 +25,23 @@ LEARNING_RATE = 2e-4
 CONSISTENCY = 0.01
 
 
+def joint_steps(config: FitConfig, frames: int) -> int:
+    """How long a number of frames is trained jointly."""
+    if config.joint_steps is not None:
+        return config.joint_steps
+    return STEPS if frames >= MANY_FRAMES else 0
+
+
 def train_jointly(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[Shot],
+    config: FitConfig,
+    descent: Descent,
+    learning_rate: float = LEARNING_RATE,
 ) -> None:
     """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``."""
-    steps = config.joint_steps if config.joint_steps is not None else (STEPS if len(shots) >= MANY_FRAMES else 0)
+    steps = joint_steps(config, len(shots))
     if steps == 0:
         return
     if len(shots) < 2:
@@ -45,7 +57,7 @@ def train_jointly(
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
 
-    descent.run("end to end", loss, dict(isp.named_parameters()), steps, LEARNING_RATE, watch=watch)
+    descent.run("end to end", loss, dict(isp.named_parameters()), steps, learning_rate, watch=watch)
     seen = descent.watched["end to end"]
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 

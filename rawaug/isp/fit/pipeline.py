@@ -88,6 +88,7 @@ def fit_isp(
         fit.forward()
         train_jointly(fit.isp, samples, shots, config, fit.descent)
     fit.descent.finish()
+    fit.isp.info["registered"] = sum(shot.registered for shot in shots)
     fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
 
@@ -204,7 +205,12 @@ class _Fit:
             predicted = stages.correct_colour(self._curved(part), self.colour.pick(frames).product())
             return reading_error(predicted, part) + self.tie(self.colour)
 
+<<<<<<< HEAD
         self.descent.run(stage + self.part, loss, tensors, CURVE_STEPS, CURVE_RATE)
+=======
+        steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
+        self.descent.run(stage, loss, tensors, steps, CURVE_RATE)
+>>>>>>> main
 
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 

@@ -49,7 +49,12 @@ class FramePair(Protocol):
     def camera(self) -> str: ...
     @property
     def registered(self) -> bool: ...
+<<<<<<< HEAD
     def require_rendered(self) -> None: ...
+=======
+    @property
+    def color_known(self) -> bool: ...
+>>>>>>> main
 
 
 class Shot(NamedTuple):
@@ -66,6 +71,7 @@ class Shot(NamedTuple):
     white_balance: tuple[float, float, float]
     srgb: Tensor
     raw: Tensor
+    registered: bool
 
 
 class PixelSamples(NamedTuple):
@@ -117,7 +123,15 @@ def sample_pixels(
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
+<<<<<<< HEAD
     pair.require_rendered()
+=======
+    if not pair.color_known:
+        raise ValueError(
+            f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
+            "use a shipped one, such as universal"
+        )
+>>>>>>> main
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
@@ -128,7 +142,7 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
     small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
-    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw)
+    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw, pair.registered)
     return drawn, shot
 
 

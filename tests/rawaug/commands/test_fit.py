@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +18,11 @@ from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-QUICK = ["--steps", "4", "--pixels", "512", "--batch", "128", "--noise", "off"]
+QUICK = ["--steps", "4", "--curve-steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
+SETTINGS: dict[str, Any] = {"steps": 4, "curve_steps": 10, "pixels": 512, "batch": 128}
 INTERRUPTED = 130
 
 Shoot = Callable[..., Path]
-
-
-@pytest.fixture(autouse=True)
-def short_first_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.isp.fit.pipeline.CURVE_STEPS", 10)
 
 
 @pytest.fixture
@@ -69,7 +67,7 @@ def test_files_and_folders_are_fitted_together(
     assert isp.info["frames"] == ["one", "b", "a", "two"]
     assert isp.info["data"] == [str(one), str(tmp_path / "more"), str(two)]
     assert f"fitted 4 frames in {isp.info['seconds']} s: {out}" in capsys.readouterr().out
-    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", steps=4, pixels=512, batch=128)
+    by_hand = rawaug.fit([one, tmp_path / "more", two], progress=False, noise="off", **SETTINGS)
     assert same(isp, by_hand)
     assert not same(isp, fit(out, one, two))
 
@@ -147,18 +145,40 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
 
 def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: Shoot) -> None:
     raw = shoot("shots/a.dng", 128)
-    plain = fit(tmp_path / "x.safetensors", raw, "--held-out", raw)
+    plain = fit(tmp_path / "x.safetensors", raw)
     rendering = read_raw_and_develop(raw)[1]
     write_picture(tmp_path / "shots" / "a.jpg", rendering // 2 + 60)  # not what LibRaw would make of it
     assert read_picture(tmp_path / "shots" / "a.jpg").shape == rendering.shape
-    with_jpeg = fit(tmp_path / "x.safetensors", raw, "--held-out", raw)
-    without = fit(tmp_path / "x.safetensors", raw, "--held-out", raw, "--camera-jpeg", "false")
-    assert same(without, plain) and without.info["held_out"] == plain.info["held_out"]
-    assert not same(with_jpeg, plain) and with_jpeg.info["held_out"] != plain.info["held_out"]
-    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, steps=4, pixels=512, batch=128), plain)
+    seen, scores = shoot("seen.dng", 128), []
+    with_jpeg = fit(tmp_path / "x.safetensors", raw)
+    without = fit(tmp_path / "x.safetensors", raw, "--camera-jpeg", "false")
+    assert same(without, plain) and not same(with_jpeg, plain)
+    for jpeg in ("true", "false"):
+        scores.append(fit(tmp_path / "x.safetensors", seen, "--held-out", raw, "--camera-jpeg", jpeg).info["held_out"])
+    assert scores[0] != scores[1]
+    assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, **SETTINGS), plain)
 
 
 def test_pairs_are_fitted_as_they_are() -> None:
-    pairs = rawaug.data.demo_pairs("train", count=2)
-    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=pairs[1:], steps=2, pixels=256, batch=64)
+    pairs, other = rawaug.data.demo_pairs("train", count=2), rawaug.data.demo_pairs("validation", count=1)
+    isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, **SETTINGS)
     assert isp.info["frames"] == [pair.name for pair in pairs] and len(isp.info["held_out"]) == 2
+
+
+def test_held_out_frames_that_are_also_fitted_are_refused(
+    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, two = shoot("shots/one.dng"), shoot("shots/two.dng")
+    (tmp_path / "link.dng").symlink_to(one)
+    out = ["--out", tmp_path / "x.safetensors", *QUICK]
+    for held_out in (one, tmp_path / "shots", tmp_path / "link.dng"):
+        assert "one.dng is also fitted" in refused(capsys, "fit", one, "--held-out", held_out, *out)
+    assert "two.dng is also fitted" in refused(capsys, "fit", tmp_path / "shots", "--held-out", two, *out)
+    assert "train_00_astronaut is also fitted" in refused(capsys, "fit", "demo:train", "--held-out", "demo:train", *out)
+    assert not (tmp_path / "x.safetensors").exists()
+
+
+def test_a_frame_of_unknown_colour_is_refused() -> None:
+    unknown = [replace(pair, color_known=False) for pair in rawaug.data.demo_pairs("train", count=1)]
+    with pytest.raises(ValueError, match="train_00_astronaut: its white balance and colour matrix are unknown"):
+        rawaug.fit(unknown, progress=False, noise="off", steps=2, pixels=256, batch=64)

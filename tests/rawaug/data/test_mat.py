@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from scipy.io import savemat
 
-from rawaug.data.mat import mat_version, read_array, read_value
+from rawaug.data.mat import MAX_BYTES, mat_version, read_array, read_value
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 ARRAY = np.random.default_rng(0).random((3, 4, 5)).astype(np.float32)
@@ -80,3 +82,31 @@ def test_a_file_cut_short_is_one_line(written: Callable[[dict[str, Any]], Path],
     with pytest.raises(OSError, match=r"a\.mat: cannot be read as a MATLAB file .*; copy it again") as caught:
         read_array(path, "x")
     assert "\n" not in str(caught.value)
+
+
+def _crash(path: Path, name: str, plain: bool) -> None:
+    ctypes.string_at(0)
+
+
+def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    savemat(tmp_path / "a.mat", {"x": ARRAY})
+    monkeypatch.setattr("rawaug.data.mat._read", _crash)
+    with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(killed by SIGSEGV\)"):
+        read_array(tmp_path / "a.mat", "x")
+
+
+def test_variables_beyond_reason_and_in_other_files_are_refused(tmp_path: Path, mat73: Writer) -> None:
+    secret = mat73(tmp_path / "secret.mat", {"x": ARRAY})
+    path = mat73(tmp_path / "a.mat", {"y": ARRAY})
+    with h5py.File(path, "a") as file:
+        file.create_dataset("huge", (2**20, 2**20), np.float64, chunks=(64, 64))  # takes no room in the file
+        file["elsewhere"] = h5py.ExternalLink(str(secret), "x")
+        file.create_dataset("outside", (4,), np.uint8, external=[(str(secret), 0, 4)])
+        file.create_group("struct")["elsewhere"] = h5py.SoftLink("/elsewhere")
+    with pytest.raises(OSError, match=f"huge declares {2**43} bytes, above the limit of {MAX_BYTES}"):
+        read_array(path, "huge")
+    for name in ("elsewhere", "struct"):
+        with pytest.raises(OSError, match=r"a\.mat: .*elsewhere is a link, not a variable"):
+            read_value(path, name)
+    with pytest.raises(OSError, match="outside is stored in another file"):
+        read_array(path, "outside")

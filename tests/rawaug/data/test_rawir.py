@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA, pack
-from rawaug.data import Rawir, open_pairs
+from rawaug.data import Rawir, check, open_pairs
 from rawaug.io import write_picture
 
 PLANES = (100, 200, 300, 400)
@@ -62,3 +63,34 @@ def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
         Rawir(tmp_path)
     with pytest.raises(FileNotFoundError, match="none: no such folder of RAWIR"):
         Rawir(tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole.replace(b"(6, 8, 4)", b"(6, 8, 4" + b"0" * 9 + b")").replace(b" " * 10, b"", 1),
+        lambda whole: whole.replace(b"'<u2'", b"'|O'  "),
+        lambda whole: whole.replace(b"'shape'", b"'shap['"),
+        lambda whole: whole[:40],
+        lambda whole: b"PK\x03\x04" + whole,
+        lambda whole: b"",
+    ],
+)
+def test_damaged_arrays_are_named_and_the_rest_is_read(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    for stem in ("a", "b", "c"):
+        write_pair(tmp_path, stem, "jpg")
+    file = tmp_path / "b.npy"
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(OSError, match=r"b\.npy: cannot be read as an array") as error:
+        Rawir(tmp_path)[1]
+    assert "\n" not in str(error.value)
+    (part,) = (part for part in check(tmp_path).parts if part.what.startswith("RAWIR"))
+    assert len(part.broken) == 1 and "b.npy" in part.broken[0] and part.sizes["12 x 16"] == 2
+
+
+def test_an_archive_in_place_of_an_array(tmp_path: Path) -> None:
+    write_pair(tmp_path, "a", "jpg")
+    np.savez(tmp_path / "a.npz", np.zeros(3))
+    (tmp_path / "a.npz").replace(tmp_path / "a.npy")
+    with pytest.raises(OSError, match=r"a\.npy: cannot be read as an array \(does not begin as one\)"):
+        Rawir(tmp_path)[0]

@@ -6,21 +6,26 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import denoisers
+from rawaug.cli import main
 from rawaug.commands.evaluate import evaluate
-from rawaug.data import demo_pairs
+from rawaug.data import Pair, demo_pairs
 from rawaug.evaluation.scores import (
+    Score,
     classical_method,
     compared,
     frozen_levels,
     frozen_sample,
     score_method,
+    summary,
 )
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import write_json
+from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
@@ -47,8 +52,8 @@ def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
 
 
 def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> None:
-    result = evaluate(identity, "demo:test")
-    assert result["kind"] == "denoiser" and len(result["images"]) == 9
+    result = evaluate(identity, "demo:validation")
+    assert result["kind"] == "denoiser" and len(result["images"]) == 4
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
@@ -56,7 +61,7 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> Non
     assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
-    again = evaluate(identity, "demo:test", self_ensemble=True)
+    again = evaluate(identity, "demo:validation", self_ensemble=True)
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
@@ -92,9 +97,9 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
 
 
-def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.commands.evaluate.open_pairs", lambda data, split: demo_pairs("test", count=2))
-    result = evaluate(identity, "demo:test", classical=["Wavelet", "TotalVariation"])
+def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) -> None:
+    given.extend(demo_pairs("test", count=2))
+    result = evaluate(identity, "given:", classical=["Wavelet", "TotalVariation"])
     for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
         scores = result["classical"][name]
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
@@ -120,14 +125,61 @@ def test_the_development_is_the_same_for_both(identity: Path) -> None:
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 
 
-def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(identity: Path, tmp_path: Path) -> None:
-    result = evaluate(identity, "demo:validation", self_ensemble=True, report=tmp_path / "new" / "page.html")
+def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
+    identity: Path, tmp_path: Path, given: list[Pair]
+) -> None:
+    given.extend(demo_pairs("validation", count=2))
+    result = evaluate(identity, "given:", self_ensemble=True, report=tmp_path / "new" / "page.html")
     assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
     page = (tmp_path / "new" / "page.html").read_text()
-    assert page.count("<h3>") == 4 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
+    assert page.count("<h3>") == 2 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
 
 
 def test_what_is_for_denoisers_is_refused_for_an_isp(tmp_path: Path) -> None:
     for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
         with pytest.raises(ValueError, match="is an ISP"):
             evaluate("universal-small", "demo:test", **flags)
+
+
+@pytest.fixture
+def crops(tmp_path: Path) -> Path:
+    """Two pairs of RAWIR, which have no noise of their own."""
+    folder = tmp_path / "crops"
+    folder.mkdir()
+    packed = np.random.default_rng(0).integers(0, 1024, (2, 16, 16, 4)).astype(np.uint16)
+    for k in range(2):
+        np.save(folder / f"{k}.npy", packed[k])
+        write_picture(folder / f"{k}.jpg", torch.full((3, 32, 32), 90, dtype=torch.uint8))
+    return folder
+
+
+def test_a_score_that_is_no_number_is_named_and_left_out_of_the_mean(
+    identity: Path, crops: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scores = [Score("a", 30.0, 0.5), Score("b", float("inf"), 0.7), Score("c", 20.0, float("nan"))]
+    result = summary(scores)
+    assert result["psnr"] == 25.0 and result["ssim"] == pytest.approx(0.6)
+    assert [set(image) for image in result["images"]] == [{"name", "psnr", "ssim"}, {"name", "ssim"}, {"name", "psnr"}]
+    assert result["no_numbers"] == ["b: psnr is inf", "c: ssim is nan"]
+    assert "no_numbers" not in summary(scores[:1])
+    figures = crops / "scores.json"
+    arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--noise", "[0, 0]", "--json", str(figures)]
+    assert main(arguments) == 2  # nothing to denoise: the frames are equal
+    printed = capsys.readouterr()
+    assert "PSNR_d" in printed.out and "0: psnr is inf" in printed.err and len(printed.err.strip().splitlines()) == 1
+    written = json.loads(figures.read_text())
+    assert "psnr" not in written and written["ssim"] == pytest.approx(1.0)
+
+
+def test_frames_that_cannot_be_read_are_named_and_the_rest_is_scored(
+    identity: Path, crops: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (crops / "1.npy").write_bytes(b"PK\x03\x04 no archive")
+    figures, page = crops / "scores.json", crops / "page.html"
+    arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--json", str(figures)]
+    assert main([*arguments, "--report", str(page)]) == 2
+    assert "1.npy: cannot be read as an array" in capsys.readouterr().err
+    result = json.loads(figures.read_text())
+    assert [image["name"] for image in result["images"]] == ["0"] and len(result["broken"]) == 1 and page.is_file()
+    (crops / "0.npy").write_bytes(b"")
+    assert main(arguments) == 2 and "none of the 2 frames can be read" in capsys.readouterr().err

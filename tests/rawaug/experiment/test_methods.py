@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.experiment import methods
 from rawaug.experiment.methods import (
@@ -20,6 +22,7 @@ from rawaug.experiment.methods import (
     cycle_psnr,
     dictionary_params,
     fit_family,
+    is_method,
     mosaic_only_psnr,
     score_rows,
 )
@@ -32,6 +35,22 @@ from rawaug.metrics import PATCH
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)
+
+
+def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
+    frame = frame_of("one")
+    universal = DictionaryISP.from_pretrained("universal-small")
+    universal.save(tmp_path / "own.safetensors")
+    for name in ("universal-small", str(tmp_path / "own.safetensors")):
+        assert is_method(name)
+        fitted = fit_family(name, [replace(frame, cfa=CFA.RGGB)], FitConfig(), (1.0, 64, 2), 0)
+        assert isinstance(fitted.model, DictionaryISP) and fitted.seconds == 0.0
+        assert torch.equal(fitted.model.colour.atoms(), universal.colour.atoms())
+    assert not is_method("universal-tiny")
+    rows = rows_of(fitted.model, replace(frame, cfa=CFA.RGGB), 1)
+    assert rows["oracle"] > rows["blind"], "the oracle weighs tone curves as well"
+    with pytest.raises(ValueError, match="makes RGGB RAW, but the frames are GRBG"):
+        fit_family("universal-small", [frame], FitConfig(), (1.0, 64, 2), 0)
 
 
 def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, float]:

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import tifffile
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -222,3 +224,15 @@ def test_the_srgb_transfer_is_inverted_and_continuous(value: float) -> None:
 def test_the_srgb_transfer_has_its_published_values() -> None:
     assert encode_srgb(torch.tensor(0.18)).item() == pytest.approx(0.4613561, abs=1e-6)
     assert decode_srgb(torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0, 0.2140411, 1], abs=1e-6)
+
+
+def test_a_picture_bomb_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    side = struct.pack(">II", 16384, 16384)
+    chunks = [(b"IHDR", side + bytes((8, 2, 0, 0, 0))), (b"IDAT", zlib.compress(bytes(100))), (b"IEND", b"")]
+    parts = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    with pytest.raises(ValueError, match=r"declares 16384 x 16384 pixels, above the limit of 67108864"):
+        read_picture(tmp_path / "bomb.png")
+    tifffile.imwrite(tmp_path / "wide.tif", np.zeros((20, 20, 8), np.uint8), photometric="rgb")
+    with pytest.raises(ValueError, match="declares 20 x 20 pixels of 8 channels, above the limit of 500"):
+        read_picture(tmp_path / "wide.tif", max_pixels=500)

@@ -55,6 +55,23 @@ def test_gains_follow_the_light(universal: DictionaryISP) -> None:
     assert torch.corrcoef(torch.stack([red, blue]))[0, 1] < -0.5
 
 
+def test_independent_gains_are_those_of_other_light(universal: DictionaryISP) -> None:
+    """The same cameras as in a consistent draw, and the same spread of gains, in no relation to each other."""
+    assert isinstance(universal.colour, CameraDictionary)
+    camera = of_cameras(universal, ["Nikon D750", "Leica S3"]).colour
+    assert isinstance(camera, CameraDictionary)
+
+    def error(consistent: bool) -> torch.Tensor:
+        sampler = CameraSampler(camera, 0, 1, 1, kelvin=(6504.0, 6504.0), lamps=0.0, consistent=consistent)
+        setting = sampler.sample(64, generator())
+        balance = white_balance(camera.xyz_to_camera(setting.colour_weights), white_point(D65))
+        own = balance / balance.amin(dim=1, keepdim=True)
+        return (setting.gains / own).log().abs().amax(dim=1)
+
+    assert error(consistent=True).max() < 0.1, "a little off the locus, but the camera's"
+    assert 0.2 < (error(consistent=False) > 0.1).float().mean() < 0.8, "half of the draws have the other camera's gains"
+
+
 def test_draws_are_where_the_published_cameras_are(universal: DictionaryISP) -> None:
     drawn = universal.draw_setting(4000, generator()).matrix
     published = colour_matrix(published_cameras().distinct()).float()

@@ -9,32 +9,20 @@ from unittest import mock
 
 import torch
 
-from rawaug.isp.config import ISPConfig
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading, ToneMap
 from rawaug.kernels import fallback, noise_numba, raw_torch
 from rawaug.kernels import noise_triton as noise_kernel
 from rawaug.kernels import raw_triton as raw_kernel
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
+from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
 
 assert os.environ["TRITON_INTERPRET"] == "1"
 
 
 def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
-    """Of an ISP in which every stage does something."""
-    generator = torch.Generator().manual_seed(0)
-    isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings)).requires_grad_(False)
-    isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-    if tone := isp.find(ToneMap):
-        list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
-    if isp.tone:
-        isp.tone.curves[0] **= 2
-    if lens := isp.find(LensShading):
-        lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
-        if lens.reverse_attention:
-            list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
+    isp = full_isp(**settings)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
     return BakedISP(isp)._camera(srgb, isp.choose(srgb), place)
 
@@ -75,9 +63,7 @@ def check_kernels_are_used() -> None:
 
 
 if __name__ == "__main__":
-    cameras: list[dict[str, Any]] = [{}, {"attention": False}, {"stages": ("tone", "colour", "gains")}]
-    cameras += [{"stages": ("curve", "colour", "gains", "shading"), "tone_atoms": 2}]
-    for settings, dtype in product(cameras, (torch.uint8, torch.float32)):
+    for settings, dtype in product(CONFIGURATIONS.values(), (torch.uint8, torch.float32)):
         check_raw(settings, dtype)
         print("raw")
     for white in (1.0, float("inf")):

@@ -23,6 +23,7 @@ from rawaug.noise import (
     noise_model,
     noise_names,
 )
+from rawaug.noise.levels import MixedLevels
 
 N = 20_000
 LAWS = {  # name: base of the logarithm, shot range, slope, intercept, sigma
@@ -111,8 +112,11 @@ def test_eld_full_model_draws_its_parts_at_one_gain() -> None:
     assert params["quantum"][0] == pytest.approx(1 / 15583)
     # the published scale is that of a Tukey lambda: its variance comes on top
     scale = params["read_var"].double().log() / 2 + math.log(15583) - (0.65588 * log_gain + 1.09269)
-    sd = [math.log(stats.tukeylambda.std(shape)) for shape in params["tukey_lambda"][:300].tolist()]
-    assert float((scale[:300] - torch.tensor(sd)).mean()) == pytest.approx(0, abs=3 * 0.28605 / 300**0.5)
+    shapes = params["tukey_lambda"][:300].tolist()
+    log_sd = {shape: math.log(stats.tukeylambda.std(shape)) for shape in set(shapes)}
+    assert float((scale[:300] - torch.tensor([log_sd[shape] for shape in shapes])).mean()) == pytest.approx(
+        0, abs=3 * 0.28605 / 300**0.5
+    )
 
 
 @pytest.mark.parametrize("name", ["Google Pixel", "pmrid", "NikonD850"])
@@ -155,3 +159,25 @@ def test_wrong_names_and_options_are_refused_in_one_line() -> None:
         SiddLevels("Pixel")
     with pytest.raises(ValueError, match="ELD camera"):
         EldLevels("Pixel")
+
+
+def test_a_mixture_draws_each_picture_s_levels_from_one_of_its_laws_all_alike() -> None:
+    laws = [FixedLevels(1e-3, 1e-6), FixedLevels(2e-3, 4e-6), FixedLevels(4e-3, 9e-6)]
+    shot, read = draw(MixedLevels(laws))
+    for law in laws:
+        mine = (shot - law.shot_var).abs() < 1e-9
+        assert mine.double().mean().item() == pytest.approx(1 / 3, abs=4 * math.sqrt(2 / 9 / N))
+        assert (read[mine] - law.read_var).abs().max() < 1e-12  # both from the same law
+    again = draw(MixedLevels(laws))
+    assert torch.equal(again[0], shot) and torch.equal(again[1], read)
+    with pytest.raises(ValueError, match="at least one law"):
+        MixedLevels([])
+
+
+def test_a_mixture_of_presets_has_the_range_of_both() -> None:
+    shot, _ = draw(noise_levels(["rawir", "cycleisp_sidd"]))
+    low, high = LAWS["rawir"][1], LAWS["cycleisp_sidd"][1]
+    assert low[0] <= shot.min() < high[0] and low[1] < shot.max() <= high[1]
+    both = ((shot >= low[0]) & (shot < high[0])).double().mean()  # rawir alone draws from there
+    expected = 0.5 * math.log(high[0] / low[0]) / math.log(low[1] / low[0])
+    assert both.item() == pytest.approx(expected, abs=0.02)

@@ -29,7 +29,7 @@ from rawaug.noise import (
 
 LEVELS = torch.tensor([0.0, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8])
 STRONG = FixedLevels(1e-3, 2e-5)
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 ZERO_MEAN: dict[str, Callable[[], NoiseModel]] = {
     "gaussian": lambda: ShotReadNoise(STRONG),
@@ -259,7 +259,7 @@ def test_noise_costs_less_than_its_random_numbers_from_pytorch() -> None:
     assert min(t for _, t in times) < 1.3 * min(t for t, _ in times)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.gpu
 @pytest.mark.parametrize("name", EVERY)
 def test_cuda_replays_and_takes_parameters_from_the_cpu(name: str) -> None:
     model = EVERY[name]()

@@ -8,7 +8,7 @@ from scipy import stats
 
 from rawaug.noise.poisson import INVERSION_LIMIT, _walked, poisson
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 N = 400_000
 
 

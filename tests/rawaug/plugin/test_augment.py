@@ -45,7 +45,7 @@ def assert_same(a: Any, b: Any) -> None:
         assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-@pytest.mark.parametrize("sampling", ["convex", "perturb", "chosen"])
+@pytest.mark.parametrize("sampling", ["convex", "independent", "perturb", "chosen"])
 def test_parameters_replay_the_pair(isp: DictionaryISP, srgb: Tensor, sampling: Any) -> None:
     augment = RawAugment(isp, sampling=sampling)
     pair = augment(srgb)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ def test_fabric_sets_up_the_loader_that_is_wrapped(augment: RawAugment, srgb: Te
     assert noisy(wrap(loader, augment, device=fabric.device)).shape == (6, 4, 8, 10)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="pinned memory and the copy to a GPU need one")
+@pytest.mark.gpu
 def test_pinned_pictures_become_pairs_on_the_gpu(srgb: Tensor) -> None:
     augment = RawAugment(DictionaryISP())
     loader = DataLoader(TensorDataset(srgb, torch.arange(6)), batch_size=3, pin_memory=True, num_workers=2)
@@ -156,14 +156,12 @@ def test_a_batch_of_grey_pictures_is_no_colour_picture(augment: RawAugment, batc
 
 
 def test_processes_of_a_distributed_run_draw_apart(
-    augment: RawAugment, srgb: Tensor, monkeypatch: pytest.MonkeyPatch
+    augment: RawAugment, srgb: Tensor, as_rank: Callable[[int, int], None]
 ) -> None:
     (alone,) = wrap([srgb], augment)
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
     drawn: list[RawPair] = []
     for rank in range(3):
-        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        as_rank(rank, 3)
         drawn += wrap([srgb], augment)
         drawn.append(RawAugment(augment.isp, seed=1)(srgb))
     assert torch.equal(drawn[0].noisy, alone.noisy)

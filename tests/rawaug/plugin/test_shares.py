@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, distributed, nn
@@ -15,7 +16,7 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, Rando
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.dataset import RawPairs, RawPairStream
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -105,8 +106,30 @@ def test_counted_draws_of_processes_differ(augment: RawAugment, tmp_path: Path) 
     assert first[2] == second[2] == first[0]
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_two_nodes_read_every_sample_of_the_shards_once(augment: RawAugment, tmp_path: Path) -> None:
+    wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
+    urls = [str(tmp_path / f"pictures-{k}.tar") for k in range(3)]
+    for k, url in enumerate(urls):
+        with wds.TarWriter(url) as tar:
+            for i in range(3):
+                tar.write({"__key__": f"{k}-{i}", "png": np.full((16, 16, 3), 60 * k + 20 * i, np.uint8)})
+
+    def read() -> list[tuple[str, Tensor]]:
+        shards = wds.WebDataset(urls, shardshuffle=False, nodesplitter=wds.split_by_node).decode("pil")
+        drawn = RawAugment(augment.isp, noise=(0.01, 0.01))
+        pairs = RawPairStream(shards, drawn, crop=8, key="png", identity="__key__")
+        return [(sample["__key__"], sample["png"].noisy) for sample in pairs]
+
+    alone = dict(read())
+    nodes = [[(key, noisy) for key, noisy in own] for own in in_two_processes(read, tmp_path)]
+    assert [len(own) for own in nodes] == [6, 3] and len(alone) == 9
+    assert sorted(key for own in nodes for key, _ in own) == sorted(alone)
+    assert all(torch.equal(noisy, alone[key]) for own in nodes for key, noisy in own)
+
+
 @pytest.mark.parametrize("chosen", ["sampler", "batch sampler", "replacement", "no loader"])
-def test_a_chosen_order_is_left_alone(augment: RawAugment, monkeypatch: pytest.MonkeyPatch, chosen: str) -> None:
+def test_a_chosen_order_is_left_alone(augment: RawAugment, as_rank: Callable[[int, int], None], chosen: str) -> None:
     shown: Any = pictures()
     loaders: dict[str, Any] = {
         "sampler": DataLoader(shown, sampler=DistributedSampler(shown, num_replicas=2, rank=0)),
@@ -114,7 +137,5 @@ def test_a_chosen_order_is_left_alone(augment: RawAugment, monkeypatch: pytest.M
         "replacement": DataLoader(shown, sampler=RandomSampler(shown, replacement=True, num_samples=3)),
         "no loader": [torch.stack(shown)],
     }
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 0)
+    as_rank(0, 2)
     assert wrap(loaders[chosen], augment).share is loaders[chosen]

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import os
+import multiprocessing
 import random
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import pytest
 from safetensors.torch import load_file
 
-ROOT = Path(__file__).parents[3]
-
 SCRIPT = """
-import sys
+import os
 import warnings
-from pathlib import Path
 
 import torch
 
+os.environ.update(environment)
 warnings.filterwarnings("ignore")
 torch.set_num_threads(1)
 from safetensors.torch import save_file
@@ -35,7 +32,6 @@ from rawaug.training.stream import TrainingStream
 from rawaug.training.loop import train
 from rawaug.training.validation import Watched
 
-where, steps, devices, names = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 generator = torch.Generator().manual_seed(0)
 frame = NoisyFrame("frame", torch.rand(1, 64, 64, generator=generator), 1e-3, 1e-4, CFA.RGGB)
 config = TrainConfig(
@@ -44,29 +40,25 @@ config = TrainConfig(
 )
 network = DenoiserConfig("UNet", {"width": 4, "scales": 2})
 watched = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
-for name in names.split():
+for name in names:
     estimator = {"noisier": Noisier(1.0, correct=True), "neighbor2neighbor": Neighbor2Neighbor()}[name]
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
-    folder = where / name
-    net = train(stream, watched, network, config, folder, 0, "cpu", devices, estimator=estimator)
-    save_file(net.state_dict(), folder / f"end{sys.argv[5] if len(sys.argv) > 5 else ''}.safetensors")
+    net = train(stream, watched, network, config, where / name, 0, "cpu", devices, estimator=estimator)
+    save_file(net.state_dict(), where / name / f"end{environment.get('LOCAL_RANK', '')}.safetensors")
 """
 
-Environment = dict[str, str]
+
+def trained(where: Path, steps: int, *names: str) -> None:
+    """The script in this process."""
+    exec(SCRIPT, {"where": where, "steps": steps, "devices": 1, "names": names, "environment": {}})
 
 
-def started(*arguments: str | int | Path, **environment: str) -> subprocess.Popen[bytes]:
+def started(where: Path, steps: int, devices: int, *names: str, **environment: str) -> ForkServerProcess:
     """The script in a process of its own."""
-    settings: Environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **environment}
-    command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
-    return subprocess.Popen(command, env=settings, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-
-
-def finished(*processes: subprocess.Popen[bytes]) -> None:
-    """Wait for their end; what they say if it is a bad one."""
-    for process in processes:
-        _, errors = process.communicate(timeout=400)
-        assert process.returncode == 0, errors.decode()[-2000:]
+    variables = {"where": where, "steps": steps, "devices": devices, "names": names, "environment": environment}
+    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(SCRIPT, variables))
+    process.start()
+    return process
 
 
 def logged(folder: Path) -> list[list[str]]:
@@ -74,10 +66,10 @@ def logged(folder: Path) -> list[list[str]]:
     return [row.split(",")[:3] for row in (folder / "log.csv").read_text().splitlines()]
 
 
-def rows_as_they_come(folder: Path, process: subprocess.Popen[bytes]) -> Iterator[int]:
+def rows_as_they_come(folder: Path, process: ForkServerProcess) -> Iterator[int]:
     """The last logged step, whenever it has changed."""
     last = -1
-    while process.poll() is None:
+    while process.is_alive():
         path = folder / "log.csv"
         count = path.read_text().count("\n") - 1 if path.is_file() else 0
         if count != last:
@@ -92,7 +84,7 @@ STEPS = 60
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unbroken")
-    finished(started(folder, STEPS, 1, "noisier"))
+    trained(folder, STEPS, "noisier")
     return folder / "noisier"
 
 
@@ -102,12 +94,12 @@ def test_killed_at_a_random_step_it_ends_bit_for_bit_as_unbroken(unbroken: Path,
     folder = tmp_path / "noisier"
     for done in rows_as_they_come(folder, process):
         if done >= step:
-            process.send_signal(signal.SIGKILL)
+            process.kill()
             break
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL, f"it was over before it could be killed at step {step}"
+    process.join()
+    assert process.exitcode == -signal.SIGKILL, f"it was over before it could be killed at step {step}"
     assert not (folder / "end.safetensors").exists() and (folder / "last.pt").is_file()
-    finished(started(tmp_path, STEPS, 1, "noisier"))
+    trained(tmp_path, STEPS, "noisier")
     whole, resumed = (load_file(place / "end.safetensors") for place in (unbroken, folder))
     assert whole.keys() == resumed.keys()
     assert all(bool((whole[key] == resumed[key]).all()) for key in whole), f"killed at step {step}"
@@ -121,9 +113,11 @@ def test_two_processes_take_the_steps_of_one(tmp_path: Path) -> None:
     together, alone = tmp_path / "together", tmp_path / "alone"
     meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "NODE_RANK": "0"}
     names = ("noisier", "neighbor2neighbor")
-    both = " ".join(names)
-    ranks = [started(together, 20, 2, both, rank, LOCAL_RANK=str(rank), **meeting) for rank in (0, 1)]
-    finished(*ranks, started(alone, 20, 1, both))
+    ranks = [started(together, 20, 2, *names, LOCAL_RANK=str(rank), **meeting) for rank in (0, 1)]
+    trained(alone, 20, *names)
+    for process in ranks:
+        process.join(400)
+        assert process.exitcode == 0
     for name in names:
         one, two = ([float(row[1]) for row in logged(folder / name)[1:]] for folder in (alone, together))
         assert len(one) == 20

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
+import multiprocessing
 import socket
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +19,8 @@ from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.training import loop
 from rawaug.training.estimators import Supervised
+from rawaug.training.journal import Journal
+from rawaug.training.state import learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.validation import Watched, validate
@@ -47,7 +47,7 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     stream = TrainingStream(RealCrops([pair], noise, 32, pair.cfa), None, 4, 0.0, seed=0)
     validation = [Watched(*frozen_sample(pair, noise, pair.cfa, seed=0))]
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2, "deviation": True})
-    config = replace(CONFIG, steps=120, batch=4, ema=0.9)
+    config = replace(CONFIG, steps=120, batch=4, ema=0.9, validate_every=60, checkpoint_every=120)
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
     noisy = psnr(validation[0].noisy, validation[0].clean).item()
     assert validate(net, validation, torch.device("cpu"))["psnr"] > noisy + 2.0
@@ -135,31 +135,39 @@ def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Wa
 
 def test_the_rate_of_the_step_schedule_halves() -> None:
     config = replace(CONFIG, schedule="step", halve_every=3, warmup=2)
-    assert [loop.learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
+    assert [learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
+
+
+MEET = """
+from rawaug.training.loop import launched
+fabric = launched("cpu", 1, "32-true")
+(where / str(fabric.global_rank)).write_text(str(fabric.world_size))
+"""
+NODE = """
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+rendezvous = {"rdzv_backend": "static", "rdzv_endpoint": endpoint, "rdzv_configs": {"rank": rank}, "run_id": "meet"}
+config = LaunchConfig(2, 2, 2, **rendezvous, max_restarts=0, monitor_interval=0.05, start_method="fork")
+elastic_launch(config, exec)(meet, {"where": where})
+"""
+"""What ``torchrun --nnodes 2 --nproc-per-node 2 --node-rank RANK`` does on a node, for code in place of a file."""
 
 
 def test_torchrun_s_processes_count(tmp_path: Path) -> None:
-    script = tmp_path / "meet.py"
-    script.write_text(
-        "from rawaug.training.loop import launched\n"
-        "fabric = launched('cpu', 1, '32-true')\n"
-        "print(f'{fabric.global_rank} of {fabric.world_size}', flush=True)\n"
-    )
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    meeting = ["--nnodes", "2", "--nproc-per-node", "2", "--master-addr", "127.0.0.1", "--master-port", port]
-    torchrun = [sys.executable, "-m", "torch.distributed.run", *meeting]
-    nodes = [
-        subprocess.Popen([*torchrun, "--node-rank", str(rank), str(script)], stdout=subprocess.PIPE, text=True)
-        for rank in (0, 1)
-    ]
-    said = "".join(node.communicate(timeout=400)[0] for node in nodes)
-    assert sorted(re.findall(r"\d of \d", said)) == [f"{rank} of 4" for rank in range(4)]
+        endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+    nodes = []
+    for rank in (0, 1):
+        variables = {"rank": rank, "endpoint": endpoint, "meet": MEET, "where": tmp_path}
+        nodes.append(multiprocessing.get_context("forkserver").Process(target=exec, args=(NODE, variables)))
+        nodes[-1].start()
+    for node in nodes:
+        node.join(400)
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {str(rank): "4" for rank in range(4)}
 
 
 def test_the_rate_warms_up_and_falls() -> None:
-    factors = [loop.learning_rate_factor(step, CONFIG) for step in range(CONFIG.steps + 1)]
+    factors = [learning_rate_factor(step, CONFIG) for step in range(CONFIG.steps + 1)]
     assert factors[0] == 0.5 and factors[2] == 1.0
     assert factors[-1] == pytest.approx(0.01)
     assert all(a >= b for a, b in pairwise(factors[2:]))
@@ -167,7 +175,7 @@ def test_the_rate_warms_up_and_falls() -> None:
 
 def test_a_log_that_was_begun_with_other_columns_goes_on(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text("step,loss,psnr\n1,0.5,30\n2,0.4,31\n3,0.3,3")
-    journal = loop.Journal(tmp_path, 2)
+    journal = Journal(tmp_path, 2)
     journal.log(3, loss=0.25, psnr=32.0, psnr_srgb=25.0)
     journal.log(4, loss=0.25, psnr=33.0, psnr_srgb=26.0)
     journal.close()

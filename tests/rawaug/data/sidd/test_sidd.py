@@ -17,10 +17,13 @@ from rawaug.data import (
     SiddBlocks,
     SiddFrames,
     SiddPlusBlocks,
+    check,
     check_submission,
     open_pairs,
     write_submission,
 )
+from rawaug.data.mat import read_array
+from rawaug.data.sidd import blocks as blocks_module
 from rawaug.data.sidd.scenes import HELD_BACK, PHONES, SiddScene
 from rawaug.io import write_picture
 from rawaug.io.picture_files import view_of_orientation
@@ -263,6 +266,26 @@ def test_sidd_plus_has_a_pattern_for_each_frame(tmp_path: Path) -> None:
     (tmp_path / "siddplus_valid_bayer_patterns.csv").write_text("rggb\n")
     with pytest.raises(ValueError, match="has 64 blocks, but there are patterns for 32"):
         SiddPlusBlocks(tmp_path)[0]
+
+
+def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind in ("gt", "noisy"):
+        name = f"siddplus_valid_{kind}_raw"
+        savemat(tmp_path / f"{name}.mat", {name: np.full((64, 8, 8), 0.5, np.float32)})
+    patterns = tmp_path / "siddplus_valid_bayer_patterns.csv"
+    patterns.write_text("rggb\n" * 32)
+    reads = []
+    monkeypatch.setattr(blocks_module, "read_array", lambda file, name: reads.append(file) or read_array(file, name))
+    (part,) = check(tmp_path).parts
+    assert part.items == 1024 and len(reads) == 2
+    assert len(part.broken) == 1 and "has 64 blocks, but there are patterns for 1024" in part.broken[0]
+    for content in ("rggb\nrgbw\n", "rggb\n" * 5000, "\0"):
+        patterns.write_text(content)
+        with pytest.raises(ValueError, match=r"bayer_patterns\.csv: is no list of patterns") as error:
+            SiddPlusBlocks(tmp_path)
+        assert "\n" not in str(error.value)
 
 
 def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer) -> None:

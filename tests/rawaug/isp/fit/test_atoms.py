@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,12 +11,12 @@ from scipy.optimize import nnls
 
 from rawaug.data.pair import Pair
 from rawaug.isp.conditioning import with_white_balance
-from rawaug.isp.fit import FitConfig, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.atoms import best_constants, reach_atoms
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
-QUICK = FitConfig(steps=0, pixels=2048, batch=512, shading="off")
+QUICK = FitConfig(steps=0, curve_steps=20, pixels=2048, batch=512, shading="off")  # the curve is the start's
 OTHER = torch.tensor([[0.8, 0.15, 0.05], [0.25, 0.5, 0.25], [0.1, 0.1, 0.8]])
 
 
@@ -25,11 +26,6 @@ def oracle_gains(isp: DictionaryISP, gains: tuple[float, float, float]) -> torch
     one = 1e3 * torch.ones(1, len(inverse)).double()
     weights, _ = nnls(torch.cat([inverse.T, one]).numpy(), torch.cat([wanted, one[0, :1]]).numpy())
     return torch.as_tensor(weights) @ inverse / wanted
-
-
-@pytest.fixture(autouse=True)
-def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "CURVE_STEPS", 20)  # the curve of these frames is where the fit starts
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +41,7 @@ def test_reach_brings_an_unseen_light_into_the_hull(one_light: list[Pair]) -> No
 
 
 def test_a_reach_of_one_adds_no_atoms(one_light: list[Pair]) -> None:
-    isp = fit_isp(one_light, FitConfig(steps=0, pixels=2048, batch=512, shading="off", reach=1.0), progress=False)
+    isp = fit_isp(one_light, replace(QUICK, reach=1.0), progress=False)
     assert isp.config.gain_atoms == isp.config.colour_atoms == 2
     assert (oracle_gains(isp, (2.2, 1.0, 1.25)) - 1).abs().max() > 0.1
 
@@ -79,7 +75,7 @@ def test_two_cameras_in_one_fit_are_reported_apart_by_their_light(
 
 def test_frames_that_are_all_alike_are_clustered_without_a_word(exact_pair: Callable[..., Pair]) -> None:
     frames = [exact_pair("same", (1.6, 1.0, 1.5), 0)] * 3
-    isp = fit_isp(frames, FitConfig(steps=0, pixels=512, batch=128, shading="off", atoms=2), progress=False)
+    isp = fit_isp(frames, replace(QUICK, atoms=2), progress=False)
     torch.testing.assert_close(isp.colour.atoms()[0], isp.colour.atoms()[1])
 
 

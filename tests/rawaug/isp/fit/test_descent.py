@@ -10,18 +10,17 @@ import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-TINY = FitConfig(steps=12, pixels=512, batch=128)
+TINY = FitConfig(steps=12, curve_steps=12, pixels=512, batch=128)
 
 
 @pytest.fixture(autouse=True)
 def save_and_report_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(descent, "SAVE_SECONDS", -1.0)
     monkeypatch.setattr(descent, "REPORT_STEPS", 5)
-    monkeypatch.setattr(pipeline, "CURVE_STEPS", 12)
     monkeypatch.setattr(atoms, "PRIOR_STEPS", 20)
 
 
@@ -47,7 +46,7 @@ def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False,
     x = torch.zeros(3)
     loss = stopped_at(stop)(x)
     score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None
-    Descent(path, key, 0, False).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
+    Descent(path, key, 0, False, report_steps=5).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
     return x
 
 
@@ -81,7 +80,7 @@ def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
 
 def test_watched_tensors_come_back_from_their_best_step() -> None:
     x = torch.zeros(3)
-    worker = Descent(None, "key", 0, False)
+    worker = Descent(None, "key", 0, False, report_steps=5)
     worker.run("down", lambda g: x.sum(), {"x": x}, 20, 0.1, watch=lambda: -abs(float(x.detach().sum()) + 1.5))
     start, step, best = worker.watched["down"]
     assert (start, step) == (-1.5, 5) and best > -0.2  # 5 steps of 0.1 by Adam, three times

@@ -15,7 +15,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
-TINY = FitConfig(steps=3, pixels=512, batch=128, shading="off")
+TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off")
 
 
 def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
@@ -45,7 +45,7 @@ def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -
 
 
 def test_the_isp_records_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
-    assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0}
+    assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0, "registered": 3}
     assert str(fitted.cfa) == "GRBG" and not fitted.training
 
 

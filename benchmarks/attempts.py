@@ -1,0 +1,120 @@
+"""What a worker of benchmarks/fuzz.py does: read a file by every reader of its kind, and say what became of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def readers(kind: str, path: Path) -> list[Callable[[], object]]:
+    """Every reader in the package for this kind of file."""
+    import torch
+
+    import denoisers
+    from rawaug import DictionaryISP
+    from rawaug.commands.info import describe
+    from rawaug.data.mat import read_value
+    from rawaug.data.rawir import read_packed
+    from rawaug.data.sidd.frames import colour_of, mosaic_of
+    from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
+    from rawaug.plugin.params import load_params
+
+    def frame_of() -> RawFrame:
+        frame = read_raw(path)
+        numbers = [*frame.white_balance, *frame.daylight, *(frame.noise_profile or ()), frame.white, *frame.black]
+        for tensor in (frame.mosaic, frame.color_matrix, frame.shading_gains, torch.tensor(numbers)):
+            if not tensor.isfinite().all():
+                raise ArithmeticError(f"not finite: {tensor.flatten()[:20].tolist()}")
+        return frame
+
+    def isp_of(path: Path) -> None:
+        raw = DictionaryISP.from_pretrained(path).reverse(torch.linspace(0, 1, 192).reshape(1, 3, 8, 8)).raw
+        if not raw.isfinite().all():
+            raise ArithmeticError("not finite: RAW of this ISP")
+
+    def rewritten() -> None:
+        frame = frame_of()
+        write_dng(path.with_name(f"{path.stem}.out.dng"), frame, source=path)
+
+    if kind == "raw":
+        return [frame_of]
+    if kind == "dng":
+        return [lambda: read_raw_and_develop(path), rewritten]
+    if kind in ("jpeg", "picture"):
+        return [lambda: read_picture(path)]
+    if kind == "recipe":
+        return [lambda: _set_up(path)]
+    if kind == "npy":
+        return [lambda: read_packed(path, path.with_suffix(".png"), None)]
+    if kind != "safetensors":
+        values = [lambda name=name: read_value(path, name) for name in ("cells", "text")]
+        return [lambda: mosaic_of(path), lambda: colour_of(path), *values]
+    load = {"isp": isp_of, "denoiser": denoisers.load, "params": load_params}
+    kept = path.stem.split("-")[0]
+    return [lambda: load[kept](path), *([lambda: describe(path)] if kept != "params" else [])]
+
+
+def _set_up(path: Path) -> None:
+    """A recipe as the command line sets it up, its networks without their memory."""
+    import torch
+    from jsonargparse import ArgumentError
+
+    from rawaug.cli import _parser
+    from rawaug.experiment.kinds import KINDS, kind_of
+    from rawaug.experiment.recipe import Recipe
+    from rawaug.training.start import first_network
+
+    try:
+        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path))
+        settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
+        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke"}})
+        if isinstance(recipe, Recipe):
+            with torch.device("meta"):
+                for arm in recipe.arms:
+                    first_network(recipe.network_of(arm), seed=0)
+    except (ArgumentError, ValueError) as error:  # the command line has named the file already
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def attempt(kind: str, path: Path) -> tuple[str, str]:
+    """``read``, ``refused`` or ``fault``, and why."""
+    outcome = "read", ""
+    for read in readers(kind, path):
+        try:
+            read()
+        except (ValueError, OSError) as error:
+            text = str(error)
+            if "\n" in text or path.stem not in text:
+                return "fault", f"{type(error).__name__} without name, or of many lines: {text!r}"
+            outcome = "refused", text
+        except Exception as error:
+            import traceback
+
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            return "fault", f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
+    return outcome
+
+
+def work() -> None:
+    """Read what standard input names, and answer each with a line of JSON; the first answer says that all is there."""
+    import faulthandler
+    import warnings
+
+    faulthandler.enable()
+    warnings.simplefilter("ignore")
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what decoders print must not come between the answers
+    for kind in ("dng", "recipe"):  # imports are no part of reading
+        attempt(kind, Path("none"))
+    print("[]", file=answers, flush=True)
+    for line in sys.stdin:
+        kind, name = json.loads(line)
+        outcome, why = attempt(kind, Path(name))
+        print(json.dumps([outcome, why]), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    work()

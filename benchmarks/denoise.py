@@ -1,0 +1,86 @@
+"""What denoising a frame costs: seconds and peak memory, whole and in tiles, in float32 and in bf16.
+
+    python -m benchmarks.denoise [--device cpu|cuda] [--denoiser rawaug-small] [--megapixels 12 45] [--quick]
+
+A frame is noise, packed, on the device; its time does not depend on what is in it. ``rawaug denoise`` also reads and
+writes a file. Every form runs ``--repeats`` times after one that is not counted, and the fastest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import denoisers
+from benchmarks.augment import machine, memory_used
+from benchmarks.loader import fastest
+from denoisers.pretrained import DEFAULT
+
+
+def frame(megapixels: float, device: torch.device) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)`` of a mosaic with sides 2 : 3."""
+    height = round((megapixels * 1e6 * 2 / 3) ** 0.5 / 2)
+    return torch.rand(1, 4, height, round(1.5 * height), generator=torch.Generator().manual_seed(0)).to(device)
+
+
+def measure(model: denoisers.Denoiser, noisy: Tensor, repeats: int) -> dict[str, dict[str, float]]:
+    """Seconds, Mpix/s and peak MiB of each form; nothing for one that the GPU's memory does not hold."""
+    variance, rows = 1e-3 * noisy + 1e-5, dict[str, dict[str, float]]()
+    forms: dict[str, Callable[..., Tensor]] = {"whole": model, "tiles": partial(denoisers.tiled, model)}
+    for form, run in forms.items():
+        for precision in (torch.float32, torch.bfloat16):
+            label = f"{form}, {str(precision).removeprefix('torch.')}"
+            try:
+                rows[label] = timed(run, noisy, variance, precision, repeats)
+            except torch.OutOfMemoryError:
+                rows[label] = {}
+    return rows
+
+
+@torch.inference_mode()
+def timed(
+    run: Callable[..., Tensor], noisy: Tensor, variance: Tensor, precision: torch.dtype, repeats: int
+) -> dict[str, float]:
+    """One form."""
+    device = noisy.device
+    with torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
+        run(noisy, variance)
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)
+        seconds = fastest({"one": lambda: run(noisy, variance)}, repeats, device)["one"]
+    return {"seconds": seconds, "Mpix/s": noisy.numel() / seconds / 1e6, "peak MiB": memory_used(device) / 2**20}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    parser.add_argument("--denoiser", default=DEFAULT, help="name of a shipped denoiser, or its file")
+    parser.add_argument("--megapixels", type=float, nargs="+", default=[12.0, 45.0], help="of the mosaics")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="one repeat of 0.25 Mpix")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    args = parser.parse_args()
+    if args.quick:
+        args.megapixels, args.repeats = [0.25], 1
+    model = denoisers.from_pretrained(args.denoiser)
+    model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    figures: dict[str, Any] = {"machine": machine(args.device, torch.get_num_threads())}
+    print("  ".join(f"{key} {value}" for key, value in figures["machine"].items()))
+    for megapixels in args.megapixels:
+        figures[f"{megapixels:g} Mpix"] = rows = measure(model, frame(megapixels, args.device), args.repeats)
+        print(f"{megapixels:g} Mpix")
+        for name, row in rows.items():
+            print(f"  {name:18s}", "  ".join(f"{what} {value:.4g}" for what, value in row.items()) or "out of memory")
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

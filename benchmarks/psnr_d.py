@@ -1,0 +1,125 @@
+"""What each part of the universal ISP is worth: PSNR_d of denoisers trained on RAW made without it.
+
+    python benchmarks/psnr_d.py --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
+        [--older universal.safetensors] [--seeds 3] [--out runs/psnr_d]
+
+Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
+the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
+in another light. ``without the wide hull``: one camera's matrix. ``real``: trained on crops of
+real RAW frames in place of pictures. Each network is scored on every test set; finished trainings are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs, open_pictures
+from rawaug.evaluation.scores import classical_method, score_method
+from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.experiment.downstream import DownstreamConfig, DownstreamScore, MadeCrops, score_on, trained_on
+from rawaug.files import write_json
+from rawaug.isp.baselines import UPI
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.universal import of_cameras
+from rawaug.noise import noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.pictures import even_sided
+from rawaug.training.stream import PictureCrops, RealCrops, Source
+from rawaug.training.train_config import DenoiserConfig, TrainConfig
+
+CONFIG = DownstreamConfig(
+    denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)
+)
+NARROW = "Canon EOS 5D Mark III"
+"""The camera that stands for all where the hull is taken away."""
+
+
+def without_tone(isp: DictionaryISP) -> DictionaryISP:
+    """The ISP with the linear rendering for every tone atom."""
+    assert isp.tone is not None
+    linear = isp.tone.curves[isp.info["tones"].index("linear")].clone()
+    isp.tone.curves.copy_(linear.expand_as(isp.tone.curves))
+    return isp
+
+
+def sources(pictures: Sequence[Tensor], older: Path | None, real: dict[str, list[str]]) -> Iterator[tuple[str, Source]]:
+    """Rows: name and training samples."""
+    noise, crop = noise_model(CONFIG.noise), CONFIG.train.crop
+
+    def universal() -> DictionaryISP:
+        return DictionaryISP.from_pretrained("universal")
+
+    def made(isp: DictionaryISP, **settings: object) -> Source:
+        return PictureCrops(RawPairs(pictures, RawAugment(isp, noise, **settings), crop))  # type: ignore[arg-type]
+
+    yield "universal", made(universal())
+    upi = UPI()
+    yield "UPI", MadeCrops(pictures, upi.draw, upi.cfa, noise, crop)
+    if older is not None:
+        yield "universal, older", made(DictionaryISP.from_pretrained(older), exposure=CONFIG.exposure)
+    yield "without tone", made(without_tone(universal()))
+    yield "without consistent gains", made(universal(), sampling="independent")
+    yield "without the wide hull", made(of_cameras(universal(), NARROW))
+    for name, specs in real.items():
+        pairs = [pair for spec in specs for pair in open_pairs(spec)]
+        yield f"real RAW, {name}", RealCrops(pairs, noise, crop, CFA.RGGB)
+
+
+def filtered(specs: Sequence[str]) -> DownstreamScore:
+    """The row that needs no training."""
+    noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
+    frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test")]
+    scores = [s for s, *_ in score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, "")]
+    return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
+
+
+def named(values: Sequence[str]) -> dict[str, list[str]]:
+    """``NAME=SPEC`` arguments; a name may come several times."""
+    specs: dict[str, list[str]] = {}
+    for value in values:
+        name, spec = value.split("=", 1)
+        specs.setdefault(name, []).append(spec)
+    return specs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pictures", nargs="+", required=True)
+    parser.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
+    parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
+    parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    folders = [open_pictures(folder, min_side=CONFIG.train.crop) for folder in options.pictures]
+    pictures = [even_sided(folder[k]) for folder in folders for k in range(len(folder))]
+    tests = named(options.test)
+    rows: dict[str, dict[str, list[DownstreamScore]]] = {}
+    for seed in range(options.seeds):
+        for row, crops in sources(pictures, options.older, named(options.real)):
+            net = trained_on(crops, CONFIG, options.out / row.replace(" ", "-").replace(",", ""), seed)
+            for test, specs in tests.items():
+                score = score_on(net, replace(CONFIG, test=specs), CFA.RGGB)
+                rows.setdefault(row, {}).setdefault(test, []).append(score)
+            write_json(rows, options.out / "scores.json")
+    rows["NonLocalMeans"] = {test: [filtered(specs)] for test, specs in tests.items()}
+    heads = [f"{test}, {domain}" for test in tests for domain in ("RAW", "sRGB")]
+    cells = [
+        [row, *(mean_and_spread([s[k] for s in scores[test]], 2) for test in tests for k in (0, 1))]
+        for row, scores in rows.items()
+    ]
+    print_rows(f"PSNR_d in dB, {len(pictures)} pictures, {options.seeds} seeds", ["RAW of", *heads], cells)
+
+
+if __name__ == "__main__":
+    main()

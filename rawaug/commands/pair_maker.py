@@ -1,0 +1,136 @@
+"""The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
+
+The draws of a pair depend on (seed, picture's name, number) alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+from rawaug._version import __version__
+from rawaug.files import find_weights, sha256
+from rawaug.io import read_picture
+from rawaug.io.apart import apart
+from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.pictures import even_sided
+from rawaug.seeding import keyed_generator
+
+Format = Literal["dng", "npz", "tiff", "webdataset"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
+
+    format: Format
+    isp: str
+    isp_sha256: str
+    noise: str | list[float]
+    sampling: Sampling
+    seed: int
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a pair was made from; with its parameters it replays the pair."""
+
+    picture: str
+    picture_sha256: str
+    isp: str
+    isp_sha256: str
+    noise: str | list[float]
+    version: str = __version__
+
+
+class Outcome(NamedTuple):
+    """Of a task: pairs made, and the pictures that could not be read, with why."""
+
+    made: int
+    broken: dict[str, str]
+
+
+class Task(Protocol):
+    """What one process makes at a time.
+
+    Attributes:
+        pictures: how many it is about.
+        existing: pairs that are there already.
+        broken: pictures that an earlier run could not read, with why.
+        todo: whether anything is missing.
+    """
+
+    @property
+    def pictures(self) -> int: ...
+    @property
+    def existing(self) -> int: ...
+    @property
+    def broken(self) -> Mapping[str, str]: ...
+    @property
+    def todo(self) -> bool: ...
+    def make(self, maker: PairMaker) -> Outcome:
+        """Write what is missing."""
+
+
+class PairMaker:
+    """The pairs of pictures under fixed settings; those with more than ``max_pixels`` are refused."""
+
+    def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
+        self.settings, self.max_pixels = settings, max_pixels
+        self.augment = augmentation(settings.isp, settings.noise, settings.sampling)
+
+    def origin(self, picture: Path) -> Origin:
+        """Of the pairs of a picture's file."""
+        s = self.settings
+        return Origin(str(picture), sha256(picture), s.isp, s.isp_sha256, s.noise)
+
+    def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> Iterator[tuple[int, RawPair]]:
+        """Pairs ``(4, h, w)`` of a file by their numbers; ``key`` is the picture's name in its folder.
+
+        Raises:
+            OSError, ValueError: if it cannot be read, here and not on iteration.
+        """
+        srgb = even_sided(apart(read_picture, picture, self.max_pixels))
+
+        def made() -> Iterator[tuple[int, RawPair]]:
+            for number in numbers:
+                params = self.augment.sample(srgb, keyed_generator(self.settings.seed, "synth", key, number))
+                yield number, self.augment.apply(srgb, params)
+
+        return made()
+
+
+def replayed(
+    drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
+) -> RawPair:
+    """The pair ``(4, h, w)`` of these parameters, bit for bit.
+
+    Args:
+        drawn: the parameters.
+        origin: what the pair was made from.
+        label: names the pair in messages.
+        picture: the sRGB picture, if it has moved since.
+        isp: the ISP's file, if it has moved since.
+
+    Raises:
+        FileNotFoundError: if picture or ISP are not there.
+        ValueError: if they have changed since.
+    """
+    augment = augmentation(str(isp or origin.isp), origin.noise)
+    found = Path(picture or origin.picture)
+    if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
+        raise ValueError(f"{label}: the ISP {isp or origin.isp} is not the one this pair was made with")
+    srgb = even_sided(read_picture(found))
+    if sha256(found) != origin.picture_sha256:
+        raise ValueError(f"{label}: the picture {found} has changed since this pair was made")
+    pair: RawPair = augment.apply(srgb, drawn)
+    return pair
+
+
+def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
+    """The augmentation with these settings."""
+    return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)

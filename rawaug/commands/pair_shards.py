@@ -1,0 +1,235 @@
+"""RAW pairs in tar shards, as WebDataset and Hugging Face read them.
+
+``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files of one
+key, ``PICTURE_NUMBER``:
+
+==================  ==============================================================================================
+``KEY.clean.npy``   packed float32 ``(4, h, w)``, R, Gr, Gb, B
+``KEY.noisy.npy``   the same with noise
+``KEY.json``        picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters
+==================  ==============================================================================================
+
+The bytes of a shard depend on its pictures and the settings alone; nothing in it says when, where or by whom it was
+made. A shard is there when ``.shards/shard-000012.json`` is, which is written last. Once all are, ``index.json``
+(sizes, as WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, replayed
+from rawaug.files import parse_object, replacing, write_json
+from rawaug.plugin.params import AugmentParams, RawPair
+
+PER_SHARD = 500
+"""Pictures in a shard: of half a megapixel each, two gigabytes."""
+
+_SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
+
+
+@dataclass(frozen=True)
+class ShardTask:
+    """One shard: its path, the number of its first picture, and its pictures by name."""
+
+    path: Path
+    first: int
+    source: Path
+    names: tuple[str, ...]
+    per_image: int
+
+    @property
+    def pictures(self) -> int:
+        """How many it should have the pairs of."""
+        return len(self.names)
+
+    @property
+    def record(self) -> Path:
+        """The file that says that the shard is whole."""
+        return self.path.parent / ".shards" / f"{self.path.stem}.json"
+
+    @cached_property
+    def known(self) -> dict[str, Any]:
+        """The record of an earlier run; empty without one."""
+        if not self.record.is_file():
+            return {}
+        try:
+            return parse_object(self.record.read_text())
+        except ValueError as error:
+            raise ValueError(f"{self.record}: {error}; delete it to make the shard again") from None
+
+    @property
+    def existing(self) -> int:
+        """Pairs that are there already."""
+        return int(self.known.get("nsamples", 0))
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """The pictures that could not be read when the shard was made."""
+        return dict(self.known.get("broken", {}))
+
+    @property
+    def todo(self) -> bool:
+        """Whether it has to be made."""
+        return not self.known
+
+    def make(self, maker: PairMaker) -> Outcome:
+        """Write the shard and its record."""
+        made, broken = 0, dict[str, str]()
+        with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
+            for index, name in enumerate(self.names, self.first):
+                picture = self.source / name
+                try:
+                    pairs = maker.pairs(picture, name, range(self.per_image))
+                except (OSError, ValueError) as error:
+                    broken[name] = str(error).replace(str(picture), name)
+                    continue
+                origin = maker.origin(picture)
+                for number, pair in pairs:
+                    _add_sample(tar, f"{index:08d}_{number}", pair, _described(pair, maker, origin, name, number))
+                    made += 1
+        size = self.path.stat().st_size
+        write_json({"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}, self.record)
+        return Outcome(made, broken)
+
+
+def shard_tasks(
+    pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
+) -> list[ShardTask]:
+    """One a shard.
+
+    Raises:
+        ValueError: if ``per_shard`` is less than 1.
+    """
+    if per_shard < 1:
+        raise ValueError(f"per_shard must be at least 1, got {per_shard}")
+    names = _names(pictures, source)
+    starts = range(0, len(names), per_shard)
+    return [
+        ShardTask(out / f"shard-{k:06d}.tar", start, source, names[start : start + per_shard], per_image)
+        for k, start in enumerate(starts)
+    ]
+
+
+def shard_settings(
+    pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
+) -> dict[str, object]:
+    """What else all shards of a folder have in common: a picture more, and all that follow would move."""
+    listed = "\n".join(_names(pictures, source)).encode()
+    return {
+        "pictures": len(pictures),
+        "names_sha256": hashlib.sha256(listed).hexdigest(),
+        "per_image": per_image,
+        "per_shard": per_shard,
+        "max_pixels": max_pixels,
+    }
+
+
+def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
+    return tuple(picture.relative_to(source).as_posix() for picture in pictures)
+
+
+def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
+    """The JSON of a sample. Paths are those within the folder, which other machines have elsewhere."""
+    own = {**vars(origin), "picture": name, "isp": Path(origin.isp).name, "number": number}
+    height, width = (2 * side for side in pair.clean.shape[-2:])
+    levels = {key: pair.params.noise[key].item() for key in ("shot_var", "read_var") if key in pair.params.noise}
+    params = {key: value.tolist() for key, value in pair.params.tensors().items()}
+    cfa = str(maker.augment.isp.cfa)
+    return own | levels | {"cfa": cfa, "height": height, "width": width, "params": params}
+
+
+def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:
+    files = {"clean.npy": _npy(pair.clean), "json": json.dumps(described, sort_keys=True).encode()}
+    files["noisy.npy"] = _npy(pair.noisy)
+    for ending, content in sorted(files.items()):
+        entry = tarfile.TarInfo(f"{key}.{ending}")  # of nobody, at the epoch
+        entry.size = len(content)
+        tar.addfile(entry, io.BytesIO(content))
+
+
+def _npy(tensor: Tensor) -> bytes:
+    content = io.BytesIO()
+    np.lib.format.write_array(content, tensor.contiguous().numpy(), allow_pickle=False)
+    return content.getvalue()
+
+
+def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str | Path | None = None) -> RawPair:
+    """The pair ``(4, h, w)`` of a sample, bit for bit as in its shard.
+
+    Args:
+        described: the sample's JSON.
+        pictures: the folder that the shards were made from.
+        isp: the ISP's file, unless it is a shipped one.
+
+    Raises:
+        FileNotFoundError: if picture or ISP are not there.
+        ValueError: if they have changed since.
+
+    Example:
+        >>> pair = replay_sample(sample["json"], "photographs")  # doctest: +SKIP
+    """
+    tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
+    origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__})
+    picture = Path(pictures) / described["picture"]
+    return replayed(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
+
+
+def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
+    """Write index and card, if all shards are there, whoever made them; whether they are."""
+    if not all(task.record.is_file() for task in tasks):
+        return False
+    records = [replace(task).known for task in tasks]  # as they are now
+    shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
+    index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
+    write_json(index, out / "index.json")
+    with replacing(out / "README.md") as partial:
+        partial.write_text(card(shards, settings), encoding="utf-8")
+    return True
+
+
+def card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
+    """The dataset card, with the header that Hugging Face reads."""
+    pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
+    category = next((name for limit, name in _SIZES if pairs < limit), "n>10M")
+    return f"""---
+configs:
+- config_name: default
+  data_files: "shard-*.tar"
+size_categories:
+- {category}
+task_categories:
+- image-to-image
+tags:
+- raw
+- denoising
+- webdataset
+---
+
+# RAW pairs
+
+{pairs} noisy/clean RAW pairs in {len(shards)} WebDataset shards, {size / 1e9:.3g} GB, made of sRGB pictures by rawaug.
+
+| setting | value |
+|---|---|
+| ISP | {Path(settings.isp).name} (SHA-256 {settings.isp_sha256}) |
+| noise | {settings.noise} |
+| sampling of cameras | {settings.sampling} |
+| seed | {settings.seed} |
+
+Each sample has `clean.npy` and `noisy.npy`, packed float32 `(4, h, w)` in the order R, Gr, Gb, B, black 0, white 1,
+not clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise
+levels, and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
+"""

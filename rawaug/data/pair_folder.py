@@ -1,0 +1,238 @@
+"""A folder of noisy/clean RAW pairs of one's own, or as ``rawaug synth`` writes them: ``pairs:PATH``.
+
+The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files of other names hold both.
+Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand at the same places in ``clean``.
+:mod:`rawaug.data.mosaic_files` lists the formats.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from rawaug.data.colour import develop_mosaic
+from rawaug.data.lazy import LazyPairs
+from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
+from rawaug.data.pair import Pair
+from rawaug.data.raw_folder import RawFolder
+from rawaug.data.statements import Statements
+from rawaug.io.apart import apart
+from rawaug.registry import DATASETS
+
+NOISY, CLEAN = "*_noisy.*", "*_clean.*"
+"""The naming of ``rawaug synth``."""
+
+_WILD = re.compile(r"[*?]")
+
+
+@dataclass
+class PairSettings:
+    """How noisy/clean pairs are found and read, where ``pairs:PATH`` alone does not say it.
+
+    Args:
+        noisy: of pairs:PATH: pattern of the noisy files' names, such as "*_noisy.*", the naming of rawaug synth.
+        clean: of pairs:PATH: pattern of the clean files' names; null replaces the word noisy in ``noisy`` by clean.
+        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, of files that do not state it.
+        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
+        white: of pairs:PATH: white level of files that do not state it.
+    """
+
+    noisy: str | None = None
+    clean: str | None = None
+    cfa: str | None = None
+    black: float | tuple[float, float, float, float] | None = None
+    white: float | None = None
+
+
+class PairFiles(NamedTuple):
+    """The files of a pair, which may be one."""
+
+    name: str
+    noisy: Path
+    clean: Path
+
+
+@DATASETS.register("pairs")
+class PairFolder(LazyPairs):
+    """The noisy/clean pairs of a folder and its subfolders, sorted by path; or those of one noisy (or two-in-one) file.
+
+    The sRGB picture of a pair is the clean frame, developed without a tone curve. Where no file states white balance
+    and colour matrix, they are 1 and the identity, and ``color_known`` is false.
+
+    Args:
+        path: where the pairs are.
+        split: is ignored: a folder has no splits.
+        noisy: pattern of the noisy files' names, or of their paths where it has a slash; other files are left out.
+            Without it all readable files must belong to a pair by the naming of ``rawaug synth``.
+        clean: pattern of the clean ones; by default ``noisy`` with the word noisy replaced by clean.
+        cfa: such as ``"RGGB"``, of files that do not state it.
+        black, white: levels of files that do not state them, in digital numbers; ``black`` is one, or R, Gr, Gb, B.
+
+    Raises:
+        FileNotFoundError: if there is no such path, or a frame has no partner.
+        ValueError: if it contains no pair, a file belongs to none, or a pattern cannot be used.
+
+    Example:
+        >>> pair = PairFolder("shots", noisy="*_NOISY_*.png", cfa="GRBG", black=64, white=1023)[0]  # doctest: +SKIP
+        >>> pair.noisy.shape, pair.raw.shape  # doctest: +SKIP
+        (torch.Size([1, 3000, 4000]), torch.Size([1, 3000, 4000]))
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        split: str = "train",
+        noisy: str | None = None,
+        clean: str | None = None,
+        cfa: str | None = None,
+        black: float | Sequence[float] | None = None,
+        white: float | None = None,
+    ) -> None:
+        self.given = Statements.parse({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
+        self.pairs = _pairs_below(Path(path), noisy, clean)
+        super().__init__([pair.name for pair in self.pairs])
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        _, noisy, clean = self.pairs[index]
+        return tuple(dict.fromkeys((noisy, clean)))
+
+    def stamp(self, index: int) -> str:
+        given = (self.given.cfa, self.given.black, self.given.white)
+        return super().stamp(index) + (f" {given}" if any(given) else "")
+
+    def read(self, index: int) -> Pair:
+        name, *files = self.pairs[index]
+        alone = files[0] == files[1]
+        noisy, clean = (
+            apart(read_mosaic, file, which, self.given, alone)
+            for file, which in zip(files, ("noisy", "clean"), strict=True)
+        )
+        for what, one, other in (
+            ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),
+            ("CFA", noisy.cfa, clean.cfa),
+        ):
+            if one != other:
+                raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
+        stated = next((m for m in (clean, noisy) if m.white_balance is not None and m.color_matrix is not None), None)
+        gains = (1.0, 1.0, 1.0) if stated is None else stated.white_balance or (1.0, 1.0, 1.0)
+        matrix = torch.eye(3) if stated is None or stated.color_matrix is None else stated.color_matrix
+        shot_var, read_var = noisy.levels or (None, None)
+        return Pair(
+            name=name,
+            srgb=develop_mosaic(clean.raw, clean.cfa, gains, matrix),
+            raw=clean.raw,
+            cfa=clean.cfa,
+            white_balance=gains,
+            color_matrix=matrix,
+            noisy=noisy.raw,
+            shot_var=shot_var,
+            read_var=read_var,
+            camera=noisy.camera,
+            color_known=stated is not None,
+        )
+
+
+def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
+    """Refuse RAW files that are noisy by their names where all frames are taken alike.
+
+    Args:
+        as_clean: whether the frames are taken for clean ones; if not, noisy frames are only refused beside clean ones.
+
+    Raises:
+        ValueError: naming the first.
+    """
+    files = {file.resolve() for file in folder.files}
+    for file in folder.files:
+        found = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)
+        partner = found and file.with_name(f"{found[1]}_clean{file.suffix}")
+        if partner and partner.resolve() in files:
+            raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
+        if found and as_clean:
+            raise ValueError(
+                f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one"
+            )
+
+
+def looks_like_pairs(files: Sequence[Path]) -> bool:
+    """Whether there are files as ``rawaug synth`` writes them: a noisy frame beside its clean one, or NPZ."""
+    names = {str(file).casefold() for file in files if file.suffix.lower() in READABLE}
+    partners = {re.sub(r"_noisy(\.\w+)$", r"_clean\1", name) for name in names if re.search(r"_noisy\.\w+$", name)}
+    return bool(names & partners) or any(name.endswith(".npz") for name in names)
+
+
+def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairFiles]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such folder of noisy/clean pairs")
+    top = path if path.is_dir() else path.parent
+    readable = sorted(file for file in top.rglob("*") if file.suffix.lower() in READABLE and file.is_file())
+    by_pattern = _by_pattern(top, readable, noisy or NOISY, clean or _clean_pattern(noisy or NOISY))
+    found = list(by_pattern)
+    if noisy is None:
+        known = {file for pair in found for file in pair[1:]}
+        others = [file for file in readable if file not in known]
+        found += [PairFiles(_stem(top, file), file, file) for file in others if file.suffix.lower() in TWO_IN_ONE]
+        strange = [file for file in others if file.suffix.lower() not in TWO_IN_ONE]
+        if strange and path.is_dir():
+            more = f" (and {len(strange) - 1} others)" if len(strange) > 1 else ""
+            raise ValueError(f"{strange[0]}{more}: is neither {NOISY} nor {CLEAN}; give a pattern of the noisy files")
+    if path.is_file():
+        found = [pair for pair in found if path in pair[1:]]
+    if not found:
+        raise ValueError(f"{path}: contains no noisy/clean pair named {noisy or f'{NOISY}, {CLEAN}'}")
+    repeated = Counter(pair.name for pair in found)
+    named = (p if repeated[p.name] == 1 else p._replace(name=p.noisy.relative_to(top).as_posix()) for p in found)
+    return sorted(named, key=lambda pair: pair.noisy)
+
+
+def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> list[PairFiles]:
+    """Every noisy file with its clean one."""
+    if len(_WILD.findall(noisy)) != len(_WILD.findall(clean)):
+        raise ValueError(f"the patterns {noisy} and {clean} must have the same number of * and ?")
+    index = {file.relative_to(top).as_posix().casefold(): file for file in files}
+    found: list[PairFiles] = []
+    for file in files:
+        match = _regex(noisy).fullmatch(file.relative_to(top).as_posix())
+        if not match:
+            continue
+        folder, *parts = match.groups()
+        wanted = folder + "".join(
+            f"{fixed}{part}" for fixed, part in zip(_WILD.split(clean), [*parts, ""], strict=True)
+        )
+        partner = index.get(wanted.casefold())
+        if partner is None:
+            raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or give its pattern")
+        if partner == file:
+            raise ValueError(f"{file}: would be its own clean frame by the pattern {clean}")
+        found.append(PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, partner))
+    paired = {file for pair in found for file in pair[1:]}
+    cleans = (file for file in files if _regex(clean).fullmatch(file.relative_to(top).as_posix()))
+    single = next((file for file in cleans if file not in paired), None)
+    if single is not None:
+        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or move this one away")
+    return found
+
+
+def _clean_pattern(noisy: str) -> str:
+    """The pattern with its word noisy, in any case, replaced by clean."""
+    words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
+    clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
+    if not count:
+        raise ValueError(f"the pattern {noisy} does not say noisy; give the pattern of the clean files too")
+    return clean
+
+
+def _regex(pattern: str) -> re.Pattern[str]:
+    """A pattern for paths below a folder: the folders above it, then what each ``*`` and ``?`` stands for."""
+    wild = {"*": "([^/]*)", "?": "([^/])"}
+    parts = (wild.get(part, re.escape(part)) for part in re.split(r"([*?])", pattern))
+    return re.compile("((?:.*/)?)" + "".join(parts), re.IGNORECASE)
+
+
+def _stem(top: Path, file: Path) -> str:
+    return file.relative_to(top).with_suffix("").as_posix()

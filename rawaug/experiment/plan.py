@@ -1,0 +1,166 @@
+"""What a run uses of what: its frames, opened and divided but not yet read, and the lines that say so at its start."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rawaug.data import open_pairs, open_pictures
+from rawaug.data.identity import shared_frame
+from rawaug.data.lazy import SomePairs, names_of
+from rawaug.data.pair import Pair
+from rawaug.data.remembered import Remembered
+from rawaug.experiment.plain_yaml import read_yaml
+from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
+from rawaug.files import find_weights
+from rawaug.isp.model import DictionaryISP
+from rawaug.registry import ESTIMATORS
+from rawaug.training.noisy_frames import noisy_frame
+
+MOST_HELD_OUT = 16
+"""Largest number of frames that are held out for validation: a fifth of them, but at least one."""
+GIVEN = "given pairs"
+"""What ``data.pairs``, ... say in results of pairs that were given from Python."""
+_NAMED = 6
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The data of a run.
+
+    Attributes:
+        pairs: what is fitted and trained on.
+        validation: what chooses the weights; empty for RAW made from the pictures.
+        test: what the result is scored on.
+        pictures: sRGB, to augment with.
+        available: number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
+        held_out: whether ``validation`` is a part of the user's own pairs.
+    """
+
+    pairs: Sequence[Pair]
+    validation: Sequence[Pair]
+    test: Sequence[Pair]
+    pictures: Any
+    available: tuple[int, int, int]
+    held_out: bool
+
+    def lines(self, recipe: Recipe) -> list[str]:
+        """What is used of what, a line each."""
+        data, (pairs, validation, test) = recipe.data, self.available
+        part = f"{data.pairs}, held out" if self.held_out else data.validation
+        camera = f"fitted to the {len(self.pairs)} frames" if recipe.camera is None else f"{recipe.camera}, as it is"
+        watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
+        found = {
+            "train": _used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
+            "validate": _used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
+            "test": _used(self.test, test, data.test),
+            "pictures": f"{len(self.pictures)} of {data.pictures}",
+            "ISP": camera,
+        }
+        return [f"{what:<10}{used}" for what, used in found.items()]
+
+
+def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> Recipe:
+    """A recipe whose pairs were replaced uses all of them, and validates on a part of them.
+
+    What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
+    of null, on RAW made from the pictures, stays.
+
+    Args:
+        recipe: as read from ``file`` and the command line.
+        given: the keys of the command line, such as ``data.pairs``.
+    """
+    usual = ((read_yaml(file) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
+    if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
+        return recipe
+    reset: dict[str, Any] = {"count": None} | ({} if recipe.data.validation is None else {"validation": HELD_OUT})
+    changes = {key: value for key, value in reset.items() if f"data.{key}" not in given}
+    return replace(recipe, data=replace(recipe.data, **changes))
+
+
+def _kind(spec: str | None) -> str | None:
+    """The dataset of a spec; a folder is one of its own."""
+    kind, colon, _ = (spec or "").partition(":")
+    return kind if colon and len(kind) > 1 and kind != "pairs" else spec
+
+
+def with_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Recipe:
+    """The recipe whose data are named :data:`GIVEN` where they are given; with pairs alone, some are held out."""
+    named: dict[str, Any] = dict.fromkeys(given, GIVEN)
+    if "pairs" in given and "validation" not in given and recipe.data.validation is not None:
+        named["validation"] = HELD_OUT
+    return replace(recipe, data=replace(recipe.data, **named))
+
+
+def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
+    """Open the data of a recipe.
+
+    Args:
+        given: pairs in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name, by the ends of these
+            keys.
+
+    Raises:
+        FileNotFoundError, ValueError: if something is missing, or the test frames are not unseen.
+    """
+    data, clean = recipe.data, not recipe.self_supervised
+    test = _opened(data, given.get("test", data.test), "test", True)
+    pairs = _opened(data, given.get("pairs", data.pairs), "train", clean)
+    named = given.get("validation", data.validation)
+    held_out = isinstance(named, str) and named == HELD_OUT
+    count = min(max(1, len(pairs) // 5), MOST_HELD_OUT) if held_out and len(pairs) > 1 else 0
+    kept = len(pairs) - count
+    validation = SomePairs(pairs, range(kept, len(pairs))) if held_out else _opened(data, named, "validation", clean)
+    for part, frames in {"pairs": pairs, "validation": [] if held_out else validation}.items():
+        if (seen := shared_frame(test, frames)) is not None:
+            raise ValueError(f"data.test: {seen} is also in data.{part}; test on unseen frames")
+    pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
+    return Plan(
+        pairs=SomePairs(pairs, range(kept)[: data.count]),
+        validation=validation,
+        test=test if data.test_count is None else SomePairs(test, range(len(test))[: data.test_count]),
+        pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,
+        available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
+        held_out=held_out,
+    )
+
+
+def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
+    if spec is None:
+        return []
+    return open_pairs(spec, split, clean, **data.settings_of(spec))
+
+
+def _used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+    names = names_of(frames)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"
+
+
+def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[Pair]) -> None:
+    """Check that frames, as they were read, have what fit and arms need of them.
+
+    Raises:
+        ValueError: naming the first frame that lacks it.
+    """
+    real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
+    for pair in pairs:
+        if recipe.camera is None and not pair.color_known:
+            raise ValueError(
+                f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
+                "use a shipped one: camera: universal"
+            )
+        if real and min(pair.raw.shape[-2:]) < recipe.train.crop + 6:
+            size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
+            raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={recipe.train.crop}")
+    if not recipe.self_supervised:
+        return
+    for name, arm in real.items():
+        if (shots := ESTIMATORS.make(arm.estimator).shots) > 1:
+            raise ValueError(f"arms.{name}: needs {shots} shots of a scene, frames have 1; set its augmented to 1")
+    if recipe.noise != "camera":
+        isp = None if recipe.camera is None else DictionaryISP.from_pretrained(find_weights(recipe.camera))
+        levels = None if isp is None else isp.info.get("noise")
+        for pair in [*(pairs if real else []), *validation]:
+            noisy_frame(pair, levels)

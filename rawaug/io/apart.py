@@ -1,0 +1,240 @@
+"""Reading apart: decoders run in a helper process, so that a crash or a hang of theirs ends one file.
+
+LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers wrote. :func:`apart` calls a reader in
+a helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
+``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets
+a new helper. Each thread of each DataLoader worker has its own.
+
+Helpers are forked from one clean process (:mod:`rawaug.io.reading_process`), which imports the libraries once: to
+start one takes milliseconds, and no thread of a decoder has to survive a fork. Needs Unix sockets; elsewhere, files are
+read in this process.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import mmap
+import os
+import pickle
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+
+SECONDS = 60.0
+START_SECONDS = 300.0
+"""For the first helper, which waits until the libraries are imported."""
+
+_ADDRESS = "RAWAUG_READERS"
+_SERVE = "import sys, json; sys.path[:] = json.loads(sys.argv[1]); from rawaug.io.reading_process import serve; serve()"
+
+
+def apart(read: Callable[..., T], *arguments: Any) -> T:
+    """``read(*arguments)`` in a helper process.
+
+    Args:
+        read: a function of a module, found there by its name.
+        arguments: that can be pickled; the first one is the file, which errors name.
+
+    Raises:
+        OSError: if the helper dies or takes too long.
+        Exception: whatever ``read`` raises.
+
+    Example:
+        >>> apart(len, "four")
+        4
+    """
+    seconds = time_limit()
+    if not seconds:
+        return read(*arguments)
+    helper: _Helper | None = getattr(_of_this_thread, "helper", None)
+    if helper is None:
+        helper = _of_this_thread.helper = _Helper(_connected())
+    try:
+        known, value = helper.call((read, arguments), seconds)
+    except _Lost as lost:
+        _of_this_thread.helper = None
+        raise OSError(f"{arguments[0]}: {lost}") from None
+    except BaseException:  # such as KeyboardInterrupt, which leaves an answer behind
+        _of_this_thread.helper = None
+        helper.kill()
+        raise
+    if not known:
+        raise value
+    return value  # type: ignore[no-any-return]
+
+
+def time_limit() -> float:
+    """Seconds that a file may take; 0 where files are read in this process.
+
+    Raises:
+        ValueError: if ``RAWAUG_READ_SECONDS`` is no number of seconds.
+    """
+    text = os.environ.get("RAWAUG_READ_SECONDS", str(SECONDS))
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds < float("inf"):
+        raise ValueError(f"RAWAUG_READ_SECONDS={text}: must be a number of seconds, or 0 to read in the same process")
+    return seconds if hasattr(os, "fork") and hasattr(socket, "AF_UNIX") else 0.0
+
+
+def prepare() -> None:
+    """Start the process that helpers come from, without waiting for it, for the workers that this one will have."""
+    if time_limit() and _address() is None:
+        _start()
+
+
+class _Lost(Exception):
+    """The helper died or hung; the text says which."""
+
+
+class _Helper:
+    """A helper process: a connection, and the memory that it shares."""
+
+    def __init__(self, link: socket.socket) -> None:
+        link.settimeout(START_SECONDS)
+        try:
+            message, (descriptor,), *_ = socket.recv_fds(link, 64, 1)
+        except (OSError, ValueError):
+            link.close()
+            raise RuntimeError("the process that reads files did not start; RAWAUG_READ_SECONDS=0 reads here") from None
+        link.settimeout(None)
+        self.pid, self.memory = int(message), descriptor
+        self.view: mmap.mmap | None = None
+        self.connection = Connection(link.detach())
+
+    def call(self, request: Any, seconds: float) -> tuple[bool, Any]:
+        """Whether there is a value, and the value or the error.
+
+        Raises:
+            _Lost: if the helper dies or takes longer.
+        """
+        try:
+            self.connection.send_bytes(pickle.dumps(request))
+            if not self.connection.poll(seconds):
+                self.kill()
+                raise _Lost(
+                    f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again"
+                )
+            kind, content, sizes = pickle.loads(self.connection.recv_bytes())
+        except (EOFError, ConnectionError):
+            kind, content, sizes = "died", 0, ()
+        if kind == "died":
+            self.close()
+            raise _Lost(f"crashes the decoder ({_ending(content)}); leave it out, or copy it again")
+        return kind == "value", pickle.loads(content, buffers=self._copied(sizes))
+
+    def _copied(self, sizes: tuple[int, ...]) -> list[np.ndarray]:
+        """The buffers in shared memory, which the next answer overwrites."""
+        total, place, buffers = sum(sizes), 0, []
+        if total and (self.view is None or len(self.view) < total):
+            self.view = mmap.mmap(self.memory, os.fstat(self.memory).st_size)
+        for size in sizes:
+            assert self.view is not None
+            buffers.append(np.frombuffer(self.view, np.uint8, size, place).copy())
+            place += size
+        return buffers
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        self.close()
+
+    def close(self) -> None:
+        """Let go of it; it ends by itself."""
+        if self.memory >= 0:
+            self.connection.close()
+            os.close(self.memory)
+            self.memory, self.view = -1, None
+
+    def __del__(self) -> None:
+        if hasattr(self, "connection"):
+            self.close()
+
+
+def _ending(status: int) -> str:
+    if os.WIFSIGNALED(status):
+        return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+    return f"exited with status {os.waitstatus_to_exitcode(status)}"
+
+
+# -- the process that helpers come from -------------------------------------------------------------------------------
+
+_of_this_thread = threading.local()
+_starting = threading.Lock()
+
+
+def _address() -> str | None:
+    """Of the socket of a running process, started here or by the process that this one comes from."""
+    address = os.environ.get(_ADDRESS)
+    return address if address and Path(address).exists() else None
+
+
+def _connected() -> socket.socket:
+    for _ in range(2):
+        link = socket.socket(socket.AF_UNIX)
+        try:
+            link.connect(_address() or _start())
+            return link
+        except (ConnectionError, FileNotFoundError):  # its owner has ended
+            link.close()
+            os.environ.pop(_ADDRESS, None)
+    raise RuntimeError("the process that reads files cannot be reached; RAWAUG_READ_SECONDS=0 reads here")
+
+
+def _start() -> str:
+    """Start the process; whoever connects before it is ready waits."""
+    with _starting:
+        if (known := _address()) is not None:
+            return known
+        folder = tempfile.mkdtemp(prefix="rawaug-")  # of this user alone
+        address = f"{folder}/readers"
+        loaded = sorted(name for name in sys.modules if name.startswith(("rawaug.io.", "rawaug.data.")))
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(address)
+            listening.listen(128)
+            number = listening.fileno()
+            process = subprocess.Popen(
+                [sys.executable, "-c", _SERVE, json.dumps(sys.path), str(number), folder, *loaded],
+                stdin=subprocess.PIPE,  # which closes when this process ends, however it does
+                stdout=2,
+                pass_fds=[number],
+                start_new_session=True,  # an interrupt is for this process
+                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+            )
+        os.environ[_ADDRESS] = address
+        atexit.register(_stop, process, folder, os.getpid())
+        return address
+
+
+def _stop(process: subprocess.Popen[bytes], folder: str, owner: int) -> None:
+    if os.getpid() == owner:
+        process.kill()
+        process.communicate()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _forget() -> None:
+    """In a forked process: the helper is the parent's."""
+    global _of_this_thread, _starting
+    _of_this_thread, _starting = threading.local(), threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)

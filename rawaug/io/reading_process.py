@@ -1,0 +1,171 @@
+"""The process that helpers of :mod:`rawaug.io.apart` are forked from, and what a helper does.
+
+It imports the libraries, decodes nothing itself and has no threads, so that a fork of it is as good as a new process.
+To every connection it forks a helper, whose end it reports; it ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import os
+import pickle
+import select
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
+from io import BytesIO
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_LIBRARIES = ("h5py", "OpenImageIO", "PIL.Image", "PIL.ImageCms", "rawpy", "scipy.io", "tifffile")
+_CLOSED = select.POLLHUP | select.POLLERR | getattr(select, "POLLRDHUP", 0)
+
+
+def serve() -> None:
+    """The process: its arguments are the socket's number, the folder of its address, and modules to import first."""
+    number, folder, *modules = sys.argv[2:]
+    for name in (*_LIBRARIES, *modules):
+        with suppress(ImportError):
+            import_module(name)
+    torch.set_num_threads(1)
+    gc.freeze()
+    try:
+        with socket.socket(fileno=int(number)) as listening:
+            _serve(listening)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _serve(listening: socket.socket) -> None:
+    """Fork, report and reap until standard input ends."""
+    woken, waking = os.pipe()
+    os.set_blocking(waking, False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(waking)
+    links: dict[int, tuple[int, socket.socket]] = {}  # by descriptor: the helper and the connection
+    poll = select.poll()
+    for descriptor, events in ((0, _CLOSED), (listening.fileno(), select.POLLIN), (woken, select.POLLIN)):
+        poll.register(descriptor, events)
+    while True:
+        for descriptor, events in poll.poll():
+            if descriptor == 0:
+                return
+            if descriptor == listening.fileno():
+                link, _ = listening.accept()
+                helper = os.fork()
+                if not helper:
+                    _help([listening, *(other for _, other in links.values())], link, (woken, waking))
+                links[link.fileno()] = helper, link
+                poll.register(link.fileno(), _CLOSED)
+            elif descriptor == woken:
+                os.read(woken, 4096)
+                for found in list(_ended(links)):
+                    poll.unregister(found)
+                    links.pop(found)[1].close()
+            elif descriptor in links and events & _CLOSED:  # nobody waits for what it does
+                poll.modify(descriptor, 0)
+                os.kill(links[descriptor][0], signal.SIGKILL)
+
+
+def _ended(links: dict[int, tuple[int, socket.socket]]) -> Iterator[int]:
+    """The connections of helpers that have ended, which is reported."""
+    by_helper = {helper: descriptor for descriptor, (helper, _) in links.items()}
+    with suppress(ChildProcessError):
+        while True:
+            helper, status = os.waitpid(-1, os.WNOHANG)
+            if not helper:
+                return
+            with suppress(OSError):
+                _send(links[by_helper[helper]][1].fileno(), ("died", status, ()))
+            yield by_helper[helper]
+
+
+def _send(descriptor: int, answer: Any) -> None:
+    with Connection(os.dup(descriptor)) as connection:
+        connection.send_bytes(pickle.dumps(answer))
+
+
+# -- a helper ---------------------------------------------------------------------------------------------------------
+
+
+def _help(others: list[socket.socket], link: socket.socket, pipe: tuple[int, int]) -> None:
+    """Answer one connection until it closes; never returns."""
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    for descriptor in (0, *pipe):
+        os.close(descriptor)
+    for other in others:
+        other.close()
+    status = 1
+    try:
+        memory = _Memory()
+        socket.send_fds(link, [str(os.getpid()).encode()], [memory.file])
+        with Connection(link.detach()) as connection, suppress(EOFError, ConnectionError):
+            while True:
+                _answer(connection, memory)
+        status = 0
+    finally:
+        os._exit(status)
+
+
+class _Memory:
+    """A file without a name, mapped: what the helper puts there, the process that it helps sees."""
+
+    def __init__(self) -> None:
+        if hasattr(os, "memfd_create"):
+            self.file = os.memfd_create("rawaug")
+        else:
+            with tempfile.TemporaryFile() as file:
+                self.file = os.dup(file.fileno())
+        self.view: mmap.mmap | None = None
+
+    def put(self, buffers: list[memoryview]) -> None:
+        """One after the other, from the beginning; the file grows to hold them."""
+        total, place = sum(map(len, buffers)), 0
+        if total and (self.view is None or len(self.view) < total):
+            self.view = None  # a mapping cannot grow
+            os.ftruncate(self.file, total)
+            self.view = mmap.mmap(self.file, total)
+        for buffer in buffers:
+            assert self.view is not None
+            self.view[place : place + len(buffer)] = buffer
+            place += len(buffer)
+
+
+def _answer(connection: Connection, memory: _Memory) -> None:
+    read, arguments = pickle.loads(connection.recv_bytes())
+    try:
+        kind, value = "value", read(*arguments)
+    except Exception as error:
+        kind, value = "error", error
+    content, buffers = _pickled(value)
+    memory.put(buffers)
+    connection.send_bytes(pickle.dumps((kind, content, tuple(map(len, buffers)))))
+
+
+def _pickled(value: Any) -> tuple[bytes, list[memoryview]]:
+    """The value, with the content of its arrays apart."""
+    file, buffers = BytesIO(), list[memoryview]()
+    try:
+        _Pickler(file, protocol=5, buffer_callback=lambda buffer: buffers.append(buffer.raw())).dump(value)
+    except (pickle.PicklingError, TypeError, AttributeError):  # an exception of an extension
+        return pickle.dumps(RuntimeError(f"{type(value).__name__}: {value}")), []
+    return file.getvalue(), buffers
+
+
+class _Pickler(pickle.Pickler):
+    """Tensors as the arrays whose memory they share."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, Tensor) and type(value) is Tensor and value.layout == torch.strided:
+            return torch.from_numpy, (value.contiguous().numpy(),)
+        return NotImplemented

@@ -1,0 +1,54 @@
+"""What a training writes while it runs: ``log.csv``, and curves for TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+from rawaug.extras import extra
+from rawaug.files import replacing
+
+
+class Journal:
+    """``log.csv`` and TensorBoard's files of a run from ``start`` on; what a killed run logged beyond it is dropped.
+
+    A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
+    """
+
+    def __init__(self, folder: Path, start: int) -> None:
+        with extra("train"):
+            from torch.utils.tensorboard.writer import SummaryWriter
+
+        self.path = folder / "log.csv"
+        if self.path.is_file():
+            head, *rows = self.path.read_text().splitlines(keepends=True)
+            kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
+            self.path.write_text("".join([head, *kept]) if kept else "")
+        self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
+
+    def log(self, step: int, **values: float) -> None:
+        """One row in the CSV file and one point in each TensorBoard curve."""
+        head = ["step", *values]
+        known = self.path.read_text().splitlines() if self.path.is_file() else []
+        if known and known[0] != ",".join(head):  # begun by a version with other columns
+            write_rows(self.path, head, list(csv.DictReader(known)))
+        with self.path.open("a", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            if not known:
+                rows.writerow(head)
+            rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
+        for name, value in values.items():
+            self.writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self.writer.close()
+
+
+def write_rows(path: Path, head: Sequence[str], rows: Sequence[dict[str, str]]) -> None:
+    """A CSV file with the columns ``head``; what a row lacks is empty, what ``head`` lacks is left out."""
+    with replacing(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, head, restval="", extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

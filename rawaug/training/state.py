@@ -1,0 +1,139 @@
+"""What a training changes, step by step, and the checkpoint that it resumes from.
+
+``theta <- Adam(gradient of the loss)``, then ``average <- d average + (1 - d) theta``; the learning rate warms up and
+falls.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from denoisers.network import Denoiser
+from rawaug.files import replacing
+from rawaug.training.train_config import TrainConfig
+
+
+class TrainingState:
+    """A network in training, with the running average of its weights, Adam and the schedule of its rate.
+
+    Attributes:
+        step: steps already taken.
+        losses: sum and number of the losses not yet logged.
+        best: validation PSNR, step and weights of the average that is kept.
+    """
+
+    def __init__(self, net: Denoiser, config: TrainConfig) -> None:
+        self.net, self.config, self.step = net, config, 0
+        self.average = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=running_average(config.ema))
+        self.optimiser: Any = torch.optim.Adam(net.parameters(), lr=config.learning_rate)
+        self.schedule = torch.optim.lr_scheduler.LambdaLR(self.optimiser, lambda n: learning_rate_factor(n, config))
+        self.losses = torch.zeros(2)
+        self.best: dict[str, Any] = {"psnr": float("-inf"), "step": 0}
+        self.layout = torch.channels_last if config.channels_last else torch.contiguous_format
+
+    @property
+    def averaged(self) -> Any:
+        """The network that is validated and kept."""
+        return self.average.module
+
+    @property
+    def _parts(self) -> dict[str, Any]:
+        return {"net": self.net, "average": self.average, "optimiser": self.optimiser, "schedule": self.schedule}
+
+    def load(self, path: Path) -> None:
+        """Go on from the checkpoint at ``path``, if there is one."""
+        if not path.is_file():
+            return
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        for key, part in self._parts.items():
+            part.load_state_dict(state[key])
+        self.step, self.best, self.losses = int(state["step"]), state["best"], state.get("losses", self.losses)
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint, whole or not at all: a kill leaves the one before."""
+        state = {key: part.state_dict() for key, part in self._parts.items()}
+        with replacing(path) as partial:
+            torch.save({**state, "step": self.step, "best": self.best, "losses": self.losses.cpu()}, partial)
+
+    def place(self, fabric: Any) -> Any:
+        """Move it to Fabric's device.
+
+        Returns:
+            The network as a step calls it.
+        """
+        placed = fabric.setup(self.net.to(memory_format=self.layout), self.optimiser)  # type: ignore[call-overload]
+        self.fabric, (self.model, self.optimiser) = fabric, placed
+        self.average.to(fabric.device)
+        self.losses = self.losses.to(fabric.device)
+        return torch.compile(self.model) if self.config.compile else self.model
+
+    def update(self, loss: Tensor) -> float:
+        """Take a step down the gradient of ``loss``.
+
+        Returns:
+            Its learning rate.
+        """
+        self.optimiser.zero_grad(set_to_none=True)
+        self.fabric.backward(loss)
+        if self.config.clip_norm:
+            self.fabric.clip_gradients(self.model, self.optimiser, max_norm=self.config.clip_norm)
+        self.optimiser.step()
+        learning_rate = float(self.schedule.get_last_lr()[0])
+        self.schedule.step()
+        if self.config.ema:
+            self.average.update_parameters(self.net)
+        else:
+            self.averaged.load_state_dict(self.net.state_dict())
+        self.losses += torch.stack([loss.detach().float(), self.losses.new_ones(())])
+        self.step += 1
+        return learning_rate
+
+    def mean_loss(self) -> float:
+        """Of the steps since it was last asked."""
+        mean = float(self.losses[0] / self.losses[1])
+        self.losses = torch.zeros_like(self.losses)
+        return mean
+
+    def note(self, score: float, choose: bool) -> None:
+        """Keep the average as it is now, if it is the best so far or ``choose`` is off."""
+        if score > self.best["psnr"] or not choose:
+            self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.averaged.state_dict())}
+
+    def kept(self, label: str) -> Any:
+        """The network with the weights that are kept, on the CPU.
+
+        Raises:
+            ValueError: if no score was a number; ``label`` opens the message.
+        """
+        if not math.isfinite(self.best["psnr"]):
+            raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
+        self.averaged.load_state_dict(self.best["net"])
+        return self.averaged.cpu().to(memory_format=torch.contiguous_format)
+
+
+def running_average(decay: float) -> Any:
+    """``average <- d average + (1 - d) weights`` with d = ``decay``, at first (1 + n) / (10 + n) after n steps."""
+
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], steps: Tensor | int) -> None:
+        n = int(steps)
+        torch._foreach_lerp_(list(averages), list(weights), 1.0 - min(decay, (1 + n) / (10 + n)))
+
+    return update
+
+
+def learning_rate_factor(step: int, config: TrainConfig) -> float:
+    """Linear warm-up, then a cosine to 1% of the highest rate, or a halving every ``halve_every`` steps."""
+    if step < config.warmup:
+        return (step + 1) / config.warmup
+    if config.schedule == "step":
+        return float(0.5 ** (step // config.halve_every))
+    progress = (step - config.warmup) / max(1, config.steps - config.warmup)
+    return 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))

@@ -1,0 +1,168 @@
+"""What a run uses of what: the user's own pairs, held-out frames, and what is refused before anything is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rawaug.cli import main
+from rawaug.data import Pair, demo_pairs
+from rawaug.data.identity import stamps
+from rawaug.data.lazy import names_of
+from rawaug.experiment.plan import planned, require_usable, with_given_pairs, with_own_pairs
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, recipe_list
+
+ARMS = {"real": ArmConfig()}
+ONE_ARM = ["--arms", '{"real": {"augmented": 0.5}}', "--denoiser.settings", '{"width": 4, "scales": 2}']
+BARE = ["--classical", "[]", "--untouched", "[]", "--isp.pixels", "256", "--device", "cpu", "--train.crop", "32"]
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """Seven noisy/clean pairs of 64 x 80, as NPZ with all that they can state."""
+    folder = tmp_path / "own"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(7):
+        clean = np.kron(rng.uniform(0.05, 0.6, (4, 8, 10)), np.ones((1, 4, 4))).astype(np.float32)
+        noisy = clean + rng.normal(0, 0.01, clean.shape).astype(np.float32)
+        colour: dict[str, Any] = {
+            "white_balance": [2.0, 1.0, 1.5],
+            "color_matrix": np.eye(3),
+            "shot_var": 1e-6,
+            "read_var": 1e-4,
+        }
+        np.savez(folder / f"shot{k}.npz", clean=clean, noisy=noisy, cfa="GRBG", **colour)
+    return folder
+
+
+def plan_of(recipe: Recipe, **given: Any) -> Any:
+    return planned(with_given_pairs(recipe, given), given)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path) -> None:
+    file = find_recipe("fewshot")
+    shipped = Recipe(arms=ARMS, data=DataConfig(count=2))
+    mine = replace(shipped, data=replace(shipped.data, pairs=f"pairs:{own}"))
+    assert with_own_pairs(shipped, file, set()) == shipped
+    data = with_own_pairs(mine, file, {"data.pairs"}).data
+    assert (data.count, data.validation, data.test) == (None, "auto", "demo:test")
+    kept = with_own_pairs(mine, file, {"data.pairs", "data.count", "data.validation"}).data
+    assert (kept.count, kept.validation) == (2, "demo:validation")  # as the command line says
+    unwatched = replace(mine, data=replace(mine.data, validation=None))
+    assert with_own_pairs(unwatched, file, {"data.pairs"}).data.validation is None
+
+    recipe = with_own_pairs(mine, file, {"data.pairs"})
+    plan = plan_of(recipe)
+    assert names_of(plan.pairs) == [f"shot{k}" for k in range(6)] and names_of(plan.validation) == ["shot6"]
+    train, validate, test, pictures, isp = plan.lines(recipe)
+    assert train.startswith(f"train     6 of 7 of pairs:{own}: shot0,")
+    assert validate == f"validate  1 of 7 of pairs:{own}, held out: shot6"
+    assert "9 of 9 of demo:test" in test and "32 of demo:" in pictures and isp.endswith("fitted to the 6 frames")
+
+
+def test_the_same_kind_of_data_elsewhere_keeps_its_regime() -> None:
+    recipe = Recipe(arms=ARMS, data=DataConfig(pairs="sidd:/elsewhere", count=56, validation=None))
+    assert with_own_pairs(recipe, find_recipe("sidd/fewshot"), {"data.pairs"}) == recipe
+
+
+def test_a_single_pair_is_trained_on_and_nothing_is_held_out() -> None:
+    plan = plan_of(Recipe(arms=ARMS, data=DataConfig(test="demo:test")), pairs=demo_pairs("train", count=1))
+    assert len(plan.pairs) == 1 and not plan.validation
+    assert "last weights are kept" in plan.lines(Recipe(arms=ARMS))[1]
+
+
+def test_pairs_from_python_are_divided_and_seen_by_their_content() -> None:
+    pairs, test = demo_pairs("train"), demo_pairs("test", count=2)
+    recipe = Recipe(arms=ARMS, data=DataConfig(test_count=1))
+    plan = plan_of(recipe, pairs=pairs, test=test)
+    assert list(plan.pairs) == pairs[:4] and list(plan.validation) == pairs[4:] and list(plan.test) == test[:1]
+    other = replace(pairs[4], raw=pairs[4].raw * 0.5)
+    changed = plan_of(recipe, pairs=[*pairs[:4], other], test=test)
+    assert stamps(plan.validation) != stamps(changed.validation) and stamps(plan.pairs) == stamps(changed.pairs)
+    with pytest.raises(ValueError, match=r"data\.test: train_00_astronaut is also in data\.pairs"):
+        plan_of(recipe, pairs=pairs, test=pairs[:1])
+    assert names_of(plan_of(recipe, pairs=pairs, validation=test[1:], test=test[:1]).pairs) == names_of(pairs)
+
+
+def test_two_folders_may_use_the_same_names(own: Path, tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "shot0.npz").write_bytes((own / "shot0.npz").read_bytes())
+    data = DataConfig(pairs=f"pairs:{own}", validation="auto", test=f"pairs:{tmp_path / 'more'}")
+    assert names_of(plan_of(Recipe(arms=ARMS, data=data)).test) == ["shot0"]
+    with pytest.raises(ValueError, match=r"shot\d\.npz is also in data\.pairs"):
+        plan_of(Recipe(arms=ARMS, data=replace(data, test=f"pairs:{own}")))
+
+
+def test_what_frames_lack_is_found_before_anything_is_fitted() -> None:
+    flat = torch.zeros(1, 64, 64)
+    pair = Pair("a", torch.zeros(3, 64, 64, dtype=torch.uint8), flat, "RGGB", noisy=flat)  # type: ignore[arg-type]
+    recipe = Recipe(arms={"r2r": ArmConfig(estimator="r2r")}, data=DataConfig())
+    with pytest.raises(ValueError, match="a: has no noise levels"):
+        require_usable(recipe, [pair], [])
+    require_usable(replace(recipe, noise="camera"), [pair], [])
+    twice = replace(recipe, arms={"two": ArmConfig(estimator="noise2noise")})
+    with pytest.raises(ValueError, match=r"arms\.two: needs 2 shots"):
+        require_usable(twice, [pair], [])
+    supervised = Recipe(arms=ARMS, data=DataConfig())
+    with pytest.raises(ValueError, match=r"64 x 64 is too small for train\.crop=60"):
+        require_usable(replace(supervised, train=replace(supervised.train, crop=60)), [pair], [])
+    require_usable(replace(supervised, train=replace(supervised.train, crop=58)), [pair], [])
+    with pytest.raises(ValueError, match="unknown, so no ISP can be fitted"):
+        require_usable(supervised, [replace(pair, color_known=False)], [])
+    require_usable(replace(supervised, camera="universal", train=replace(supervised.train, crop=58)), [pair], [])
+
+
+def test_settings_of_pairs_need_pairs() -> None:
+    with pytest.raises(ValueError, match=r"data\.noisy: applies to pairs:PATH"):
+        DataConfig(noisy="*_NOISY_*")
+    with pytest.raises(ValueError, match=r"auto holds out a part of data\.pairs, which is null"):
+        DataConfig(pairs=None, validation="auto")
+    assert DataConfig(test="pairs:x", cfa="RGGB").settings_of("pairs:x")["cfa"] == "RGGB"
+
+
+def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "run",
+        "fewshot",
+        "--data.pairs",
+        f"pairs:{own}",
+        "--isp.curve_steps",
+        "5",
+        "--dry-run",
+        "--out",
+        str(tmp_path / "runs"),
+    ]
+    assert main([*command, *ONE_ARM, *BARE]) == 0
+    said = capsys.readouterr().out
+    assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said
+    assert "frames read: train 6 of 6, validate 1 of 1, test 9 of 9" in said and "nothing wrong found" in said
+    assert not (tmp_path / "runs").exists()
+    assert "64 x 80 is too small for train.crop=64" in refused(capsys, *command, *ONE_ARM, "--train.crop", "64")
+    (own / "shot2.npz").write_bytes(b"cut")
+    assert "shot2.npz: cannot be read" in refused(capsys, *command, *ONE_ARM, *BARE)
+    assert "--dry-run" in refused(capsys, "run", "ablation", "--dry-run")
+
+
+def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run"]) == 0
+    lines = recipe_list().splitlines()
+    assert recipe_list() in capsys.readouterr().out
+    assert len(lines) == 10 and all(len(line.split(maxsplit=1)[1]) > 30 for line in lines)
+    for name, shown in (("unsupervised", "default: 4000"), ("pretrain", "default: PMRID")):
+        with pytest.raises(SystemExit):
+            main(["run", name, "--help"])
+        assert shown in capsys.readouterr().out

@@ -1,0 +1,91 @@
+"""Reading apart: what a decoder does to its process ends one file, and the pixels are the same."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from rawaug.data import PictureFolder
+from rawaug.io import read_picture, write_picture
+from rawaug.io.apart import apart, prepare, time_limit
+
+pytestmark = pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
+
+
+def test_values_and_errors_come_back_as_they_are(tmp_path: Path) -> None:
+    array = apart(np.arange, 100_000.0)
+    assert np.array_equal(array, np.arange(100_000.0)) and array.flags.writeable
+    assert apart(np.arange, 10)[9] == 9 and array[9] == 9  # the memory of the first answer is not the second's
+    path = tmp_path / "a.png"
+    write_picture(path, torch.arange(3 * 64 * 80).reshape(3, 64, 80).to(torch.uint8))
+    assert torch.equal(apart(read_picture, path), read_picture(path))
+    with pytest.raises(FileNotFoundError, match=r"none\.png: no such picture file"):
+        apart(read_picture, tmp_path / "none.png")
+    with pytest.raises(ValueError, match="above the limit of 100"):
+        apart(read_picture, path, 100)
+
+
+def test_a_crash_and_a_hang_end_one_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(OSError, match=r"^0: crashes the decoder \(killed by SIGSEGV\)"):
+        apart(ctypes.string_at, 0)
+    with pytest.raises(OSError, match=r"^3: crashes the decoder \(exited with status 3\)"):
+        apart(os._exit, 3)
+    assert apart(len, "four") == 4
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0.1")
+    with pytest.raises(OSError, match=r"^100: cannot be read within 0\.1 s \(RAWAUG_READ_SECONDS\)"):
+        apart(time.sleep, 100)
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "soon")
+    with pytest.raises(ValueError, match="RAWAUG_READ_SECONDS=soon: must be a number of seconds"):
+        apart(len, "four")
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")
+    assert apart(os.getpid) == os.getpid()
+
+
+def test_a_helper_ends_with_whoever_it_helps() -> None:
+    prepare()
+    receiving, sending = multiprocessing.Pipe(duplex=False)
+    worker = os.fork()
+    if not worker:
+        sending.send(apart(os.getpid))
+        time.sleep(60)
+        os._exit(0)
+    helper = receiving.recv()
+    assert helper not in (worker, os.getpid(), apart(os.getpid))  # each process has its own
+    os.kill(worker, signal.SIGKILL)
+    os.waitpid(worker, 0)
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            os.kill(helper, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.01)
+    pytest.fail("the helper is still there")
+
+
+def _crash_on_marked(path: Path, max_pixels: int) -> torch.Tensor:
+    if path.stem == "2":
+        ctypes.string_at(0)
+    return read_picture(path, max_pixels)
+
+
+def test_a_folder_names_the_file_that_crashed_in_a_worker_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for k in range(4):
+        write_picture(tmp_path / f"{k}.png", torch.full((3, 8, 8), k, dtype=torch.uint8))
+    monkeypatch.setattr("rawaug.data.picture_folder.read_picture", _crash_on_marked)
+    pictures = PictureFolder(tmp_path, allowed_share=0.5)
+    loader = DataLoader(pictures, None, num_workers=1, multiprocessing_context="fork")  # type: ignore[arg-type]
+    assert [int(picture[0, 0, 0]) for picture in loader] == [0, 1, 3, 3]
+    assert [path.name for path in pictures.skipped] == ["2.png"]
+    assert "2.png: crashes the decoder (killed by SIGSEGV)" in pictures.report()

@@ -1,0 +1,67 @@
+"""How losses weigh light and shade: each weighing by its formula, and what it makes of an error in either."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from denoisers.domains import LEAST_SHOT
+from rawaug.data.sample import Sample
+from rawaug.training.criteria import L1, L2, Charbonnier, weighed
+
+SHOT, READ = 2e-3, 1e-5
+NOISY = torch.rand(2, 4, 8, 8, generator=torch.Generator().manual_seed(0)) * 0.8
+SAMPLE = Sample(NOISY, NOISY, SHOT * NOISY + READ)
+
+
+def level(value: float) -> Tensor:
+    return torch.full((2, 4, 8, 8), value)
+
+
+def root(y: float) -> float:
+    """``2 sqrt(y / s + r / s^2 + 3/8)``"""
+    return float(2.0 * (y / SHOT + READ / SHOT**2 + 0.375) ** 0.5)
+
+
+def test_the_losses_are_their_formulas() -> None:
+    a, b = level(0.5), level(0.2)
+    assert L1()(a, b).item() == pytest.approx(0.3)
+    assert L2()(a, b).item() == pytest.approx(0.09)
+    assert Charbonnier(epsilon=0.4)(a, b).item() == pytest.approx(0.5)
+
+
+def test_linear_is_the_loss_itself() -> None:
+    loss = L1()
+    assert weighed(loss, "linear", SAMPLE) is loss
+
+
+def test_stabilised_is_the_loss_of_the_roots() -> None:
+    for clean, denoised in ((0.1, 0.12), (0.7, 0.65)):
+        expected = abs(root(denoised) - root(clean))
+        assert weighed(L1(), "stabilised", SAMPLE)(level(denoised), level(clean)).item() == pytest.approx(
+            expected, rel=1e-3
+        )
+    assert SHOT > LEAST_SHOT  # below it the root has fewer photons
+
+
+def test_mixed_is_the_mean_of_both_in_units_of_the_noise() -> None:
+    deviation = SAMPLE.variance.sqrt().mean((1, 2, 3))
+    expected = 0.5 * (root(0.5) - root(0.4) + float((0.1 / deviation).mean()))
+    assert weighed(L1(), "mixed", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_shadows_count_more_the_more_is_stabilised() -> None:
+    """An error in the shadow over the same one in the light."""
+
+    def ratio(weigh: str) -> float:
+        loss = weighed(L1(), weigh, SAMPLE)
+        return loss(level(0.02), level(0.01)).item() / loss(level(0.81), level(0.80)).item()
+
+    assert ratio("linear") == pytest.approx(1.0, rel=1e-4)
+    assert 1.2 < ratio("mixed") < ratio("stabilised")
+
+
+def test_an_unknown_weighing_is_named() -> None:
+    with pytest.raises(ValueError, match=r"train\.weigh 'cubic' is unknown; use one of linear, stabilised, mixed"):
+        weighed(L1(), "cubic", SAMPLE)

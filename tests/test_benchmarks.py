@@ -1,0 +1,81 @@
+"""The benchmarks that a GPU is measured with, run tiny on the CPU: what they print means what they say."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import denoisers
+from benchmarks import augment, denoise, networks
+
+CPU = torch.device("cpu")
+
+
+def test_augmentation_is_compared_in_one_unit() -> None:
+    rows = augment.measure(augment.pictures(2, 32, 48), repeats=1, gb_s=10.0)
+    assert {"rawaug", "rawaug, drawn before", "upi", "cycleisp", "kornia", "copy"} <= set(rows)
+    ours = rows["rawaug"]
+    assert ours["counted"] == pytest.approx(ours["mpix_s"] * 1e6 * 11 / 10e9)
+    assert ours["moved"] == pytest.approx(ours["counted"] * 19 / 11)
+    assert rows["upi"]["ratio"] == pytest.approx(ours["mpix_s"] / rows["upi"]["mpix_s"])
+    assert "moved" not in rows["upi"], "what other methods move is not known"
+
+
+def test_bandwidth_and_peak_memory_are_positive_and_finite() -> None:
+    assert 0.01 < augment.bandwidth(CPU, megabytes=1, repeats=2) < 1e5
+    assert 0 <= augment.peak_memory(CPU, 32, 32) < float("inf")
+
+
+def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[str] = []
+
+    def compiled(network: torch.nn.Module, mode: str) -> torch.nn.Module:
+        modes.append(mode)
+        return network
+
+    monkeypatch.setattr(torch, "compile", compiled)
+    monkeypatch.setattr(networks, "SIDE", 16)
+    args = argparse.Namespace(
+        device=CPU, threads=1, minutes=0.0, width=None, batch=2, crop=32, repeats=1, workers=0, compile=["default"]
+    )
+    monkeypatch.setattr(networks, "SIZES", {"DnCNN": {"width": 4, "depth": 3}})
+    figures = networks.measure("DnCNN", args)
+    assert modes == ["default"] and all(f"images/s, augmented{label}" in figures for label in ("", ", default"))
+    assert figures["share of augmentation"] == pytest.approx(1 - figures["images/s, augmented"] / figures["images/s"])
+    srgb = torch.zeros(2, 3, 32, 32, dtype=torch.uint8)
+    seen: list[torch.Size] = []
+    assert networks.in_workers(lambda pair: seen.append(pair.noisy.shape), srgb, args) > 0
+    assert seen == 5 * [torch.Size([2, 4, 16, 16])], "one batch to start, four timed"
+
+
+def test_published_sizes_can_be_built() -> None:
+    with torch.device("meta"):
+        built = {name: denoisers.build(name, **size) for name, size in networks.GPU_SIZES.items()}
+    assert built.keys() == networks.SIZES.keys()
+
+
+def test_denoising_is_timed_whole_and_in_tiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "figures.json"
+    monkeypatch.setattr(sys, "argv", ["denoise", "--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
+    denoise.main()
+    rows = json.loads(out.read_text())["0.01 Mpix"]
+    assert set(rows) == {f"{form}, {p}" for form in ("whole", "tiles") for p in ("float32", "bfloat16")}
+    assert all(row["seconds"] > 0 for row in rows.values())
+    assert denoise.frame(12, CPU).shape == (1, 4, 1414, 2121)
+    capsys.readouterr()
+
+
+def test_a_form_without_room_is_reported_and_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    assert denoise.measure(full, torch.rand(1, 4, 8, 8), repeats=1) == {  # type: ignore[arg-type]
+        f"{form}, {p}": {} for form in ("whole", "tiles") for p in ("float32", "bfloat16")
+    }
