@@ -69,11 +69,9 @@ def run(
         json: write the result as JSON to this file.
         settings: of pairs:PATH.
     """
-<<<<<<< HEAD
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views)
-=======
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **vars(settings))
->>>>>>> main
+    result = evaluate(
+        weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **vars(settings)
+    )
     print_scores(result)
     if json:
         write_json(result, json)
@@ -91,11 +89,8 @@ def evaluate(
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
-<<<<<<< HEAD
     views: Literal[4, 8] | None = None,
-=======
     **settings: Any,
->>>>>>> main
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
 
@@ -109,11 +104,8 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
-<<<<<<< HEAD
         views: of the self-ensemble, 4 or 8; given alone it asks for one.
-=======
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
->>>>>>> main
 
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
@@ -138,25 +130,16 @@ def evaluate(
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(device)
-<<<<<<< HEAD
         at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
         ensemble = views or (8 if self_ensemble else 1)
         result = _denoiser_result(model, pairs, levels, cfa, seed, ensemble, classical, at_test)
-=======
-        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
         _require_some(pairs)
->>>>>>> main
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
-<<<<<<< HEAD
             methods["denoised"] = network_method(model, cfa, at_test=at_test)
-            for pair in shown_on_page(pairs):
-=======
-            methods["denoised"] = network_method(model, cfa)
             for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
->>>>>>> main
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:

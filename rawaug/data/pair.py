@@ -28,15 +28,12 @@ class Pair:
         iso: None if unknown.
         registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
-<<<<<<< HEAD
         rendered: whether ``srgb`` is a rendering in the camera's colours. False: gains and matrix are unknown, and
             ``srgb`` merely displays the RAW, so that no ISP can be fitted to it or scored on it.
         noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, where there is one.
         levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``, which a denoiser that is
             tested must not know.
-=======
         color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
->>>>>>> main
 
     Raises:
         ValueError: if shapes or dtypes disagree, a side is odd, or levels come without the other or without ``noisy``.
@@ -53,14 +50,11 @@ class Pair:
     read_var: float | None = None
     camera: str = "unknown"
     registered: bool = True
-<<<<<<< HEAD
     rendered: bool = True
     noisy_srgb: Tensor | None = None
     levels_from_clean: bool = False
-=======
     color_known: bool = True
     iso: float | None = None
->>>>>>> main
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name

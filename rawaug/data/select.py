@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from itertools import accumulate, groupby
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from rawaug.data.lazy import LazyPairs
+from rawaug.data.lazy import names_of
 from rawaug.data.pair import Pair
 
 SELECTIONS = ("first", "scenes", "phones")
@@ -31,11 +31,12 @@ class Labelled(Protocol):
     def labels(self) -> Sequence[FrameLabel]: ...
 
 
-def selected(pairs: Sequence[Pair], count: int | None, select: str | Sequence[str] = "first") -> list[Pair]:
-    """``count`` of the pairs, all if None; only these are read.
+def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
+    """Indices of ``count`` of the first ``kept`` pairs, of all of these if None; none is read.
 
     Args:
         pairs: the dataset.
+        kept: number of pairs to choose from; the others are held out.
         count: how many.
         select: ``first``; ``scenes``, whole scenes until there are ``count`` pairs; ``phones``, as many of each phone,
             the middle ones by ISO; or names of frames, or of their folders (scene instances).
@@ -49,17 +50,17 @@ def selected(pairs: Sequence[Pair], count: int | None, select: str | Sequence[st
         [1, 4]
     """
     if not isinstance(select, str):
-        return [pairs[k] for k in _named(pairs, select)][:count]
+        return _named(names_of(pairs)[:kept], select)[:count]
     if select not in SELECTIONS:
         raise ValueError(f"data.select {select!r} is unknown; use {', '.join(SELECTIONS)} or a list of names")
     if select == "first":
-        return list(pairs[:count])
+        return list(range(kept)[:count])
     if not isinstance(pairs, Labelled):
         raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
     if count is None:
-        return list(pairs)
+        return list(range(kept))
     choose = whole_scenes if select == "scenes" else one_a_phone
-    return [pairs[k] for k in choose(pairs.labels, count)]
+    return choose(pairs.labels[:kept], count)
 
 
 def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
@@ -97,9 +98,8 @@ def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
     return [frames[i] for i in range(longest) for frames in chosen if i < len(frames)]
 
 
-def _named(pairs: Sequence[Pair], wanted: Sequence[str]) -> list[int]:
-    names = pairs.names if isinstance(pairs, LazyPairs) else [pair.name for pair in pairs]
-    indices = []
+def _named(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    indices: list[int] = []
     for name in wanted:
         found = [k for k, known in enumerate(names) if known == name or known.rpartition("_")[0] == name]
         if not found:

@@ -33,12 +33,9 @@ from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
 
-<<<<<<< HEAD
 Run = Callable[..., Tensor]
 """``run(noisy, variance) -> denoised``, packed RAW."""
-=======
 SHOWN_FAULTS = 5
->>>>>>> main
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -230,20 +227,16 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
-<<<<<<< HEAD
-    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame.
-    """
-    images = [{key: value for key, value in vars(score).items() if value is not None} for score in scores]
-    result: dict[str, Any] = {"images": images}
-    if flagged := sum(bool(score.levels_from_clean) for score in scores):
-        result["levels_from_clean"] = flagged
-=======
-    So is a score that is no number, such as the PSNR of two equal frames; it is named under ``no_numbers``.
+    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score that is
+    no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
     """
     images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
     result: dict[str, Any] = {"images": images}
+    for image, score in zip(images, scores, strict=True):
+        image |= {"levels_from_clean": True} if score.levels_from_clean else {}
+    if flagged := sum(bool(score.levels_from_clean) for score in scores):
+        result["levels_from_clean"] = flagged
     wrong: list[str] = []
->>>>>>> main
     for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
         known = []
         for image, score in zip(images, scores, strict=True):

@@ -23,11 +23,7 @@ from rawaug.commands.fit import fit
 from rawaug.data import PictureFolder
 from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
-<<<<<<< HEAD
-from rawaug.data.remembered import Remembered
-from rawaug.data.select import selected
-=======
->>>>>>> main
+from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -108,16 +104,6 @@ class _Run:
             first_network(recipe.network_of(arm), seed=0)
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
-<<<<<<< HEAD
-        self.test = _first(open_pairs(self.data.test), self.data.test_count)
-        source = [] if self.data.pairs is None else open_pairs(self.data.pairs, split="train")
-        self.validation = [] if self.data.validation is None else open_pairs(self.data.validation, split="validation")
-        _require_unseen(self.test, {"pairs": source, "validation": self.validation})
-        pictures = open_pictures(self.data.pictures, min_side=recipe.train.crop + 6)
-        self.pictures = Remembered(pictures, self.data.memory_mb) if self.data.memory_mb else pictures
-        self.pairs = selected(source, self.data.count, self.data.select)
-        if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
-=======
         self.plan = plan = planned(recipe, given)
         self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
         self.pairs: list[Pair] = []
@@ -128,8 +114,9 @@ class _Run:
             print("\n".join(self.plan.lines(self.recipe)))
         self.pairs = list(self.plan.pairs)
         if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
->>>>>>> main
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+        if self.data.pictures == OWN_PICTURES:
+            self.pictures = PairPictures(self.pairs)
         require_usable(self.recipe, self.pairs, self.validation)
 
     def all_stages(self) -> Results:

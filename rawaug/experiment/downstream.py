@@ -91,15 +91,6 @@ def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) 
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
     drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
     watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
-<<<<<<< HEAD
-    net = train(
-        stream, watched, config.denoiser, config.train, place / f"seed{seed}", seed, label=f"{place.name} {seed}"
-    )
-    test = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
-    frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in test]
-    scores = [score.psnr for score, *_ in score_denoiser(net, frames, noise, cfa, 0, 1, "PSNR_d")]
-    return sum(scores) / len(scores)
-=======
     folder = place / f"seed{seed}"
     return train(stream, watched, config.denoiser, config.train, folder, seed, label=f"{place.name} {seed}")
 
@@ -108,9 +99,8 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     """Mean scores on the test frames; their noise is frozen with seed 0."""
     pairs = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
-    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, False, "PSNR_d")]
+    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
     return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
->>>>>>> main
 
 
 @singledispatch

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_type_hints
 
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
+from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
@@ -30,7 +31,7 @@ class DataConfig(PairSettings):
         count: number of pairs to use; null for all.
         select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
             folders.
-        pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
+        pictures: the sRGB pictures to augment with: a folder, ``demo:``, or ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
@@ -53,6 +54,8 @@ class DataConfig(PairSettings):
     def __post_init__(self) -> None:
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
+        if self.pictures == OWN_PICTURES and self.pairs is None:
+            raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
         given = [key for key, value in self._pair_settings().items() if value is not None]
         specs = (self.pairs, self.validation, self.test)
         if given and not any(isinstance(spec, str) and spec.startswith(_PAIRS) for spec in specs):

@@ -112,13 +112,9 @@ class SiddBlocks(LazyPairs):
         self.path = Path(path)
         self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
-<<<<<<< HEAD
-        self._blocks: tuple[Tensor, Tensor] | None = None
+        self._all = Once(self._read_all)
         self._pictures: dict[str, Tensor] = {}
         self._frame: tuple[int, _Frame] | None = None
-=======
-        self._all = Once(self._read_all)
->>>>>>> main
         super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
 
     def read(self, index: int) -> Pair:
@@ -136,27 +132,13 @@ class SiddBlocks(LazyPairs):
         pictures = {key: turned_like(every[scene], clean, shot.cfa, what) for key, every in self._pictures.items()}
         return _Frame(shot.cfa, shot.camera, levels, known is None, self._colours.get(shot.name), **pictures)
 
-<<<<<<< HEAD
-    def _all(self) -> tuple[Tensor, Tensor]:
-        if self._blocks is None:
-            clean, noisy = (_blocks_of_scenes(file) for file in self.files)
-            _require_same_shape(clean, noisy, self.files[1])
-            self._blocks = clean, noisy
-            self._levels = noise_level_functions(self.path)
-            self._colours = _colours(self.path)
-            for key, kind in (("srgb", "Gt"), ("noisy_srgb", "Noisy")):
-                if (file := _file_if_any(self.path, f"Validation{kind}BlocksSrgb.mat")) is not None:
-                    side = (clean.shape[-2], clean.shape[-1])
-                    self._pictures[key] = read_block_pictures(file, (len(HELD_BACK), BLOCKS), side)
-        return self._blocks
-=======
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (_blocks_of_scenes(file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         self._levels = noise_level_functions(self.path)
         self._colours = _colours(self.path)
+        self._pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
         return clean, noisy
->>>>>>> main
 
 
 class SiddPlusBlocks(LazyPairs):
@@ -176,52 +158,29 @@ class SiddPlusBlocks(LazyPairs):
         path = self.path = Path(path)
         self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
         patterns = find_file(path, "siddplus_*bayer_patterns.csv")
-<<<<<<< HEAD
-        with patterns.open(encoding="utf-8-sig", newline="") as stream:
-            self.cfas = [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
-        self._blocks: tuple[Tensor, Tensor] | None = None
+        self.cfas = _patterns(patterns)
+        self._all = Once(self._read_all)
         self._pictures: dict[str, Tensor] = {}
         self._frame: tuple[int, _Frame] | None = None
         super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
 
     def read(self, index: int) -> Pair:
-        if self._blocks is None:
-            clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
-            _require_same_shape(clean, noisy, self.files[1])
-            if len(clean) != len(self):
-                raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
-            self._blocks = clean, noisy
-            for key, kind in (("srgb", "gt"), ("noisy_srgb", "noisy")):
-                if (file := _file_if_any(self.path, f"siddplus_valid_{kind}_srgb.mat")) is not None:
-                    side = (clean.shape[-2], clean.shape[-1])
-                    self._pictures[key] = read_block_pictures(file, (len(clean),), side)
         number, block = divmod(index, BLOCKS)
         part = slice(number * BLOCKS, (number + 1) * BLOCKS)
-        clean, noisy = (blocks[part] for blocks in self._blocks)
+        clean, noisy = (blocks[part] for blocks in self._all())
         if self._frame is None or self._frame[0] != number:
             what, cfa = f"{self.path}: frame {number}", self.cfas[number]
             pictures = {key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()}
             levels = captured_noise(clean.numpy(), noisy.numpy())
             self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
         return _pair(self.names[index], block, clean, noisy, self._frame[1])
-=======
-        self.cfas = _patterns(patterns)
-        self._all = Once(self._read_all)
-        super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
-
-    def read(self, index: int) -> Pair:
-        frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
-        clean, noisy = self._all()
-        levels = captured_noise(clean[frame].numpy(), noisy[frame].numpy())
-        cfa = self.cfas[index // BLOCKS]
-        return _pair(self.names[index], clean[index], noisy[index], cfa, _NO_COLOUR, levels, "SIDD+")
->>>>>>> main
 
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         if len(clean) != len(self):
             raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
+        self._pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
         return clean, noisy
 
 
@@ -296,10 +255,17 @@ def find_file(path: Path, pattern: str) -> Path:
     return found[0]
 
 
-<<<<<<< HEAD
-def _file_if_any(path: Path, name: str) -> Path | None:
-    return find_file(path, name) if any(path.rglob(name)) else None
-=======
+def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
+    """The pictures of the clean and of the noisy blocks, of those that there are."""
+    found = {}
+    for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
+        name = pattern.format(kind)
+        if any(path.rglob(name)):
+            side = (clean.shape[-2], clean.shape[-1])
+            found[key] = read_block_pictures(find_file(path, name), tuple(clean.shape[:-3]), side)
+    return found
+
+
 def _patterns(file: Path) -> list[CFA]:
     """A pattern for each frame of 32 blocks."""
     try:
@@ -310,7 +276,6 @@ def _patterns(file: Path) -> list[CFA]:
         return [CFA(name) for name in names]
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{file}: is no list of patterns, one for each frame ({error}); copy it again") from None
->>>>>>> main
 
 
 def _blocks_of_scenes(file: Path) -> Tensor:
@@ -349,6 +314,7 @@ def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) ->
         shot_var=frame.levels[0],
         read_var=frame.levels[1],
         camera=frame.camera,
+        color_known=frame.colour is not None,
         rendered=frame.srgb is not None or frame.colour is not None,
         noisy_srgb=None if frame.noisy_srgb is None else frame.noisy_srgb[block],
         levels_from_clean=frame.levels_from_clean,

@@ -86,17 +86,9 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-<<<<<<< HEAD
         pictures = {kind: _turned_back(files[kind], view) for kind in ("GT_SRGB", "NOISY_SRGB") if kind in files}
         known = self.levels.get(scene.name)
         shot_var, read_var = known or measured_levels(clean, noisy)
-=======
-        if "GT_SRGB" in files:
-            srgb = _even(turn_back(apart(read_picture, files["GT_SRGB"]), view))
-        else:
-            srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
-        shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
->>>>>>> main
         return Pair(
             name=self.names[index],
             srgb=pictures["GT_SRGB"] if "GT_SRGB" in pictures else develop_mosaic(clean, scene.cfa, gains, matrix),
@@ -202,7 +194,7 @@ def colour_of(file: Path) -> Colour:
 
 def _turned_back(file: Path, view: int) -> Tensor:
     """The upright picture in ``file`` as the sensor saw it."""
-    return _even(turn_back(read_picture(file), view)).contiguous()
+    return _even(turn_back(apart(read_picture, file), view)).contiguous()
 
 
 def _even(image: Tensor) -> Tensor:

@@ -49,9 +49,7 @@ class Descent:
         ValueError: if the file at ``path`` cannot be read.
     """
 
-    def __init__(
-        self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int | None = None
-    ) -> None:
+    def __init__(self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int | None = None) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
         self.report_steps = report_steps or REPORT_STEPS
         self.watched: dict[str, Watched] = {}

@@ -97,9 +97,7 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
     return pieces[0], pieces[1]
 
 
-def _gain_on_frames_left_out(
-    samples: PixelSamples, shots: Sequence[Shot], descent: Descent, refit: Refit
-) -> float:
+def _gain_on_frames_left_out(samples: PixelSamples, shots: Sequence[Shot], descent: Descent, refit: Refit) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
     gain = 0.0
     for fold in range(FOLDS):

@@ -205,12 +205,8 @@ class _Fit:
             predicted = stages.correct_colour(self._curved(part), self.colour.pick(frames).product())
             return reading_error(predicted, part) + self.tie(self.colour)
 
-<<<<<<< HEAD
-        self.descent.run(stage + self.part, loss, tensors, CURVE_STEPS, CURVE_RATE)
-=======
         steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
-        self.descent.run(stage, loss, tensors, steps, CURVE_RATE)
->>>>>>> main
+        self.descent.run(stage + self.part, loss, tensors, steps, CURVE_RATE)
 
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 

@@ -49,12 +49,8 @@ class FramePair(Protocol):
     def camera(self) -> str: ...
     @property
     def registered(self) -> bool: ...
-<<<<<<< HEAD
-    def require_rendered(self) -> None: ...
-=======
     @property
     def color_known(self) -> bool: ...
->>>>>>> main
 
 
 class Shot(NamedTuple):
@@ -112,7 +108,7 @@ def sample_pixels(
         noisy: take the captured noisy RAW (and never the clean one).
 
     Raises:
-        ValueError: if there is no pair, one has no picture in the camera's colours, or a noisy RAW is asked for and
+        ValueError: if there is no pair, one's colours are unknown, or a noisy RAW is asked for and
             absent.
     """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
@@ -123,15 +119,11 @@ def sample_pixels(
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
-<<<<<<< HEAD
-    pair.require_rendered()
-=======
     if not pair.color_known:
         raise ValueError(
             f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
             "use a shipped one, such as universal"
         )
->>>>>>> main
     raw = pair.noisy if noisy else pair.raw
     if raw is None:
         raise ValueError(f"{pair.name}: has no noisy RAW; fit on clean frames or add noise first")
