@@ -59,6 +59,8 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 
 def _set_up(path: Path) -> None:
     """A recipe as the command line sets it up, its networks without their memory."""
+    from dataclasses import fields
+
     import torch
     from jsonargparse import ArgumentError
 
@@ -68,9 +70,9 @@ def _set_up(path: Path) -> None:
     from rawaug.training.start import first_network
 
     try:
-        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path))
+        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path), ["run"])[0]
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke"}})
+        recipe = kind.settings(**{field.name: settings[field.name] for field in fields(kind.settings)})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:

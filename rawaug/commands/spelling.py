@@ -63,7 +63,7 @@ def require_known_keys(file: object, content: Any, parser: Any) -> None:
     Raises:
         ValueError: naming the key, and the one that is nearly spelt so.
     """
-    known = {action.dest for action in parser._actions}
+    known = {action.dest for action in parser._actions if not action.dest.endswith(".help")}
 
     def walk(part: Mapping[str, Any], above: str) -> None:
         for name, value in part.items():
