@@ -59,8 +59,6 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 
 def _set_up(path: Path) -> None:
     """A recipe as the command line sets it up, its networks without their memory."""
-    from dataclasses import fields
-
     import torch
     from jsonargparse import ArgumentError
 
@@ -72,7 +70,7 @@ def _set_up(path: Path) -> None:
     try:
         kind, parser = KINDS[kind_of(path)], _parser(kind_of(path), ["run"])[0]
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{field.name: settings[field.name] for field in fields(kind.settings)})
+        recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:

@@ -10,7 +10,6 @@ import json
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rawaug._version import __version__
@@ -58,21 +57,20 @@ def _dispatch(argv: list[str]) -> int:
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
         print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
         return 0
-    kind, recipe, shown = "training", None, None
+    kind, recipe = "training", None
     if argv[:2] == ["run", "--recipe"]:
         argv = ["run", *argv[2:]]
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
-        from rawaug.experiment.kinds import kind_of
+        from rawaug.experiment.kinds import KINDS, kind_of
         from rawaug.experiment.plain_yaml import read_yaml
-        from rawaug.experiment.recipe import find_recipe
+        from rawaug.experiment.recipe import defaults_of, find_recipe
 
         recipe = find_recipe(argv[1])
         kind = kind_of(recipe)
-        shown = recipe if {"-h", "--help"} & set(argv) else None
         argv = ["run", "--recipe", str(recipe), *argv[2:]]
     names = [*OWN, *listed()]
     chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
-    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen], shown)
+    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
     if not argv:
         parser.print_help()
         return 0
@@ -80,6 +78,8 @@ def _dispatch(argv: list[str]) -> int:
         require_known_options(chosen, leaves[chosen], argv)
     if recipe is not None:
         require_known_keys(recipe, read_yaml(recipe), leaves["run"])
+        if {"-h", "--help"} & set(argv):
+            leaves["run"].set_defaults(defaults_of(recipe, KINDS[kind].settings))
     parsed = parser.parse_args(argv)
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
@@ -93,11 +93,8 @@ def _dispatch(argv: list[str]) -> int:
     return 0
 
 
-def _parser(kind: str, wanted: Sequence[str | None], recipe: Path | None = None) -> tuple[Any, dict[str, Any]]:
-    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments.
-
-    ``run`` takes the keys of ``kind``; the values of ``recipe`` stand in its help.
-    """
+def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
+    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments."""
     from jsonargparse import ArgumentParser
 
     from rawaug.commands.arguments import add_arguments
@@ -125,7 +122,7 @@ def _parser(kind: str, wanted: Sequence[str | None], recipe: Path | None = None)
     for name, leaf in leaves.items():
         if name in wanted:
             if name == "run":
-                _add_run_arguments(leaf, kind, recipe)
+                _add_run_arguments(leaf, kind)
             elif name == "completion":
                 leaf.add_argument("shell", choices=SHELLS)
             else:
@@ -136,17 +133,14 @@ def _parser(kind: str, wanted: Sequence[str | None], recipe: Path | None = None)
     return parser, leaves
 
 
-def _add_run_arguments(run: Any, kind: str, recipe: Path | None) -> None:
+def _add_run_arguments(run: Any, kind: str) -> None:
     from rawaug.experiment.kinds import KINDS
-    from rawaug.experiment.recipe import defaults_of
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
     run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
-    if recipe is not None:
-        run.set_defaults(defaults_of(recipe, KINDS[kind].settings))
 
 
 def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:

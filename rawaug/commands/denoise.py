@@ -12,7 +12,7 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,8 @@ from typing import Any
 
 from torch import Tensor
 
-from denoisers.pretrained import DEFAULT
+import denoisers
+from denoisers.pretrained import DEFAULT, find
 from rawaug import bayer
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, FrameDenoiser, NetworkDenoiser
 from rawaug.commands.synth import require_same_settings
@@ -29,14 +30,23 @@ from rawaug.files import require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
 from rawaug.io.raw import develop
-from rawaug.noise import EldLevels, FixedLevels, camera_names, estimate_noise, noise_levels
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import (
+    EldLevels,
+    FixedLevels,
+    MeasuredLevels,
+    camera_law,
+    camera_names,
+    estimate_noise,
+    noise_levels,
+)
 from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS, Spec
 from rawaug.seeding import keyed_generator
 
-Noise = str | Sequence[float]
-"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name (taken at the file's ISO), or two variances."""
+Noise = str | Sequence[float] | MeasuredLevels
+"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
 
 _NO_NOISE = (0.0, 0.0)
 
@@ -62,7 +72,8 @@ def run(
         out: output DNG, or output folder.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
-        noise: auto (NoiseProfile, else estimate), profile, estimate, a measured camera, or [shot_var, read_var].
+        noise: auto (NoiseProfile, else estimate), profile, estimate, camera (the law that the denoiser was trained
+            for), an ISP's .safetensors (the law in it), a measured camera's name, or [shot_var, read_var].
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
@@ -73,13 +84,14 @@ def run(
         ValueError: if a file of a folder could not be denoised, after all others.
     """
     method = frame_denoiser(denoiser, classical, self_ensemble, device)
+    law = stored_noise(noise, DEFAULT if denoiser is None else denoiser)
     if not Path(source).is_dir():
-        done = denoise_file(source, out, method, noise, strength=strength, preview=preview, overwrite=overwrite)
+        done = denoise_file(source, out, method, law, strength=strength, preview=preview, overwrite=overwrite)
         print_denoised(DenoisedFolder([done]))
         return
     if preview is not None:
         raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
-    result = denoise_folder(source, out, method, noise, strength=strength, overwrite=overwrite)
+    result = denoise_folder(source, out, method, law, strength=strength, overwrite=overwrite)
     print_denoised(result)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
@@ -136,6 +148,8 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     Raises:
         ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
     """
+    if isinstance(noise, MeasuredLevels):
+        return *_of_law(noise, frame), "camera"
     if not isinstance(noise, str):
         fixed = FixedLevels(*noise)
         return fixed.shot_var, fixed.read_var, "given"
@@ -169,6 +183,37 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
         return *levels.typical(), noise
     shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
     return float(shot_var), float(read_var), noise
+
+
+def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
+    """The law at the frame's ISO.
+
+    Raises:
+        ValueError: if the law is of another camera, or does not reach the ISO.
+    """
+    known = {law.camera, frame.camera} - {"unknown"}
+    if len(known) > 1:
+        raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
+    try:
+        return law.at(frame.iso)
+    except ValueError as error:
+        raise ValueError(f"{frame.name}: {error}; pass --noise estimate or --noise '[shot_var, read_var]'") from None
+
+
+def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
+    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such file, or no law in it.
+    """
+    if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
+        return noise
+    stored = denoisers.load(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
+    law = stored.get("noise")
+    if not isinstance(law, Mapping):
+        file = denoiser if noise == "camera" else noise
+        raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
+    return camera_law(law)
 
 
 def denoise_file(
@@ -291,7 +336,7 @@ def denoise_folder(
     targets = _targets(source, out)
     require_writable(out, folder=True)
     made, strength = _made(method), _checked(strength)
-    settings = {**made.settings, "noise": noise if isinstance(noise, str) else list(noise)}
+    settings = {**made.settings, "noise": _as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
     result = DenoisedFolder()
@@ -306,6 +351,12 @@ def denoise_folder(
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
     return result
+
+
+def _as_json(noise: Noise) -> Any:
+    if isinstance(noise, MeasuredLevels):
+        return noise.spec()
+    return noise if isinstance(noise, str) else list(noise)
 
 
 def _targets(source: Path, out: Path) -> dict[Path, Path]:

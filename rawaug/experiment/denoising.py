@@ -45,7 +45,7 @@ from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.extras import extra
 from rawaug.files import find_weights, fingerprint, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
@@ -87,6 +87,10 @@ def run(
 
 def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
+
+    Args:
+        recipe: what would be run.
+        overwrite: it would replace a run of this name with other settings.
 
     Raises:
         OSError, ValueError: for the first thing found wrong.
@@ -192,7 +196,7 @@ class _Run:
         model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
         if not _leads():
             return model
-        levels = [isp.info["noise"][k] for k in ("shot_var", "read_var")] if recipe.noise == "camera" else recipe.noise
+        levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
@@ -294,8 +298,6 @@ def _leads() -> bool:
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
-
-
 
 
 def _discard_other_checkpoint(place: Path, key: str) -> None:

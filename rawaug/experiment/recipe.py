@@ -12,7 +12,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
@@ -239,22 +239,15 @@ def _listed() -> list[tuple[str, Path]]:
 def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
     """What a recipe's file sets, by the keys of the command line such as ``data.count``; arms are one key.
 
-    Raises:
-        ValueError: if it sets a key that ``settings``, a dataclass, does not have.
+    Args:
+        file: whose keys are known.
+        settings: the dataclass of its kind.
     """
     found: dict[str, Any] = {}
     hints = get_type_hints(settings)
     for key, value in (read_yaml(file) or {}).items():
-        if key not in hints:
-            raise ValueError(f"{file}: unknown key {key}{nearest(key, hints)}")
-        if not is_dataclass(hints[key]):
-            found[key] = value
-            continue
-        inner = get_type_hints(hints[key])
-        for name, setting in (value or {}).items():
-            if name not in inner:
-                raise ValueError(f"{file}: unknown key {key}.{name}{nearest(name, inner)}")
-            found[f"{key}.{name}"] = setting
+        parts = {f"{key}.{name}": part for name, part in (value or {}).items()} if is_dataclass(hints[key]) else None
+        found |= {key: value} if parts is None else parts
     return found
 
 

@@ -98,6 +98,8 @@ def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr("rawaug.files.tempfile.TemporaryFile", denied)
     with pytest.raises(OSError, match=r"report\.html: cannot be written: .*: Permission denied"):
         require_writable(tmp_path / "report.html")
+
+
 def test_two_writers_of_one_file_do_not_meet_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
     path = tmp_path / ("n" * 251 + ".txt")  # as long as a name can be
     with replacing(path) as first:

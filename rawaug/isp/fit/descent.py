@@ -40,7 +40,7 @@ class Descent:
         key: what the state belongs to; a file with another key is not used.
         seed: of what the steps draw.
         progress: show progress bars.
-        report_steps: a stage reports, and is watched, this often.
+        report_steps: a stage reports, and is watched, this often; None is 50.
 
     Attributes:
         watched: what the watched stages scored, by name.
@@ -49,10 +49,9 @@ class Descent:
         ValueError: if the file at ``path`` cannot be read.
     """
 
-    def __init__(
-        self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int = REPORT_STEPS
-    ) -> None:
-        self.path, self.key, self.seed, self.progress, self.report_steps = path, key, seed, progress, report_steps
+    def __init__(self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int | None = None) -> None:
+        self.path, self.key, self.seed, self.progress = path, key, seed, progress
+        self.report_steps = report_steps or REPORT_STEPS
         self.watched: dict[str, Watched] = {}
         self._steps: dict[str, int] = {}
         self._tensors: dict[str, Tensor] = {}

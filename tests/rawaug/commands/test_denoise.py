@@ -1,8 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
+import multiprocessing
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -260,13 +259,19 @@ def test_wrong_wishes_are_refused_before_anything_is_read(
 def test_12_megapixels_take_less_than_2_gib(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
     numbers = np.random.default_rng(0).integers(400, 4000, (3000, 4000)).astype(np.uint16)
     bayer_dng(tmp_path / "a.dng", numbers, black=(64,), noise_profile=LEVELS)
-    code = "import sys; from rawaug.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = """
+import resource
+from rawaug.cli import main
+assert main(command) == 0
+out.write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+"""
     command = ["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng"), "--denoiser", str(identity)]
-    child = subprocess.Popen([sys.executable, "-c", code, *command], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    assert child.returncode == 0
-    assert usage.ru_maxrss < 2 * 2**20  # KiB
+    variables = {"command": command, "out": tmp_path / "peak"}
+    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(code, variables))
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    assert int((tmp_path / "peak").read_text()) < 2 * 2**20  # KiB
 
 
 def test_a_real_dng_keeps_its_gain_maps(tmp_path: Path, camera_files: Path, identity: Path) -> None:

@@ -47,7 +47,7 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     stream = TrainingStream(RealCrops([pair], noise, 32, pair.cfa), None, 4, 0.0, seed=0)
     validation = [Watched(*frozen_sample(pair, noise, pair.cfa, seed=0))]
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2, "deviation": True})
-    config = replace(CONFIG, steps=120, batch=4, ema=0.9)
+    config = replace(CONFIG, steps=120, batch=4, ema=0.9, validate_every=60, checkpoint_every=120)
     net = loop.train(stream, validation, network, config, tmp_path, device="cpu")
     noisy = psnr(validation[0].noisy, validation[0].clean).item()
     assert validate(net, validation, torch.device("cpu"))["psnr"] > noisy + 2.0
@@ -146,7 +146,7 @@ fabric = launched("cpu", 1, "32-true")
 NODE = """
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 rendezvous = {"rdzv_backend": "static", "rdzv_endpoint": endpoint, "rdzv_configs": {"rank": rank}, "run_id": "meet"}
-config = LaunchConfig(2, 2, 2, **rendezvous, max_restarts=0, monitor_interval=0.05, start_method="forkserver")
+config = LaunchConfig(2, 2, 2, **rendezvous, max_restarts=0, monitor_interval=0.05, start_method="fork")
 elastic_launch(config, exec)(meet, {"where": where})
 """
 """What ``torchrun --nnodes 2 --nproc-per-node 2 --node-rank RANK`` does on a node, for code in place of a file."""
