@@ -47,7 +47,9 @@ def generate(folder: Path, count: int, height: int, width: int) -> None:
         free = (source.shape[2] - height, source.shape[3] - width)
         top, left = (int(torch.randint(n + 1, (), generator=generator)) for n in free)
         crop = source[0, :, top : top + height, left : left + width].round().clamp(0, 255).to(torch.uint8)
-        write_picture(folder / f"{k // 1000:03d}" / f"{k:06d}.jpg", crop)
+        file = folder / f"{k // 1000:03d}" / f"{k:06d}.jpg"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_picture(file, crop)
 
 
 def run(pictures: Path, out: Path, workers: int, kills: int, shards: int) -> None:

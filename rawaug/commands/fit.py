@@ -12,6 +12,7 @@ from rawaug.data import RawFolder, open_pairs
 from rawaug.data.identity import shared_frame
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.files import require_writable
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import MeasuredLevels, camera_law, plot_noise
@@ -45,6 +46,7 @@ def run(
     """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"--out {out}: the file must end in .safetensors")
+    require_writable(out)
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
     isp = fit(

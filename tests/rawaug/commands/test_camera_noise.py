@@ -28,7 +28,7 @@ SHOT_VAR, READ_VAR = 1e-3, 4e-5
 TINY: dict[str, Any] = {"steps": 1, "curve_steps": 1, "pixels": 256}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def noisy_pair() -> Pair:
     """Patches of many greys, as a colour chart has, at known levels."""
     generator = torch.Generator().manual_seed(0)
