@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,15 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.readable import Readable
+from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
     Score,
     classical_method,
-    installed_classical,
     label_of,
     network_method,
+    require_classical,
     require_numbers,
     row_of,
     score_classical,
@@ -30,7 +31,7 @@ from rawaug.evaluation.scores import (
     summary,
 )
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import find_weights, read_header, sha256, write_json
+from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, NoiseSpec, noise_model
 from rawaug.progress import progress
@@ -66,10 +67,17 @@ def run(
         json: write the result as JSON to this file.
         settings: of pairs:PATH.
     """
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **vars(settings))
-    print_scores(result)
+
+    def written(result: dict[str, Any]) -> None:
+        print_scores(result)
+        if json:
+            write_json(result, json)
+
     if json:
-        write_json(result, json)
+        require_writable(json)
+    more = {"first": written, **vars(settings)}
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **more)
+    written(result)
     if report:
         print(f"page: {report}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
@@ -84,6 +92,7 @@ def evaluate(
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+    first: Callable[[dict[str, Any]], None] | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
@@ -98,6 +107,7 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+        first: called with the result without self-ensemble and classical denoisers where these are still to come.
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
 
     Raises:
@@ -105,11 +115,15 @@ def evaluate(
             is for denoisers and the file is an ISP's, or no frame can be read. Some that cannot are named under
             ``broken``.
     """
-    classical = installed_classical(classical)
+    require_classical(classical)
+    where = find_device(device)
+    if report is not None:
+        require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = Readable(open_pairs(data, split="test", **settings))
     data = data if isinstance(data, str) else f"{len(pairs)} pairs"
+    about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
         if self_ensemble or noise is not None or classical or report is not None:
             raise ValueError(
@@ -122,8 +136,15 @@ def evaluate(
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
-        model = model.to(device)
-        result = _denoiser_result(model, pairs, levels, cfa, seed, self_ensemble, classical)
+        model = model.to(where)
+        result = {"self_ensemble": False, "seed": seed}
+        result |= summary([score for score, *_ in score_denoiser(model, pairs, levels, cfa, seed, False, "evaluate")])
+        if first is not None and (self_ensemble or classical):
+            first({**about[0], **result, **about[1]})
+        if self_ensemble:
+            result = _with_self_ensemble(result, model, pairs, levels, cfa)
+        if classical:
+            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
         _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
@@ -135,7 +156,7 @@ def evaluate(
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
         result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
-    return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
+    return {**about[0], **result, **about[1]}
 
 
 def _require_some(pairs: Readable) -> None:
@@ -143,23 +164,11 @@ def _require_some(pairs: Readable) -> None:
         raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
 
 
-def _denoiser_result(
-    model: Denoiser,
-    pairs: Sequence[Pair],
-    noise: NoiseModel,
-    cfa: CFA,
-    seed: int,
-    self_ensemble: bool,
-    classical: Sequence[Spec],
+def _with_self_ensemble(
+    plain: Mapping[str, Any], model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA
 ) -> dict[str, Any]:
-    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
-    result: dict[str, Any] = {"self_ensemble": self_ensemble, "seed": seed}
-    plain = summary([score for score, *_ in score_denoiser(model, pairs, noise, cfa, seed, False, "evaluate")])
-    if self_ensemble:
-        scored = score_denoiser(model, pairs, noise, cfa, seed, True, "evaluate, self-ensemble")
-        result |= {"plain": plain, **summary([score for score, *_ in scored])}
-    else:
-        result |= plain
-    if classical:
-        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
-    return result
+    """The summary of a denoiser averaged over views, with the one without under ``plain``."""
+    settings = {"self_ensemble": True, "seed": plain["seed"]}
+    scored = score_denoiser(model, pairs, noise, cfa, plain["seed"], True, "evaluate, self-ensemble")
+    without = {key: value for key, value in plain.items() if key not in settings}
+    return {**settings, "plain": without, **summary([score for score, *_ in scored])}

@@ -25,6 +25,7 @@ class Pair:
         noisy: a noisy mosaic of the same scene, like ``raw``, where one was captured.
         shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
         camera: make and model.
+        iso: None if unknown.
         registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
         color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
@@ -45,6 +46,7 @@ class Pair:
     camera: str = "unknown"
     registered: bool = True
     color_known: bool = True
+    iso: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name

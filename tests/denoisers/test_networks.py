@@ -1,5 +1,6 @@
 """The contract that every network keeps: shapes, identity before training, errors, dtypes, export."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,12 @@ def test_channels_last_and_bf16_agree_with_the_plain_run(make: Make) -> None:
     assert (half - plain).abs().mean() < 0.05 * correction
 
 
-def test_export_gives_the_same_numbers(make: Make) -> None:
+def test_an_exported_program_is_saved_and_gives_the_same_numbers(make: Make) -> None:
     model, (noisy, variance) = awake(make()), pair(1, 4, 36, 40)
-    exported = torch.export.export(model, (noisy, variance)).module()
-    torch.testing.assert_close(exported(noisy, variance), model(noisy, variance))
+    file = io.BytesIO()
+    torch.export.save(torch.export.export(model, (noisy, variance)), file)
+    loaded = torch.export.load(file).module()
+    torch.testing.assert_close(loaded(noisy, variance), model(noisy, variance))
 
 
 def test_export_with_sides_of_any_multiple_of_the_stride() -> None:

@@ -84,6 +84,7 @@ def fit_isp(
         fit.forward()
         train_jointly(fit.isp, samples, shots, config, fit.descent)
     fit.descent.finish()
+    fit.isp.info["registered"] = sum(shot.registered for shot in shots)
     fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
 

@@ -37,7 +37,7 @@ def test_every_kind_has_settings_that_name_it() -> None:
 def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
     expected = name if name in KINDS else "training"
     assert kind_of(find_recipe(name)) == expected
-    parsed = _parser(expected).parse_args(["run", "--recipe", str(find_recipe(name))])
+    parsed = _parser(expected, ["run"])[0].parse_args(["run", "--recipe", str(find_recipe(name))])
     assert parsed.run.name == name
 
 
@@ -45,17 +45,14 @@ def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
 def test_the_commands_of_a_header_can_be_given(name: str) -> None:
     commands = re.findall(r"^#   (rawaug run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
     assert len(commands) >= 3 and any("--smoke" in command for command in commands)
-    parser = _parser(kind_of(find_recipe(name)))
+    parser, _ = _parser(kind_of(find_recipe(name)), ["run"])
     for command in commands:
         _, _, named, *rest = shlex.split(command)
         assert named == name
         given = parser.instantiate(parser.parse_args(["run", "--recipe", str(find_recipe(name)), *rest])).run
-        settings = vars(given)
-        settings.pop("recipe")
-        quick = settings.pop("smoke")
         kind = KINDS[kind_of(find_recipe(name))]
-        recipe = kind.settings(**settings)
-        assert not quick or kind.smoke(recipe).name.endswith("-smoke")
+        recipe = kind.settings(**{key: getattr(given, key) for key in kind.settings.__dataclass_fields__})
+        assert not given.smoke or kind.smoke(recipe).name.endswith("-smoke")
 
 
 def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:

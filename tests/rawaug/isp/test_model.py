@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -196,13 +194,6 @@ def test_the_shipped_isps_are_small_and_hold_only_what_is_on() -> None:
         assert set(read_tensors(file, "", infinite=["colour.spread"])[1]) == set(
             DictionaryISP.from_pretrained(file).state_dict()
         )
-
-
-def test_loading_an_isp_does_not_import_the_compiler() -> None:
-    code = "import sys; from rawaug import DictionaryISP; import torch; before = set(sys.modules); "
-    code += "DictionaryISP.from_pretrained('universal'); print(*sorted(set(sys.modules) - before))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not [name for name in done.stdout.split() if name.startswith(("torch._dynamo", "torch._decomp"))]
 
 
 @pytest.mark.parametrize(
