@@ -13,7 +13,7 @@ LOCKED := \# Exact versions by Python version and platform, written by make lock
 
 BENCHMARKS := augment denoise faults folder fuzz loader networks noise shards synth
 
-.PHONY: demo test lint docs bench lock resolve clean
+.PHONY: demo test lint docs bench dist lock resolve clean
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without augmentation
 	$(BIN)/rawaug run recipes/fewshot.yaml
@@ -33,6 +33,10 @@ docs: $(VENV)/.docs  ## the site, in site/; a broken link or reference stops it
 bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name --quick || exit 1; done
 
+dist: | $(BIN)/python  ## the wheel and the source archive of a release
+	$(BIN)/pip install --quiet --disable-pip-version-check build
+	$(BIN)/python -m build
+
 lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
 	$(COMPILE) --universal --python-version 3.10 --fork-strategy requires-python --output-file constraints.txt $<
 	sed -i.old -E '/^(rawaug|nvidia-|cuda-)/d; 1i $(LOCKED)' constraints.txt && rm constraints.txt.old
@@ -46,7 +50,7 @@ resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on th
 	done; done
 
 clean:
-	rm -rf $(VENV) runs build site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) runs build dist site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -5,7 +5,8 @@
 
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
 The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first. All are timed
-in turn, and the fastest run of each counts. ``--memory`` prints the resident memory of the process and its persistent
+in turn, and the fastest run of each counts. ``--reading`` times PictureFolder alone: with decoders in a helper process
+of each worker (rawaug.io.apart), and without. ``--memory`` prints the resident memory of the process and its persistent
 workers after each epoch. Pictures are those of PICTURES, or the built-in ones written to a folder.
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import platform
 import tempfile
 import time
@@ -77,6 +79,26 @@ def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
     return fastest(runs, args.repeats, args.device)
 
 
+def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, float]:
+    """Seconds of an epoch that decodes in the loader's workers, and of one whose workers have helpers for it."""
+    runs: dict[str, Callable[[], object]] = {}
+    for name, limit in (("without", "0"), ("apart", "60")):
+        os.environ["RAWAUG_READ_SECONDS"] = limit
+        loader = DataLoader(
+            Crops(PictureFolder(folder), args.crop), args.batch, num_workers=args.workers,
+            persistent_workers=args.workers > 0,
+        )  # fmt: skip
+
+        def epoch(loader: DataLoader[Tensor] = loader, limit: str = limit) -> None:
+            os.environ["RAWAUG_READ_SECONDS"] = limit  # which persistent workers keep from their start
+            for _ in loader:
+                pass
+
+        epoch()
+        runs[name] = epoch
+    return fastest(runs, args.repeats, torch.device("cpu"))
+
+
 def time_steps(args: argparse.Namespace) -> dict[str, float]:
     """Seconds of a training step on a batch."""
     augment = rawaug.RawAugment.from_pretrained("universal").to(args.device)
@@ -129,17 +151,20 @@ def measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         growth = memory[-1] / memory[min(1, len(memory) - 1)] - 1
         print(f"  from epoch 2 to {len(memory)}: {growth:+.1%}")
         return {"memory_mib": memory, "growth": growth}
-    loaders, steps = time_loaders(folder, args), time_steps(args)
-    for what, seconds in (("loader", loaders), (f"step of UNet({args.width})", steps)):
+    timed = {"reading": time_reading(folder, args)}
+    if not args.reading:
+        timed |= {"loader": time_loaders(folder, args), f"step of UNet({args.width})": time_steps(args)}
+    for what, seconds in timed.items():
         shown = "  ".join(f"{name} {value:.2f}" for name, value in ratios(seconds).items())
         print(f"  {what:20s} without {1e3 * seconds['without']:.0f} ms;  ratios: {shown}")
-    return {"loader": ratios(loaders), "step": ratios(steps), "seconds": {"loader": loaders, "step": steps}}
+    return {"ratios": {what: ratios(seconds) for what, seconds in timed.items()}, "seconds": timed}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", type=Path, nargs="?", help="folder of pictures; by default the built-in ones")
     parser.add_argument("--memory", action="store_true", help="measure resident memory over epochs instead of times")
+    parser.add_argument("--reading", action="store_true", help="time the reading of pictures alone")
     parser.add_argument("--epochs", type=int, default=10, help="of --memory")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--workers", type=int, default=4)

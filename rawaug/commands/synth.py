@@ -205,20 +205,21 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     return pictures
 
 
-def require_same_settings(path: Path, settings: dict[str, object]) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with those in it.
+def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
+    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``.
 
     Raises:
         ValueError: if the existing files were made with other settings.
     """
-    if path.is_file():
+    if path.is_file() and not overwrite:
         try:
             known = json.loads(path.read_text())
         except json.JSONDecodeError as error:
             raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
-        for key, value in known.items():
-            if settings.get(key) != value:
-                raise ValueError(f"{path}: made with {key} {value}, not {settings.get(key)}; choose another folder")
+        for key in known | settings:
+            value, asked = known.get(key), settings.get(key)
+            if asked != value:
+                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
         return
     write_json(settings, path)
 

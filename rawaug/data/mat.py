@@ -53,7 +53,10 @@ def variables(path: str | Path) -> list[str]:
     Raises:
         FileNotFoundError, ValueError, OSError: as :func:`read_array`.
     """
-    path = Path(path)
+    return apart(_variables, Path(path))
+
+
+def _variables(path: Path) -> list[str]:
     if mat_version(path) == "5":
         from scipy.io import whosmat
 

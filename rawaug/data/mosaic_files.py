@@ -34,13 +34,14 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.mat import read_array, read_value, variables
+from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
 from rawaug.data.raw_folder import EXTENSIONS
 from rawaug.data.statements import KINDS, Statements, levels, shown
 from rawaug.extras import extra
 from rawaug.io import read_raw
+from rawaug.io.apart import apart
 from rawaug.io.picture_files import read_plane
-from rawaug.io.tiff_tags import damage_as_os_error
+from rawaug.io.tiff_tags import opened_tiff
 
 ARRAYS = (".npz", ".tif", ".tiff", ".png", ".mat")
 READABLE = (*EXTENSIONS, *ARRAYS)
@@ -66,7 +67,8 @@ class Mosaic(NamedTuple):
     white_balance: tuple[float, float, float] | None
     color_matrix: Tensor | None
     levels: tuple[float, float] | None
-    camera: str
+    camera: str = "unknown"
+    iso: float | None = None
 
 
 def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) -> Mosaic:
@@ -85,11 +87,11 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
     if suffix in EXTENSIONS:
         return _camera_file(file, given)
     if suffix in TWO_IN_ONE:
-        numbers, values = (_npz if suffix == ".npz" else _mat)(file, which, alone)
+        numbers, values = apart(_npz, file, which, alone) if suffix == ".npz" else _mat(file, which, alone)
     elif suffix == ".png":
         numbers, values = _png(file), {}
     elif suffix in (".tif", ".tiff"):
-        numbers, values = _tiff(file)
+        numbers, values = apart(_tiff, file)
     else:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(ARRAYS)} or a RAW format")
     stated = Statements.parse(values, file).joined(given, file)
@@ -101,15 +103,14 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
         white_balance=stated.white_balance,
         color_matrix=stated.color_matrix,
         levels=None if stated.shot_var is None or stated.read_var is None else (stated.shot_var, stated.read_var),
-        camera="unknown",
     )
 
 
 def _camera_file(file: Path, given: Statements) -> Mosaic:
-    frame = read_raw(file)
+    frame = apart(read_raw, file)
     Statements(frame.cfa, levels(frame.black), frame.white).joined(given, file)
     gains, matrix = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
-    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera)
+    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera, frame.iso)
 
 
 def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:
@@ -118,9 +119,12 @@ def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
     try:
         with np.load(file, allow_pickle=False) as arrays:
             names = list(arrays.files)
-            values = {name: arrays[name] for name in names if name in KINDS}
             name = _name_of(file, names, which, alone)
-            return arrays[name], values
+            stated = [known for known in names if known in KINDS]
+            size = sum(arrays.zip.getinfo(f"{read}.npy").file_size for read in (name, *stated))
+            if size > MAX_BYTES:
+                raise ValueError(f"{name} declares {size} bytes, above the limit of {MAX_BYTES}")
+            return arrays[name], {known: arrays[known] for known in stated}
     except _Unclear:
         raise
     except _UNREADABLE as error:
@@ -134,7 +138,7 @@ def _mat(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
 
 
 def _png(file: Path) -> np.ndarray:
-    numbers = read_plane(file)
+    numbers = apart(read_plane, file)
     if numbers.dtype != np.uint16:
         raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
     return numbers
@@ -147,8 +151,10 @@ def _tiff(file: Path) -> tuple[np.ndarray, dict[str, Any]]:
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such TIFF file")
     try:
-        with damage_as_os_error(file), tifffile.TiffFile(file) as tiff:
+        with opened_tiff(file) as tiff:
             page = tiff.pages[0]
+            if page.nbytes > MAX_BYTES:
+                raise ValueError(f"its first page declares {page.nbytes} bytes, above the limit of {MAX_BYTES}")
             text = getattr(page, "description", "")
             numbers = page.asarray()
     except OSError as error:

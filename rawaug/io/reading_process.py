@@ -107,8 +107,8 @@ def _help(others: list[socket.socket], link: socket.socket, pipe: tuple[int, int
         other.close()
     status = 1
     try:
-        memory = _anonymous_file()
-        socket.send_fds(link, [str(os.getpid()).encode()], [memory])
+        memory = _Memory()
+        socket.send_fds(link, [str(os.getpid()).encode()], [memory.file])
         with Connection(link.detach()) as connection, suppress(EOFError, ConnectionError):
             while True:
                 _answer(connection, memory)
@@ -117,29 +117,39 @@ def _help(others: list[socket.socket], link: socket.socket, pipe: tuple[int, int
         os._exit(status)
 
 
-def _anonymous_file() -> int:
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("rawaug")
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())
+class _Memory:
+    """A file without a name, mapped: what the helper puts there, the process that it helps sees."""
+
+    def __init__(self) -> None:
+        if hasattr(os, "memfd_create"):
+            self.file = os.memfd_create("rawaug")
+        else:
+            with tempfile.TemporaryFile() as file:
+                self.file = os.dup(file.fileno())
+        self.view: mmap.mmap | None = None
+
+    def put(self, buffers: list[memoryview]) -> None:
+        """One after the other, from the beginning; the file grows to hold them."""
+        total, place = sum(map(len, buffers)), 0
+        if total and (self.view is None or len(self.view) < total):
+            self.view = None  # a mapping cannot grow
+            os.ftruncate(self.file, total)
+            self.view = mmap.mmap(self.file, total)
+        for buffer in buffers:
+            assert self.view is not None
+            self.view[place : place + len(buffer)] = buffer
+            place += len(buffer)
 
 
-def _answer(connection: Connection, memory: int) -> None:
+def _answer(connection: Connection, memory: _Memory) -> None:
     read, arguments = pickle.loads(connection.recv_bytes())
     try:
         kind, value = "value", read(*arguments)
     except Exception as error:
         kind, value = "error", error
     content, buffers = _pickled(value)
-    sizes, place = tuple(len(buffer) for buffer in buffers), 0
-    if sum(sizes):
-        if os.fstat(memory).st_size < sum(sizes):
-            os.ftruncate(memory, sum(sizes))
-        with mmap.mmap(memory, sum(sizes)) as view:
-            for buffer in buffers:
-                view[place : place + len(buffer)] = buffer
-                place += len(buffer)
-    connection.send_bytes(pickle.dumps((kind, content, sizes)))
+    memory.put(buffers)
+    connection.send_bytes(pickle.dumps((kind, content, tuple(map(len, buffers)))))
 
 
 def _pickled(value: Any) -> tuple[bytes, list[memoryview]]:

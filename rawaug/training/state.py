@@ -109,8 +109,14 @@ class TrainingState:
         if score > self.best["psnr"] or not choose:
             self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.averaged.state_dict())}
 
-    def kept(self) -> Any:
-        """The network with the weights that are kept, on the CPU."""
+    def kept(self, label: str) -> Any:
+        """The network with the weights that are kept, on the CPU.
+
+        Raises:
+            ValueError: if no score was a number; ``label`` opens the message.
+        """
+        if not math.isfinite(self.best["psnr"]):
+            raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
         self.averaged.load_state_dict(self.best["net"])
         return self.averaged.cpu().to(memory_format=torch.contiguous_format)
 
