@@ -35,7 +35,7 @@ from rawaug.seeding import derived_seed
 
 SECONDS, WAITING_SECONDS, MEBIBYTES = 10.0, 120.0, 2048.0
 """Of a processor for a file, of a wait for it, and of memory."""
-START_SECONDS = 120.0
+START_SECONDS = 600.0
 DECODERS = {
     "raw": "LibRaw",
     "dng": "LibRaw",

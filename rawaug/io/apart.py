@@ -3,7 +3,8 @@
 LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers wrote. :func:`apart` calls a reader in
 a helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
 ``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets
-a new helper. Each thread of each DataLoader worker has its own.
+a new helper. On a busy machine, where it did not get to use a processor for that long, it has ten times as many. Each
+thread of each DataLoader worker has its own.
 
 Helpers are forked from one clean process (:mod:`rawaug.io.reading_process`), which imports the libraries once: to
 start one takes milliseconds, and no thread of a decoder has to survive a fork. Needs Unix sockets; elsewhere, files are
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import atexit
 import json
+import math
 import mmap
 import os
 import pickle
@@ -36,6 +38,8 @@ import numpy as np
 T = TypeVar("T")
 
 SECONDS = 60.0
+PATIENCE = 10
+"""Times the limit that a file may take where the helper has not used the limit of a processor: on a busy machine."""
 START_SECONDS = 300.0
 """For the first helper, which waits until the libraries are imported."""
 
@@ -128,7 +132,7 @@ class _Helper:
         """
         try:
             self.connection.send_bytes(pickle.dumps(request))
-            if not self.connection.poll(seconds):
+            if not self._answers(seconds):
                 self.kill()
                 raise _Lost(
                     f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again"
@@ -140,6 +144,16 @@ class _Helper:
             self.let_go()
             raise _Lost(f"crashes the decoder ({_ending(content)}); leave it out, or copy it again")
         return kind == "value", pickle.loads(content, buffers=self._copied(sizes))
+
+    def _answers(self, seconds: float) -> bool:
+        """Whether an answer comes; a helper that other programs keep from running gets more time."""
+        start = _processor_seconds(self.pid)
+        for _ in range(PATIENCE):
+            if self.connection.poll(seconds):
+                return True
+            if not _processor_seconds(self.pid) < start + seconds:
+                return False
+        return False
 
     def _copied(self, sizes: tuple[int, ...]) -> list[np.ndarray]:
         """The buffers in shared memory, which the next answer overwrites."""
@@ -157,6 +171,15 @@ class _Helper:
         with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
         self.let_go()
+
+
+def _processor_seconds(process: int) -> float:
+    """What a process has used of the processors; infinite where the system does not say."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError):
+        return math.inf
 
 
 def _close(connection: Connection, descriptor: int) -> None:
