@@ -11,9 +11,9 @@ PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  
 WHEEL := build/resolve/requirements.in
 LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
 
-BENCHMARKS := augment denoise folder fuzz loader networks noise shards synth
+BENCHMARKS := augment denoise faults folder fuzz loader networks noise shards synth
 
-.PHONY: demo test lint docs bench lock resolve clean
+.PHONY: demo test lint docs bench dist lock resolve clean
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without augmentation
 	$(BIN)/rawaug run recipes/fewshot.yaml
@@ -25,12 +25,17 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python .ci/advisories.py
 
 docs: $(VENV)/.docs  ## the site, in site/; a broken link or reference stops it
 	$(BIN)/zensical build --strict --clean
 
 bench: $(VENV)/.demo  ## what things cost and what damaged files do, each benchmark quickly
 	for name in $(BENCHMARKS); do $(BIN)/python -m benchmarks.$$name --quick || exit 1; done
+
+dist: | $(BIN)/python  ## the wheel and the source archive of a release
+	$(BIN)/pip install --quiet --disable-pip-version-check build
+	$(BIN)/python -m build
 
 lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
 	$(COMPILE) --universal --python-version 3.10 --fork-strategy requires-python --output-file constraints.txt $<
@@ -45,7 +50,7 @@ resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on th
 	done; done
 
 clean:
-	rm -rf $(VENV) runs build site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) runs build dist site .cache *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

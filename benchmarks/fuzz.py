@@ -54,10 +54,10 @@ FORBIDDEN = OUTCOMES[3:]
 
 
 class Worker:
-    """A process that reads files, restarted after a crash or a fault."""
+    """A process that reads files, each in at most ``seconds``, restarted after a crash or a fault."""
 
-    def __init__(self, folder: Path) -> None:
-        self.log = folder / "stderr.txt"
+    def __init__(self, folder: Path, seconds: float = WAITING_SECONDS) -> None:
+        self.log, self.seconds = folder / "stderr.txt", seconds
         self.process: subprocess.Popen[str] | None = None
 
     def read(self, kind: str, path: Path) -> tuple[str, str]:
@@ -67,7 +67,7 @@ class Worker:
         _forget_peak(process.pid)
         process.stdin.write(json.dumps([kind, str(path)]) + "\n")
         process.stdin.flush()
-        end, busy = time.monotonic() + WAITING_SECONDS, _processor_seconds(process.pid) + SECONDS
+        end, busy = time.monotonic() + self.seconds, _processor_seconds(process.pid) + SECONDS
         answered = False
         while not answered and time.monotonic() < end and _processor_seconds(process.pid) < busy:
             if _peak_mebibytes(process.pid) >= MEBIBYTES:
@@ -82,7 +82,7 @@ class Worker:
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
-            return "hung", f"more than {SECONDS:g} s of a processor, or {WAITING_SECONDS:g} s in all"
+            return "hung", f"more than {SECONDS:g} s of a processor, or {self.seconds:g} s in all"
         name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
@@ -219,7 +219,7 @@ def print_table(results: dict[str, Any]) -> None:
             print(f"{kind}: {reason}")
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=5000, help="files of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
@@ -227,7 +227,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="100 files")
     parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     start = time.perf_counter()
     results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
     print_table(results)

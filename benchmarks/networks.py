@@ -160,7 +160,7 @@ def training(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str,
         step(ready)  # memory is found, kernels are chosen
         if args.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(args.device)
-        runs = {"ready": lambda step=step: step(ready), "made": lambda step=step: step(augment(srgb))}  # type: ignore[misc]
+        runs = {"ready": lambda step=step: step(ready), "made": lambda step=step: step(augment(srgb))}
         steps = fastest(runs, args.repeats, args.device)
         figures |= {
             f"images/s{label}": args.batch / steps["ready"],

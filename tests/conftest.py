@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from rawaug import registry
+from rawaug.data.pair import Pair
 
 torch.set_num_threads(1)
 multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
@@ -48,3 +49,15 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds
+
+
+@pytest.fixture
+def given(registries: list[registry.Registry]) -> list[Pair]:
+    """What is opened as ``"given:"``, whatever the split: a list to be filled."""
+    pairs: list[Pair] = []
+
+    @registry.DATASETS.register("given")
+    def opened(path: str = "", split: str = "") -> list[Pair]:
+        return pairs
+
+    return pairs

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,8 +13,6 @@ import pytest
 import denoisers
 from rawaug.cli import main
 from rawaug.registry import Registry
-
-ROOT = Path(__file__).parents[1]
 
 PACKAGE = """
 from denoisers.network import PACKED, Denoiser, conv
@@ -73,26 +69,31 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(site: Path, registries: list[Registry], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The package can be imported in this process, and nothing of it is left afterwards."""
     monkeypatch.syspath_prepend(str(site))
-    for kind in registries:
-        vars(kind).pop("_entry_points", None)
+    look_again(registries)
     yield
+    look_again(registries)
+
+
+def look_again(registries: list[Registry]) -> None:
+    """Forget the package, and for which entry points the path was searched."""
     sys.modules.pop("abroad", None)
     for kind in registries:
         vars(kind).pop("_entry_points", None)
 
 
-def test_a_recipe_trains_with_what_another_package_brings(site: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("installed")
+def test_a_recipe_trains_with_what_another_package_brings(
+    tmp_path: Path, registries: list[Registry], monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(site)]), "PYTHONWARNINGS": "ignore"}
-    command = [sys.executable, "-m", "rawaug.cli", "run", "mine.yaml"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    results = json.loads((tmp_path / "runs" / "abroad" / "results.json").read_text())
+    assert main(["run", str(tmp_path / "mine.yaml"), "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "abroad" / "results.json").read_text())
     assert 20.0 < results["results"]["pictures"][0]["plain"]["psnr"] < 60.0
     assert results["recipe"]["noise"] == {"name": "Banded", "settings": {"row_var": 1e-4}}
-    weights = tmp_path / "runs" / "abroad" / "seed0" / "pictures" / "denoiser.safetensors"
+    monkeypatch.undo()  # the package is gone
+    look_again(registries)
     with pytest.raises(ValueError, match="denoiser 'Shallow' is unknown; use one of DHDN"):
-        denoisers.load(weights)  # the package is not installed in this process
+        denoisers.load(tmp_path / "abroad" / "seed0" / "pictures" / "denoiser.safetensors")
 
 
 @pytest.mark.usefixtures("installed")

@@ -5,20 +5,27 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 
 
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+@pytest.fixture
+def fuzz(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT))
+    monkeypatch.chdir(ROOT)
+    return import_module("benchmarks.fuzz")
+
+
+def test_damaged_files_are_read_or_refused_in_one_line(
+    fuzz: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     figures = tmp_path / "figures.json"
-    command = [sys.executable, "-m", "benchmarks.fuzz", "--quick", "--json", str(figures)]
-    done = subprocess.run(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert fuzz.main(["--quick", "--json", str(figures)]) == 0, capsys.readouterr().out
     kinds = json.loads(figures.read_text())["kinds"]
     assert {"dng", "jpeg", "picture", "mat5", "mat73", "safetensors", "npy", "recipe"} <= set(kinds)
     assert sum(row["mutated"] for row in kinds.values()) == 100
@@ -26,13 +33,8 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-def test_a_worker_that_dies_or_hangs_is_named_and_started_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT))
-    monkeypatch.chdir(ROOT)
-    from benchmarks import fuzz
-
-    monkeypatch.setattr(fuzz, "WAITING_SECONDS", 1.0)
-    worker, missing = fuzz.Worker(tmp_path), tmp_path / "missing.jpg"
+def test_a_worker_that_dies_or_hangs_is_named_and_started_anew(fuzz: ModuleType, tmp_path: Path) -> None:
+    worker, missing = fuzz.Worker(tmp_path, seconds=1.0), tmp_path / "missing.jpg"
     try:
         for name, outcome, why in (
             ("SIGSEGV", "crashed", "OpenImageIO: SIGSEGV"),

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -16,14 +17,15 @@ LEFT_OUT = shutil.ignore_patterns(".*", "build", "runs", "site", "*.egg-info", "
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the installed wheel and nothing else; what the package requires comes from the test environment."""
+    """A folder with the content of the wheel; what the package requires comes from the test environment."""
     place = tmp_path_factory.mktemp("wheel")
     shutil.copytree(ROOT, place / "source", ignore=LEFT_OUT)
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    wheel = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(place / "dist"), str(place / "source")]
-    subprocess.run([*pip, *wheel], check=True, capture_output=True)
-    (built,) = (place / "dist").glob("rawaug-*.whl")
-    subprocess.run([*pip, "install", "--no-deps", "--target", str(place / "site"), str(built)], check=True)
+    build = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
+    command = [sys.executable, "-c", build, str(place)]
+    subprocess.run(command, cwd=place / "source", check=True, capture_output=True)
+    (built,) = place.glob("rawaug-*.whl")
+    with zipfile.ZipFile(built) as wheel:
+        wheel.extractall(place / "site")
     return place / "site"
 
 

@@ -1,4 +1,4 @@
-"""``rawaug export``: a denoiser as an ONNX file, for programs that have no PyTorch.
+"""``rawaug export``: a denoiser as an ONNX file, for programs that have no PyTorch; an ISP by :mod:`.export_isp`.
 
 Inputs ``noisy`` and, where the network reads it, ``variance``; output ``denoised``: float32 packed RAW (R, Gr, Gb, B)
 ``(1, 4, h, w)`` of any h, w >= 2, that is any even mosaic. Variance is ``shot_var max(noisy, 0) + read_var``, of each
@@ -8,9 +8,7 @@ value. The file is run by ONNX Runtime on a frame with noise and compared with P
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,21 +16,19 @@ import torch
 from torch import Tensor
 
 import denoisers
-from denoisers.network import Denoiser
-from denoisers.pretrained import find
+from denoisers.pretrained import FOLDER, find
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.commands.export_isp import export_isp
+from rawaug.commands.onnx_files import feeds, require_equal, require_onnx, session_of, to_onnx
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.files import replacing
+from rawaug.files import find_weights, read_header, replacing
 from rawaug.io import read_raw
+from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.registry import COMMANDS
 
-TOLERANCE = 1e-4
-"""Largest difference between ONNX Runtime and PyTorch, white at 1."""
-
-NEEDED = ("onnx", "onnxscript", "onnxruntime")
 SIDE = 512
 """Mosaic pixels on the longer side of what both are run on and timed on."""
 
@@ -53,15 +49,29 @@ class Exported(NamedTuple):
 
 
 @COMMANDS.register("export")
-def run(denoiser: str, out: str, *, frame: str | None = None) -> None:
-    """Write a denoiser as an ONNX file, compared with PyTorch.
+def run(
+    weights: str, out: str, *, frame: str | None = None, white_balance: tuple[float, float, float] | None = None
+) -> None:
+    """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX; ONNX is compared with PyTorch.
 
     Args:
-        denoiser: a .safetensors file written by rawaug run, or the name of a shipped denoiser.
-        out: the .onnx file to write.
-        frame: RAW file on whose middle both are compared; by default a generated frame.
+        weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
+        out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
+        frame: of a denoiser, RAW file on whose middle both are compared; by default a generated frame.
+        white_balance: of an ISP, as-shot multipliers R, G, B of the setting; the fit's typical one by default.
+
+    Raises:
+        ValueError: if an option is given that is of the other kind.
     """
-    done = export(denoiser, out, frame)
+    if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
+        if frame is not None:
+            raise ValueError(f"--frame: is for denoisers, and {weights} is an ISP")
+        for path in export_isp(DictionaryISP.from_pretrained(weights), out, white_balance):
+            print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+        return
+    if white_balance is not None:
+        raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
+    done = export(weights, out, frame)
     print(f"{done.out}: {done.out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {done.difference:.1e}")
     seconds = f"ONNX Runtime {done.seconds_onnx:.2f} s a megapixel, PyTorch {done.seconds_torch:.2f} s"
     print(f"{seconds} ({torch.get_num_threads()} threads)")
@@ -72,56 +82,28 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
 
     Raises:
         FileNotFoundError, ValueError: if the denoiser or the frame cannot be read, a package is missing, ``out`` is not
-            named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`TOLERANCE`.
+            named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`rawaug.commands.onnx_files.TOLERANCE`.
     """
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        raise ValueError(f"export needs {', '.join(missing)}: pip install 'rawaug[export]'")
+    require_onnx()
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
     model, _ = denoisers.load(find(denoiser))
-    images = comparison_frame(frame)[: 1 + model.reads_variance]
+    names = ["noisy", "variance"][: 1 + model.reads_variance]
+    images = comparison_frame(frame)[: len(names)]
+    example = torch.rand(1, model.channels, 70, 90)
+    examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
     with replacing(out) as partial:
-        to_onnx(model, partial)
-        session = session_of(partial)
-        feeds = dict(zip(("noisy", "variance"), (image.numpy() for image in images), strict=False))
+        to_onnx(model, examples, "denoised", partial)
+        session, values = session_of(partial), feeds(names, images)
         with torch.inference_mode():
             expected = model(*images)
             seconds_torch = _fastest(lambda: model(*images))
-        (result,) = session.run(None, feeds)
-        difference = (torch.from_numpy(result) - expected).abs().max().item()
-        if not difference <= TOLERANCE:
-            raise ValueError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, more than {TOLERANCE}")
-        seconds_onnx = _fastest(lambda: session.run(None, feeds))
+        (result,) = session.run(None, values)
+        difference = require_equal(result, expected, out)
+        seconds_onnx = _fastest(lambda: session.run(None, values))
     megapixels = images[0].numel() / 1e6
     return Exported(out, difference, seconds_onnx / megapixels, seconds_torch / megapixels)
-
-
-def to_onnx(model: Denoiser, path: Path) -> None:
-    """One ONNX file, whose height and width are free."""
-    example = torch.rand(1, model.channels, 70, 90)
-    inputs = (example, 1e-3 * example + 1e-5)[: 1 + model.reads_variance]
-    names = ["noisy", "variance"][: len(inputs)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own
-        program = torch.export.export(
-            model,
-            inputs,
-            dynamic_shapes=tuple({2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC} for _ in inputs),
-        )
-        onnx = torch.onnx.export(program, input_names=names, output_names=["denoised"], dynamo=True, verbose=False)
-        assert onnx is not None
-        onnx.save(str(path), external_data=False)
-
-
-def session_of(path: Path) -> Any:
-    """ONNX Runtime on the CPU, on as many threads as PyTorch has."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from rawaug.commands.camera_noise import as_info, measure_camera_noise
+from rawaug.commands.camera_noise import CameraNoise, measure_camera_noise
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.identity import shared_frame
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.files import require_writable
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseEstimate, plot_noise
+from rawaug.lock import locked
+from rawaug.noise import MeasuredLevels, camera_law, plot_noise
 from rawaug.registry import COMMANDS
 
 WATCHED_PATCHES = 4
@@ -38,36 +40,40 @@ def run(
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
         held_out: frames of which none is fitted; their PSNR_r is shown during the fit.
         out: output .safetensors file.
-        noise: measure the camera's noise, for noise: camera; auto continues without it where the frames do not
-            allow it.
+        noise: measure the camera's noise at each ISO of the files, for noise: camera; auto continues without it where
+            the frames do not allow it.
         dark: folder of dark frames to measure the read variance.
         config: of the fit.
     """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"--out {out}: the file must end in .safetensors")
+    require_writable(out)
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
-    isp = fit(
-        data,
-        noise_figure=figure,
-        state=f"{out}.state",
-        camera_jpeg=camera_jpeg,
-        held_out=held_out,
-        noise=noise,
-        dark=dark,
-        **vars(config),
-    )
-    isp.info["data"] = data
-    isp.save(out)
+    with locked(Path(f"{out}.lock")):
+        isp = fit(
+            data,
+            noise_figure=figure,
+            state=f"{out}.state",
+            camera_jpeg=camera_jpeg,
+            held_out=held_out,
+            noise=noise,
+            dark=dark,
+            **vars(config),
+        )
+        isp.info["data"] = data
+        isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
     for score in isp.info.get("held_out", [])[-1:]:
         print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")
     if "noise_not_measured" in isp.info:
         print(f"noise not measured: {isp.info['noise_not_measured']}")
     if "noise" in isp.info:
-        measured = isp.info["noise"]
-        levels = f"shot_var {measured['shot_var']:.3g}, read_var {measured['read_var']:.3g}"
-        print(f"noise: {levels}, R^2 {measured['r2']:.3f}: {figure}")
+        law = camera_law(isp.info["noise"])
+        for level in law.levels:
+            at = "" if level.iso is None else f" at ISO {level.iso:g}"
+            print(f"noise{at}: shot_var {level.shot_var:.3g}, read_var {level.read_var:.3g}, R^2 {level.r2:.3f}")
+        print(f"points and lines: {', '.join(map(str, noise_figures(figure, law)))}")
 
 
 def fit(
@@ -117,14 +123,28 @@ def fit(
     if isinstance(estimate, str):
         isp.info["noise_not_measured"] = estimate
     elif estimate is not None:
-        isp.info["noise"] = as_info(estimate)
+        isp.info["noise"] = estimate.law.spec()
         if noise_figure is not None:
-            plot_noise(estimate, noise_figure, title=", ".join(isp.info["frames"][:4]))
+            _plot(estimate, noise_figure)
+    isp.info["rendering"] = rendering_of(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
 
 
-def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> NoiseEstimate | str | None:
+def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
+    """Where the measured points are drawn: ``path``, with the ISO in its name where there are several."""
+    path = Path(path)
+    if len(law.levels) == 1:
+        return [path]
+    return [path.with_name(f"{path.stem}-iso{level.iso:g}{path.suffix}") for level in law.levels]
+
+
+def _plot(noise: CameraNoise, path: str | Path) -> None:
+    for file, (iso, estimate) in zip(noise_figures(path, noise.law), noise.estimates.items(), strict=True):
+        plot_noise(estimate, file, title=noise.law.camera if iso is None else f"{noise.law.camera}, ISO {iso:g}")
+
+
+def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
     """The levels, or why they could not be measured."""
     if noise == "off":
         return None
@@ -134,6 +154,13 @@ def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) 
         if noise == "on":
             raise
         return str(error)
+
+
+def rendering_of(pairs: Sequence[Pair], frames: int, registered: int) -> str:
+    """What rendering the fit was to, whose tone curve and colours the ISP undoes; registered pairs are no JPEGs."""
+    own = "LibRaw" if isinstance(pairs, RawFolder) else "sRGB of the pairs"
+    counts = {own: registered, "JPEG of the camera": frames - registered}
+    return ", ".join(f"{name} ({count} of {frames})" for name, count in counts.items() if count)
 
 
 class _Watch:

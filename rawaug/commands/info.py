@@ -2,24 +2,44 @@
 
 from __future__ import annotations
 
-import json
+from json import dumps
 from pathlib import Path
+from typing import Any
 
 import denoisers
 from denoisers.pretrained import FOLDER
-from rawaug.files import find_weights, read_header
+from rawaug._version import __version__
+from rawaug.files import find_weights, read_header, sha256
+from rawaug.isp.description import description, tone_curve
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import COMMANDS
 
 
 @COMMANDS.register("info")
-def run(weights: str) -> None:
+def run(weights: str, *, json: bool = False) -> None:
     """Describe a weights file.
 
     Args:
         weights: a .safetensors file, or the name of a shipped ISP or denoiser.
+        json: print one JSON object, for programs; of an ISP with its tone curve at 256 codes.
     """
-    print(describe(weights))
+    print(dumps(as_json(weights)) if json else describe(weights))
+
+
+def as_json(weights: str | Path) -> dict[str, Any]:
+    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.description.description`.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
+    """
+    path = find_weights(weights, FOLDER)
+    content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
+    if read_header(path)["kind"] == "isp":
+        return content | description(DictionaryISP.from_pretrained(path))
+    model, info = denoisers.load(path)
+    parameters = sum(p.numel() for p in model.parameters())
+    name = {"kind": "denoiser", "name": type(model).__name__, "parameters": parameters}
+    return content | name | {"config": model.config, "info": info}
 
 
 def describe(weights: str | Path) -> str:
@@ -34,7 +54,7 @@ def describe(weights: str | Path) -> str:
         return _describe_isp(path)
     model, info = denoisers.load(path)
     lines = [f"{path}: denoiser {type(model).__name__}, {_millions(model)} M parameters"]
-    lines += [f"  {key}: {json.dumps(value)}" for key, value in {**model.config, **info}.items()]
+    lines += [f"  {key}: {dumps(value)}" for key, value in {**model.config, **info}.items()]
     return "\n".join(lines)
 
 
@@ -55,6 +75,13 @@ def _describe_isp(path: Path) -> str:
     lines.append(f"  colour atoms (sRGB to camera, rows of {rows}):")
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
+    lines.append(f"  tone and gamma, grey code to linear: {_curve(isp)}")
     lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
-    lines += [f"  {key}: {json.dumps(value)}" for key, value in isp.info.items()]
+    lines += [f"  {key}: {dumps(value)}" for key, value in isp.info.items()]
     return "\n".join(lines)
+
+
+def _curve(isp: DictionaryISP) -> str:
+    """A few codes of the tone curve, the mean of the channels."""
+    means = tone_curve(isp).mean(dim=1)
+    return ", ".join(f"{code} {means[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))

@@ -45,7 +45,7 @@ class PartReport:
     Attributes:
         what: the kind of data.
         items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
-        sizes, cfas, cameras, levels: how often each occurs among those that could be read.
+        sizes, cfas, cameras, iso, levels: how often each occurs among those that could be read.
         signal: least and greatest value of RAW.
         broken: one line per damaged file, with its name.
     """
@@ -56,13 +56,14 @@ class PartReport:
     sizes: Counter[str] = field(default_factory=Counter)
     cfas: Counter[str] = field(default_factory=Counter)
     cameras: Counter[str] = field(default_factory=Counter)
+    iso: Counter[str] = field(default_factory=Counter)
     levels: Counter[str] = field(default_factory=Counter)
     signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: PartReport) -> None:
         """Add another report's counts; a damaged file of many blocks is one line."""
-        for name in ("sizes", "cfas", "cameras", "levels"):
+        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
             getattr(self, name).update(getattr(other, name))
         if other.signal is not None:
             low, high = self.signal or other.signal
@@ -72,7 +73,7 @@ class PartReport:
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} examined"
         lines = [f"{self.what}: {self.items}{examined}"]
-        for name in ("sizes", "cfas", "cameras", "levels"):
+        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
             counts: Counter[str] = getattr(self, name)
             if counts:
                 more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
@@ -231,4 +232,6 @@ def _take(part: PartReport, item: Any) -> None:
         part.levels[f"shot_var {item.shot_var:.1e}, read_var {item.read_var:.1e}"] += 1
     if camera := getattr(item, "camera", None):
         part.cameras[camera] += 1
+    if iso := getattr(item, "iso", None):
+        part.iso[f"{iso:g}"] += 1
     part.signal = raw.min().item(), raw.max().item()

@@ -110,6 +110,7 @@ def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
         color_matrix=frame.color_matrix,
         camera=frame.camera,
         registered=registered,
+        iso=frame.iso,
     )
 
 

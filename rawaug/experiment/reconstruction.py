@@ -24,6 +24,7 @@ from rawaug.data.pair import Pair
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.early_checks import require_precision
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -34,6 +35,7 @@ from rawaug.experiment.methods import (
     mosaic_only_psnr,
     score_rows,
 )
+from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
@@ -117,14 +119,19 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
     )
 
 
-def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
-    """Run a comparison; the rows as in ``table.json``."""
-    return _Comparison(comparison).table()
+def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
+    """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
+    require_free(comparison, overwrite)
+    if comparison.downstream is not None:
+        require_precision(comparison.downstream.train.precision)
+    comparing = _Comparison(comparison)
+    claim(comparison, overwrite)
+    return comparing.table()
 
 
 class _Comparison:
     def __init__(self, settings: Comparison) -> None:
-        self.settings, self.folder = settings, Path(settings.out) / settings.name
+        self.settings, self.folder = settings, run_folder(settings)
         self.pairs = list(open_pairs(settings.data, split="train"))
         if len(self.pairs) < 2:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")

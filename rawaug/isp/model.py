@@ -114,11 +114,6 @@ class DictionaryISP(ReverseISP):
         for stage in self.ordered_stages:
             stage.config = config
 
-    @property
-    def encoders_in_use(self) -> bool:
-        """Whether the encoders look at the picture."""
-        return self.config.encoders
-
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
         """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
 

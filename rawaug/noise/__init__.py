@@ -7,6 +7,7 @@ from rawaug.noise.estimate import NoiseEstimate, NoisePoints, estimate_noise
 from rawaug.noise.figure import plot_noise
 from rawaug.noise.iso import EldLevels, PmridLevels, SiddLevels
 from rawaug.noise.levels import FixedLevels, NoiseLevels, Preset
+from rawaug.noise.measured import IsoLevel, MeasuredLevels, MeasuredNoise, camera_law
 from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import BlackOffset, ColourBias, DefectPixels, Quantisation, RowNoise, TukeyLambdaNoise
 
@@ -19,6 +20,9 @@ __all__ = [
     "EldLevels",
     "EldNoise",
     "FixedLevels",
+    "IsoLevel",
+    "MeasuredLevels",
+    "MeasuredNoise",
     "NoiseEstimate",
     "NoiseLevels",
     "NoiseModel",
@@ -35,6 +39,7 @@ __all__ = [
     "ShotReadNoise",
     "SiddLevels",
     "TukeyLambdaNoise",
+    "camera_law",
     "camera_names",
     "estimate_noise",
     "from_dark_frames",

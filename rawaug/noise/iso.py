@@ -38,6 +38,21 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
     return float(low), float(high)
 
 
+def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
+    """(shot_var, read_var), each ``(B,)`` float32, at ISO values ``(B,)`` within a table of two rows or more.
+
+    Args:
+        table: logarithms of ISO, shot_var and read_var, ``(3, N)`` float64, the ISO values ascending.
+        iso: where to read it, linearly in the logarithms.
+    """
+    x, shot, read = table
+    at = iso.log().double()
+    right = torch.bucketize(at, x).clamp(1, len(x) - 1)
+    t = (at - x[right - 1]) / (x[right] - x[right - 1])
+    shot_var, read_var = (torch.exp(torch.lerp(y[right - 1], y[right], t)).float() for y in (shot, read))
+    return shot_var, read_var
+
+
 class SiddLevels:
     """One of SIDD's phones: interpolated in the logarithms of ISO and variance between the tabulated ISOs.
 
@@ -54,12 +69,7 @@ class SiddLevels:
         self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        x, shot, read = self.table.to(generator.device)
-        at = log_uniform(self.iso, batch, generator).log().double()
-        right = torch.bucketize(at, x).clamp(1, len(x) - 1)
-        t = (at - x[right - 1]) / (x[right] - x[right - 1])
-        shot_var, read_var = (torch.exp(torch.lerp(y[right - 1], y[right], t)).float() for y in (shot, read))
-        return shot_var, read_var
+        return interpolated(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
 
 
 class PmridLevels:

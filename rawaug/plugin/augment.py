@@ -30,7 +30,7 @@ from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.eager import eager
-from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
@@ -292,7 +292,7 @@ def _float32(like: Tensor) -> torch.autocast:
 
 
 def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` are the levels in its file.
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` is the law in its file, at any measured ISO.
 
     Raises:
         ValueError: if none were measured, or the name is unknown.
@@ -301,4 +301,4 @@ def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
         return noise_model(noise)
     if "noise" not in isp.info:
         raise ValueError('noise "camera": this ISP was fitted without measuring noise; fit it again or use a preset')
-    return noise_model((isp.info["noise"]["shot_var"], isp.info["noise"]["read_var"]))
+    return ShotReadNoise(camera_law(isp.info["noise"]))

@@ -7,7 +7,6 @@ weights. Lightning Fabric places model and data: the same code on a CPU, one GPU
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Sequence
@@ -73,7 +72,6 @@ def train(
     loader = _batches(stream, start, config, fabric)
     journal = Journal(folder, start) if fabric.is_global_zero else None
     began, shown = time.perf_counter(), journal is not None
-
     bar = progress(loader, label=label, unit="step", total=config.steps, initial=start, leave=True, shown=shown)
     for step, batch in enumerate(bar, start=start + 1):
         sample = type(batch)(*(x.to(fabric.device, memory_format=state.layout) for x in batch))
@@ -89,14 +87,13 @@ def train(
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
+                journal.show(step, config.steps, estimator.corrected(state.averaged), validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt")
     if journal is not None:
         journal.close()
-    if not math.isfinite(state.best["psnr"]):
-        raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
-    return estimator.corrected(state.kept()).eval()
+    return estimator.corrected(state.kept(label)).eval()
 
 
 def _batches(stream: TrainingStream, start: int, config: TrainConfig, fabric: Any) -> DataLoader[Any]:

@@ -7,7 +7,7 @@ and what an estimator adds change from step to step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
-from rawaug.noise import ShotReadModel
+from rawaug.noise import ShotReadModel, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided, to_rgb_tensor
 from rawaug.seeding import keyed_generator
@@ -50,30 +50,37 @@ class NoisyFrame(NamedTuple):
 def noisy_only(pair: Pair) -> Pair:
     """The pair without anything derived from a clean frame.
 
-    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` its development (bilinear demosaic, the
-    camera's white balance and matrix, the sRGB curve). A pair without one is a RAW file as shot: it is noisy itself.
+    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` the camera's picture of it, or else its
+    development (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair without one is a RAW
+    file as shot: it is noisy itself.
     """
     if pair.noisy is None:
         return pair
+    if pair.noisy_srgb is not None:
+        return replace(pair, raw=pair.noisy, srgb=pair.noisy_srgb)
     srgb = develop_packed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
     return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
 
 
-def noisy_frame(pair: Pair, camera: dict[str, float] | None) -> NoisyFrame:
+def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
     """A real noisy frame.
 
     Args:
         pair: as :func:`noisy_only` leaves it.
-        camera: measured ``shot_var`` and ``read_var``, for pairs without levels of their own.
+        camera: the noise law of the camera as its ISP's file holds it, for pairs without levels of their own.
 
     Raises:
-        ValueError: if the levels are unknown.
+        ValueError: if the levels are unknown, or the law does not reach the pair's ISO.
     """
     if pair.shot_var is not None and pair.read_var is not None:
         return NoisyFrame(pair.name, pair.raw, pair.shot_var, pair.read_var, pair.cfa)
     if camera is None:
         raise ValueError(f'{pair.name}: has no noise levels; measure them with noise: "camera"')
-    return NoisyFrame(pair.name, pair.raw, camera["shot_var"], camera["read_var"], pair.cfa)
+    try:
+        shot_var, read_var = camera_law(camera).at(pair.iso)
+    except ValueError as error:
+        raise ValueError(f"{pair.name}: {error}") from None
+    return NoisyFrame(pair.name, pair.raw, shot_var, read_var, pair.cfa)
 
 
 class FrozenPictures(Sequence[NoisyFrame]):

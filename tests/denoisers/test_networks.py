@@ -1,5 +1,6 @@
 """The contract that every network keeps: shapes, identity before training, errors, dtypes, export."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -120,10 +121,12 @@ def test_channels_last_and_bf16_agree_with_the_plain_run(make: Make) -> None:
     assert (half - plain).abs().mean() < 0.05 * correction
 
 
-def test_export_gives_the_same_numbers(make: Make) -> None:
+def test_an_exported_program_is_saved_and_gives_the_same_numbers(make: Make) -> None:
     model, (noisy, variance) = awake(make()), pair(1, 4, 36, 40)
-    exported = torch.export.export(model, (noisy, variance)).module()
-    torch.testing.assert_close(exported(noisy, variance), model(noisy, variance))
+    file = io.BytesIO()
+    torch.export.save(torch.export.export(model, (noisy, variance)), file)
+    loaded = torch.export.load(file).module()
+    torch.testing.assert_close(loaded(noisy, variance), model(noisy, variance))
 
 
 def test_export_with_sides_of_any_multiple_of_the_stride() -> None:
@@ -158,6 +161,18 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="domain 'log' is unknown; use one of linear, ksigma, anscombe"):
         make(domain="log")
+
+
+@torch.no_grad()
+def test_dhdn_s_lowest_level_and_what_it_started_from_go_up_together() -> None:
+    """Concatenated as at every other level: C features that were kept beside C that were worked on."""
+    net = awake(DHDN(width=4))
+    seen: dict[str, Tensor] = {}
+    net.encoder[-1].register_forward_hook(lambda _, given, made: seen.update(started=given[0], worked=made))
+    net.up[0].register_forward_pre_hook(lambda _, given: seen.update(up=given[0]))
+    net(*pair(1, 4, 16, 16))
+    assert not torch.equal(seen["started"], seen["worked"])
+    assert torch.equal(seen["up"], torch.cat([seen["worked"], seen["started"]], dim=1))
 
 
 def size(model: Denoiser) -> int:

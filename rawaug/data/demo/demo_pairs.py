@@ -83,11 +83,8 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
     """
     if count < 1:
         raise ValueError(f"demo: count must be at least 1, got {count}")
-    photographs = [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
-    leaves = (
-        dead_leaves(*FRAME, photographs, keyed_generator(seed, "demo pictures", k))
-        for k in range(count - len(photographs))
-    )
+    photographs = _users_photographs()
+    leaves = (_leaves(k, seed) for k in range(count - len(photographs)))
     return [*photographs[:count], *leaves]
 
 
@@ -109,6 +106,16 @@ def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
     return demo_pictures()
 
 
+def _users_photographs() -> list[Tensor]:
+    return [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
+
+
+@cache
+def _leaves(k: int, seed: int) -> Tensor:
+    return dead_leaves(*FRAME, _users_photographs(), keyed_generator(seed, "demo pictures", k))
+
+
+@cache
 def _pair(split: str, k: int, seed: int) -> Pair:
     photographs = _photographs(split)
     scenes = list(photographs) if split == "train" else [*photographs, "leaves"]

@@ -67,6 +67,7 @@ class Shot(NamedTuple):
     white_balance: tuple[float, float, float]
     srgb: Tensor
     raw: Tensor
+    registered: bool
 
 
 class PixelSamples(NamedTuple):
@@ -107,7 +108,8 @@ def sample_pixels(
         noisy: take the captured noisy RAW (and never the clean one).
 
     Raises:
-        ValueError: if there is no pair, or a noisy RAW is asked for and absent.
+        ValueError: if there is no pair, one's colours are unknown, or a noisy RAW is asked for and
+            absent.
     """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
@@ -132,7 +134,7 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
     small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
-    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw)
+    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw, pair.registered)
     return drawn, shot
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +12,23 @@ import numpy as np
 import pytest
 import torch
 
+from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.commands.camera_noise import measure_camera_noise
+from rawaug.commands.denoise import levels_of, stored_noise
 from rawaug.commands.fit import fit
 from rawaug.data.pair import Pair
-from rawaug.noise import NoiseEstimate, estimate_noise, noise_model
+from rawaug.io import RawFrame
+from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
+from rawaug.plugin.augment import noise_for
+from rawaug.training.noisy_frames import noisy_frame
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
 TINY: dict[str, Any] = {"steps": 1, "curve_steps": 1, "pixels": 256}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def noisy_pair() -> Pair:
     """Patches of many greys, as a colour chart has, at known levels."""
     generator = torch.Generator().manual_seed(0)
@@ -38,8 +44,9 @@ def noisy_pair() -> Pair:
 
 def test_the_capture_is_measured_and_stored(noisy_pair: Pair, tmp_path: Path) -> None:
     isp = fit([noisy_pair], progress=False, noise_figure=tmp_path / "noise.png", curve_steps=2, steps=2, pixels=512)
-    assert isp.info["noise"]["shot_var"] == pytest.approx(SHOT_VAR, rel=0.1)
-    assert isp.info["noise"]["r2"] > 0.9
+    (level,) = camera_law(isp.info["noise"]).levels
+    assert level.iso is None and level.shot_var == pytest.approx(SHOT_VAR, rel=0.1)
+    assert level.r2 is not None and level.r2 > 0.9
     assert (tmp_path / "noise.png").stat().st_size > 10_000
 
 
@@ -47,9 +54,9 @@ def test_dark_frames_set_the_read_variance(noisy_pair: Pair, tmp_path: Path, bay
     rng = np.random.default_rng(0)
     dark = rng.normal(512, READ_VAR**0.5 * (16383 - 512), (128, 128)).round().astype(np.uint16)
     bayer_dng(tmp_path / "dark.dng", dark, cfa="GRBG", black=(512,), white=16383)
-    estimate = measure_camera_noise([noisy_pair], dark=tmp_path)
-    assert estimate.read_var == pytest.approx(READ_VAR, rel=0.03)
-    assert estimate.shot_var == pytest.approx(SHOT_VAR, rel=0.1)
+    shot_var, read_var = measure_camera_noise([noisy_pair], dark=tmp_path).law.at(None)
+    assert read_var == pytest.approx(READ_VAR, rel=0.03)
+    assert shot_var == pytest.approx(SHOT_VAR, rel=0.1)
 
 
 def with_variance(pair: Pair, shot_var: float, read_var: float, seed: int = 1) -> Pair:
@@ -94,7 +101,67 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
     monkeypatch.setattr("rawaug.commands.camera_noise.estimate_noise", estimate)
     if accepted:
-        assert measure_camera_noise([noisy_pair]).shot_var == shot_var
+        assert measure_camera_noise([noisy_pair]).law.at(None)[0] == shot_var
     else:
         with pytest.raises(ValueError, match=f"R\\^2 {r2:.2f}"):
             measure_camera_noise([noisy_pair])
+
+
+def at_iso(pair: Pair, iso: float | None, shot_var: float, camera: str = "Maker Model") -> Pair:
+    return replace(with_variance(pair, shot_var, shot_var / 25), iso=iso, camera=camera)
+
+
+def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_path: Path) -> None:
+    pairs = [at_iso(noisy_pair, 400, 8e-4), at_iso(noisy_pair, 100, 2e-4)]
+    isp = fit(pairs, progress=False, noise="on", noise_figure=tmp_path / "noise.png", **TINY)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["noise-iso100.png", "noise-iso400.png"]
+    assert isp.info["rendering"] == "sRGB of the pairs (2 of 2)"
+    shot_var = noise_for(isp, "camera").sample(200, torch.Generator().manual_seed(0))["shot_var"]
+    assert 1.7e-4 < float(shot_var.min()) < 2.4e-4 and 6.5e-4 < float(shot_var.max()) < 9e-4
+    law = camera_law(json.loads(json.dumps(isp.info))["noise"])
+    assert law.camera == "Maker Model" and law.limits == (100, 400)
+    assert law.at(200)[0] == pytest.approx((law.at(100)[0] * law.at(400)[0]) ** 0.5, rel=1e-4)
+    with pytest.raises(ValueError, match="ISO 800 is outside the measured range of Maker Model, 100 to 400"):
+        law.at(800)
+    with pytest.raises(ValueError, match="depends on the ISO, which the file does not say"):
+        law.at(None)
+    frame = noisy_frame(replace(pairs[1], noisy=None), isp.info["noise"])
+    assert (frame.shot_var, frame.read_var) == law.at(100)
+
+
+def test_two_cameras_are_not_pooled(noisy_pair: Pair) -> None:
+    pairs = [at_iso(noisy_pair, 100, 2e-4), at_iso(noisy_pair, 100, 2e-4, "Other 2")]
+    with pytest.raises(ValueError, match=r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera by itself"):
+        measure_camera_noise(pairs)
+
+
+def test_frames_without_an_iso_are_not_mixed_with_others(noisy_pair: Pair) -> None:
+    with pytest.raises(ValueError, match="1 of 2 frames have no ISO"):
+        measure_camera_noise([at_iso(noisy_pair, 100, 2e-4), at_iso(noisy_pair, None, 2e-4)])
+
+
+def test_a_file_of_version_0_1_has_one_level_for_every_iso() -> None:
+    law = camera_law({"shot_var": 1e-3, "read_var": 1e-5, "r2": 0.9})
+    assert law.at(None) == law.at(1600) == (1e-3, 1e-5)
+    with pytest.raises(ValueError, match="noise law of a camera"):
+        camera_law({"name": "upi"})
+    with pytest.raises(ValueError, match="levels of different ISO values"):
+        MeasuredLevels([IsoLevel(100, 1e-3, 0.0), IsoLevel(100, 1e-3, 0.0)])
+
+
+def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path) -> None:
+    law = MeasuredLevels([IsoLevel(100, 2e-4, 1e-6), IsoLevel(400, 8e-4, 1e-5)], "Maker Model")
+    weights = tmp_path / "small.safetensors"
+    save(build("PMRID", width=4, variance_map=True), weights, {"cfa": "RGGB", "noise": law.spec()})
+    stored = stored_noise("camera", weights)
+    frame = RawFrame(
+        noisy_pair.raw, CFA.GRBG, (0.0, 0.0, 0.0, 0.0), 4095.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), torch.eye(3),
+        camera="Maker Model", iso=400, noise_profile=None, orientation=0, name="a",
+    )  # fmt: skip
+    assert levels_of(frame, stored) == (8e-4, 1e-5, "camera")
+    with pytest.raises(ValueError, match="a: is from Other, but the noise law is of Maker Model"):
+        levels_of(replace(frame, camera="Other"), stored)
+    with pytest.raises(ValueError, match=r"a: ISO 800 is outside the measured range .*pass --noise estimate"):
+        levels_of(replace(frame, iso=800), stored)
+    with pytest.raises(ValueError, match="rawaug-small: holds no camera's noise law"):
+        stored_noise("camera", "rawaug-small")

@@ -9,7 +9,8 @@ import torch
 
 import denoisers
 from rawaug.cli import main
-from rawaug.commands.export import export, session_of
+from rawaug.commands.export import export
+from rawaug.commands.onnx_files import session_of
 
 
 @pytest.fixture
@@ -39,9 +40,9 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
 
 
 def test_what_is_missing_is_said_in_one_line(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.commands.export.find_spec", lambda name: None)
+    monkeypatch.setattr("rawaug.commands.onnx_files.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"export needs onnx, onnxscript, onnxruntime: pip install 'rawaug\[export\]'"):
         export(weights, tmp_path / "a.onnx")
-    monkeypatch.setattr("rawaug.commands.export.find_spec", lambda name: True)
+    monkeypatch.setattr("rawaug.commands.onnx_files.find_spec", lambda name: True)
     with pytest.raises(ValueError, match=r"ends in \.onnx"):
         export(weights, tmp_path / "a.pt")

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import denoisers
+from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands.evaluate import evaluate
-from rawaug.data import demo_pairs
+from rawaug.data import Pair, demo_pairs
+from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import (
     Score,
     classical_method,
     compared,
+    denoise,
     frozen_levels,
     frozen_sample,
+    installed_classical,
+    require_classical,
     score_method,
     summary,
 )
@@ -39,9 +46,21 @@ def identity(tmp_path: Path) -> Path:
     return path
 
 
+def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
+    """A test must not know the clean frame, not even through its noise map."""
+    captured = demo_pairs("test", count=1)[0]
+    assert captured.shot_var is not None and captured.read_var is not None
+    drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
+    for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
+        sample = frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=0)
+        assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
+        expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
+        torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
+
+
 def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> None:
-    result = evaluate(identity, "demo:test")
-    assert result["kind"] == "denoiser" and len(result["images"]) == 9
+    result = evaluate(identity, "demo:validation")
+    assert result["kind"] == "denoiser" and len(result["images"]) == 4
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
@@ -49,7 +68,9 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> Non
     assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
-    again = evaluate(identity, "demo:test", self_ensemble=True)
+    early: list[dict[str, Any]] = []
+    again = evaluate(identity, "demo:validation", self_ensemble=True, first=early.append)
+    assert early == [result]  # known before the views are scored
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
@@ -85,9 +106,9 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
 
 
-def test_classical_denoisers_stand_beside_it(identity: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.commands.evaluate.open_pairs", lambda data, split: demo_pairs("test", count=2))
-    result = evaluate(identity, "demo:test", classical=["Wavelet", "TotalVariation"])
+def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) -> None:
+    given.extend(demo_pairs("test", count=2))
+    result = evaluate(identity, "given:", classical=["Wavelet", "TotalVariation"])
     for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
         scores = result["classical"][name]
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
@@ -113,17 +134,43 @@ def test_the_development_is_the_same_for_both(identity: Path) -> None:
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 
 
-def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(identity: Path, tmp_path: Path) -> None:
-    result = evaluate(identity, "demo:validation", self_ensemble=True, report=tmp_path / "new" / "page.html")
+def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
+    identity: Path, tmp_path: Path, given: list[Pair]
+) -> None:
+    given.extend(demo_pairs("validation", count=2))
+    result = evaluate(identity, "given:", self_ensemble=True, report=tmp_path / "new" / "page.html")
     assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
     page = (tmp_path / "new" / "page.html").read_text()
-    assert page.count("<h3>") == 4 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
+    assert page.count("<h3>") == 2 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
 
 
 def test_what_is_for_denoisers_is_refused_for_an_isp(tmp_path: Path) -> None:
     for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
         with pytest.raises(ValueError, match="is an ISP"):
             evaluate("universal-small", "demo:test", **flags)
+
+
+def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0")
+    packed = torch.rand(1, 4, 4, 2000, generator=torch.Generator().manual_seed(0))
+    model = denoisers.build("UNet", width=4, scales=2)
+    assert torch.equal(denoise(model, Sample(packed, packed, packed), CFA.GRBG, False), packed)
+    assert capsys.readouterr().err.startswith("frame: 1/2 tiles, 00:00 elapsed")
+    denoise(model, Sample(*(packed[..., :8] for _ in range(3))), CFA.GRBG, True)
+    assert "view groups, " in capsys.readouterr().err
+
+
+def test_a_filter_whose_library_is_missing_is_refused_and_bm3d_left_out_of_recipes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    with pytest.raises(ValueError, match="classical: BM3D: bm3d is not installed"):
+        require_classical(["Wavelet", "BM3D"])
+    assert installed_classical(["Wavelet", "BM3D"]) == ["Wavelet"]
+    assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    with pytest.raises(ValueError, match=r"classical: NonLocalMeans: skimage is not installed; run: pip install"):
+        installed_classical(["NonLocalMeans"])
 
 
 @pytest.fixture

@@ -81,11 +81,10 @@ def test_an_unregistered_pair_is_compared_over_blocks(known_camera: DictionaryIS
 
 
 @pytest.fixture
-def frames(frame_of: FrameOf, monkeypatch: pytest.MonkeyPatch) -> list[Pair]:
+def frames(frame_of: FrameOf, given: list[Pair]) -> list[Pair]:
     """Three shots, two of them in one light, which the ablation opens."""
-    found = [frame_of("a"), frame_of("b", LAMPS), frame_of("c")]
-    monkeypatch.setattr(ablation, "open_pairs", lambda spec, split: found)
-    return found
+    given.extend([frame_of("a"), frame_of("b", LAMPS), frame_of("c")])
+    return given
 
 
 def test_each_frame_is_measured_by_fits_on_the_others(
@@ -107,7 +106,7 @@ def test_each_frame_is_measured_by_fits_on_the_others(
 
     monkeypatch.setattr(ablation, "fit_isp", fit)
     monkeypatch.setattr(ablation, "stage_psnr", curve)
-    result = ablate(Ablation(data="known", fit=TINY, seed=4, out=str(tmp_path)))
+    result = ablate(Ablation(data="given:", fit=TINY, seed=4, out=str(tmp_path)))
     expected: list[set[str]] = [set(), *({stage} for stage in LEFT_OUT)]
     assert fits == [(others, lacking) for others in ("bc", "ac", "ab") for lacking in expected]
 
@@ -134,10 +133,10 @@ def _reported_in_full(result: dict[str, Any], folder: Path, said: str) -> None:
             assert f"{figure:.2f}" in said
 
 
-def test_one_frame_leaves_none_to_fit(monkeypatch: pytest.MonkeyPatch, frame_of: FrameOf) -> None:
-    monkeypatch.setattr(ablation, "open_pairs", lambda spec, split: [frame_of("a")])
-    with pytest.raises(ValueError, match="data: lonely has 1 frame; leave-one-out needs two or more"):
-        ablate(Ablation(data="lonely"))
+def test_one_frame_leaves_none_to_fit(given: list[Pair], frame_of: FrameOf) -> None:
+    given.append(frame_of("a"))
+    with pytest.raises(ValueError, match="data: given: has 1 frame; leave-one-out needs two or more"):
+        ablate(Ablation(data="given:"))
 
 
 def test_the_smoke_form_keeps_what_is_fitted() -> None:

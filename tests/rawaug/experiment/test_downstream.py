@@ -25,7 +25,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 
 SILENT = noise_model((0.0, 0.0))
-TINY = DownstreamConfig().smoke()
+TINY = replace(DownstreamConfig().smoke(), test=["given:"])
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -85,7 +85,7 @@ def test_noise_is_clipped_at_white_but_not_at_black() -> None:
 
 
 @pytest.fixture
-def scores(monkeypatch: pytest.MonkeyPatch, frame_of: Callable[..., Pair]) -> list[list[Pair]]:
+def scores(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callable[..., Pair]) -> list[list[Pair]]:
     """The test frames of each call of :func:`psnr_d`, two small ones; one is measured whole and one in part."""
     seen: list[list[Pair]] = []
 
@@ -93,8 +93,7 @@ def scores(monkeypatch: pytest.MonkeyPatch, frame_of: Callable[..., Pair]) -> li
         seen.append(frames)
         return score_denoiser(net, frames, *rest)
 
-    frames = [frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))]
-    monkeypatch.setattr(downstream, "open_pairs", lambda spec, split: frames)
+    given.extend([frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))])
     monkeypatch.setattr(downstream, "score_denoiser", score)
     return seen
 

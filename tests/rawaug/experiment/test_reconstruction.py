@@ -30,6 +30,7 @@ class Laboratory:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.frames = 8
+        self.pairs: list[Pair] = []
         self.folds: list[tuple[str, str, tuple[float, int, int], int]] = []
         self.wholes: list[tuple[str, int]] = []
         self.denoisers: list[Path] = []
@@ -39,6 +40,8 @@ class Laboratory:
             monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
     def open_pairs(self, spec: str, split: str) -> list[Pair]:
+        if self.pairs:
+            return self.pairs
         srgb, raw = torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2)
         return [Pair(f"f{k}", srgb, raw, CFA.RGGB, (1.0, 1.0, 1.0), torch.eye(3)) for k in range(self.frames)]
 
@@ -173,9 +176,7 @@ def test_files_of_other_settings_are_not_used(
         assert not before[2] & later
 
 
-def test_frames_that_cannot_make_a_table_are_refused(
-    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_cannot_make_a_table_are_refused(laboratory: Laboratory, tmp_path: Path) -> None:
     laboratory.frames = 1
     with pytest.raises(ValueError, match="data: known has 1 frame; leave-one-out needs two"):
         compare(settings(tmp_path))
@@ -186,21 +187,25 @@ def test_frames_that_cannot_make_a_table_are_refused(
         (replace(pairs[1], cfa=CFA.BGGR), "f1 has a different CFA"),
         (replace(pairs[1], name="f0"), "several frames are named f0"),
     ):
-        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split, odd=odd: [pairs[0], odd, pairs[2]])
+        laboratory.pairs = [pairs[0], odd, pairs[2]]
         with pytest.raises(ValueError, match=message):
             compare(settings(tmp_path, methods=["unet"]))
     assert laboratory.folds == []
 
 
+class Blocks(Laboratory):
+    """Scores over blocks, whose speed is not measured."""
+
+    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        return {"rows": {"blind": 40.0}, "mpix_s": None}
+
+
 def test_blocks_of_unregistered_frames_make_a_table_of_pointwise_methods(
-    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    laboratory = Blocks(monkeypatch)
     laboratory.frames = 3
-    pairs = [replace(pair, registered=False) for pair in laboratory.open_pairs("", "")]
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: pairs)
-    monkeypatch.setattr(
-        reconstruction, "score_rows", lambda fitted, pair, patches: {"rows": {"blind": 40.0}, "mpix_s": None}
-    )
+    laboratory.pairs = [replace(pair, registered=False) for pair in laboratory.open_pairs("", "")]
     rows = compare(settings(tmp_path, methods=["dictionary"]))
     assert rows["dictionary"]["psnr_r"][0] == 40.0 and rows["dictionary"]["mpix_s"] is None
 
@@ -208,23 +213,23 @@ def test_blocks_of_unregistered_frames_make_a_table_of_pointwise_methods(
 def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
     frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    laboratory = Laboratory(monkeypatch)
-    laboratory.frames = 2
-    clean = [frame_of(f"f{k}") for k in range(2)]
     seen: list[tuple[Pair, bool]] = []
     scored: list[Pair] = []
 
-    def fit(family: str, pairs: Sequence[Pair], config: FitConfig, budget: Any, seed: int) -> Any:
-        seen.extend((pair, config.noisy) for pair in pairs)
-        return laboratory.fit_family(family, pairs, config, budget, seed)
+    class Watching(Laboratory):
+        def fit_family(
+            self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
+        ) -> Any:
+            seen.extend((pair, fit.noisy) for pair in pairs)
+            return super().fit_family(family, pairs, fit, budget, seed)
 
-    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        scored.append(pair)
-        return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+            scored.append(pair)
+            return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
 
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: clean)
-    monkeypatch.setattr(reconstruction, "fit_family", fit)
-    monkeypatch.setattr(reconstruction, "score_rows", score)
+    laboratory = Watching(monkeypatch)
+    laboratory.frames = 2
+    clean = laboratory.pairs = [frame_of(f"f{k}") for k in range(2)]
     compare(settings(tmp_path, methods=["dictionary"], noise="cycleisp_sidd"))
     assert all(noisy for _, noisy in seen)
     for pair, _ in seen:
@@ -254,32 +259,40 @@ def test_the_smoke_form_keeps_what_is_quick() -> None:
     assert smoke_comparison(Comparison(methods=["unet"])).methods == ["dictionary"]
 
 
+class Fitting(Laboratory):
+    """Fits for real without one frame; by its name, all tensors of the camera."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__(monkeypatch)
+        self.found: dict[str, dict[str, torch.Tensor]] = {}
+
+    def fit_family(
+        self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
+    ) -> Any:
+        left_out = {"a", "b", "c"} - {pair.name for pair in pairs}
+        if not left_out:
+            return SimpleNamespace(model=None)
+        fitted = methods.fit_family(family, pairs, fit, budget, seed)
+        self.found[left_out.pop()] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
+        return fitted
+
+    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
+
+
 def test_a_fit_never_sees_the_frame_that_is_left_out(
     frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
-    monkeypatch.setattr(reconstruction, "open_pictures", lambda spec, min_side: [])
-    monkeypatch.setattr(reconstruction, "mosaic_only_psnr", lambda pictures, cfa: 0.0)
-    monkeypatch.setattr(reconstruction._Comparison, "_whole", lambda self, family: {})
     frames = [frame_of(name) for name in "abc"]
     noise = torch.rand(1, 256, 256, generator=torch.Generator().manual_seed(0))
     poisoned = replace(frames[0], srgb=(255 * noise).byte().expand(3, -1, -1), raw=noise, white_balance=(9.0, 1.0, 9.0))
 
     def cameras(first: Pair, family: str) -> dict[str, dict[str, torch.Tensor]]:
-        """By the frame that was left out, all tensors of the camera that was fitted."""
-        found = {}
-
-        def fit(name: str, pairs: Sequence[Pair], *rest: Any) -> Any:
-            fitted = methods.fit_family(name, pairs, *rest)
-            (left_out,) = {"a", "b", "c"} - {pair.name for pair in pairs}
-            found[left_out] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
-            return fitted
-
-        monkeypatch.setattr(reconstruction, "fit_family", fit)
-        monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: [first, *frames[1:]])
+        laboratory = Fitting(monkeypatch)
+        laboratory.pairs = [first, *frames[1:]]
         folder = tmp_path / str(first is poisoned)
         compare(settings(folder, methods=[family], seeds=1, patches=1, fit=TINY))
-        return found
+        return laboratory.found
 
     for family in ("dictionary", "upi-tuned"):
         clean, other = cameras(frames[0], family), cameras(poisoned, family)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ BITS, BLACK = 12, 256
 ROUNDING = (1 / (2**BITS - 1 - BLACK)) ** 2 / 12
 
 
+@cache
 def scene(seed: int, size: int = 1024, texture: float = 0.3) -> Tensor:
     """Clean packed RAW ``(1, 4, size/2, size/2)``: patches from near black to beyond white, with 1/f texture on half of
     them, fine gratings on some, a slow gradient over all; some 7 % is clipped."""
@@ -58,7 +60,7 @@ def shoot(clean: Tensor, shot: float, read: float, seed: int, **switches: float)
 
 
 @pytest.mark.parametrize(("shot", "read"), [(1e-3, 1e-5), (3e-4, 3e-6)])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_textured_and_clipped_frames_give_both_levels_within_5_percent(shot: float, read: float, seed: int) -> None:
     clean = scene(seed)
     assert (clean == 1).float().mean() > 0.03

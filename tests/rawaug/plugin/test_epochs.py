@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ LOADERS: list[dict[str, Any]] = [
     {"num_workers": 1, "batch_size": 4, "multiprocessing_context": "fork"},
     {"num_workers": 2, "batch_size": 1, "multiprocessing_context": "fork"},
     {"num_workers": 2, "batch_size": 1, "multiprocessing_context": "fork", "persistent_workers": True},
-    {"num_workers": 1, "batch_size": 3, "multiprocessing_context": "spawn"},
+    {"num_workers": 1, "batch_size": 3, "multiprocessing_context": "forkserver"},
     {"num_workers": 1, "batch_size": 3, "multiprocessing_context": "forkserver", "persistent_workers": True},
 ]
 
@@ -83,7 +83,7 @@ def test_every_pass_is_the_next_epoch(
         assert torch.equal(one_pass(loader), expected)
 
 
-@pytest.mark.parametrize("settings", [s for s in LOADERS if s.get("multiprocessing_context") != "spawn"], ids=named)
+@pytest.mark.parametrize("settings", LOADERS, ids=named)
 def test_every_pass_of_a_stream_is_the_next_epoch(
     augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any]
 ) -> None:
@@ -172,11 +172,9 @@ def test_a_copy_counts_for_itself_and_its_workers(
     assert torch.equal(one_pass(DataLoader(pairs)), epochs[0])
 
 
-def test_processes_draw_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_draw_apart(as_rank: Callable[[int, int], None], monkeypatch: pytest.MonkeyPatch) -> None:
     visits = Visits(2)
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    as_rank(1, 2)
     assert visits.key(0) == (0, 0, 1)
     assert visits.state_dict()["visits"].tolist() == [1, 1]  # of two pictures in two processes, a pass each
     state = pickle.dumps(visits)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -156,14 +156,12 @@ def test_a_batch_of_grey_pictures_is_no_colour_picture(augment: RawAugment, batc
 
 
 def test_processes_of_a_distributed_run_draw_apart(
-    augment: RawAugment, srgb: Tensor, monkeypatch: pytest.MonkeyPatch
+    augment: RawAugment, srgb: Tensor, as_rank: Callable[[int, int], None]
 ) -> None:
     (alone,) = wrap([srgb], augment)
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
     drawn: list[RawPair] = []
     for rank in range(3):
-        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        as_rank(rank, 3)
         drawn += wrap([srgb], augment)
         drawn.append(RawAugment(augment.isp, seed=1)(srgb))
     assert torch.equal(drawn[0].noisy, alone.noisy)

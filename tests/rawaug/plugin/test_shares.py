@@ -129,7 +129,7 @@ def test_two_nodes_read_every_sample_of_the_shards_once(augment: RawAugment, tmp
 
 
 @pytest.mark.parametrize("chosen", ["sampler", "batch sampler", "replacement", "no loader"])
-def test_a_chosen_order_is_left_alone(augment: RawAugment, monkeypatch: pytest.MonkeyPatch, chosen: str) -> None:
+def test_a_chosen_order_is_left_alone(augment: RawAugment, as_rank: Callable[[int, int], None], chosen: str) -> None:
     shown: Any = pictures()
     loaders: dict[str, Any] = {
         "sampler": DataLoader(shown, sampler=DistributedSampler(shown, num_replicas=2, rank=0)),
@@ -137,7 +137,5 @@ def test_a_chosen_order_is_left_alone(augment: RawAugment, monkeypatch: pytest.M
         "replacement": DataLoader(shown, sampler=RandomSampler(shown, replacement=True, num_samples=3)),
         "no loader": [torch.stack(shown)],
     }
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 0)
+    as_rank(0, 2)
     assert wrap(loaders[chosen], augment).share is loaders[chosen]

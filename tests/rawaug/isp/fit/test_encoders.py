@@ -45,7 +45,7 @@ def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> li
 def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
     pairs = frames(exact_pair, 4, informative=True)
     isp = fit_isp(pairs, config("on"), progress=False)
-    assert isp.encoders_in_use and isp.config.encoders
+    assert isp.config.encoders
     dark, bright = (isp.choose(pairs[k].srgb[None]).gains[0] for k in (0, 2))
     assert dark[0] < bright[0] - 0.01 and dark[2] > bright[2] + 0.01
     theirs = isp.choose_forward(torch.rand(1, 3, 8, 8)).gain_weights
@@ -54,18 +54,18 @@ def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
 
 def test_auto_leaves_the_constants_to_few_frames(exact_pair: Callable[..., Pair]) -> None:
     isp = fit_isp(frames(exact_pair, 4, informative=True), config("auto"), progress=False)
-    assert not isp.encoders_in_use and "encoders_gain_db" not in isp.info
+    assert not isp.config.encoders and "encoders_gain_db" not in isp.info
 
 
 def test_auto_keeps_them_where_the_picture_shows_the_light(exact_pair: Callable[..., Pair]) -> None:
     isp = fit_isp(frames(exact_pair, 12, informative=True), config("auto"), progress=False)
-    assert isp.encoders_in_use and isp.info["encoders_gain_db"] > 1.0
+    assert isp.config.encoders and isp.info["encoders_gain_db"] > 1.0
 
 
 def test_auto_drops_them_where_it_does_not(exact_pair: Callable[..., Pair]) -> None:
     pairs = frames(exact_pair, 12, informative=False)
     isp = fit_isp(pairs, config("auto"), progress=False)
-    assert not isp.encoders_in_use and isp.info["encoders_gain_db"] < -0.2
+    assert not isp.config.encoders and isp.info["encoders_gain_db"] < -0.2
     off = fit_isp(pairs, config("off"), progress=False)
     assert all(torch.equal(value, off.state_dict()[key]) for key, value in isp.state_dict().items())
 

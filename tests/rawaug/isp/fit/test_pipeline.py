@@ -45,7 +45,7 @@ def test_the_forward_pass_renders_the_picture(exact_pair: Callable[..., Pair]) -
 
 
 def test_the_isp_records_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
-    assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0}
+    assert fitted.info == {"frames": ["shot0", "shot1", "shot2"], "steps": 60, "seed": 0, "registered": 3}
     assert str(fitted.cfa) == "GRBG" and not fitted.training
 
 
