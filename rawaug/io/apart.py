@@ -26,6 +26,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import warnings
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -63,11 +64,9 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
         4
     """
     seconds = time_limit()
-    if not seconds:
-        return read(*arguments)
-    helper: _Helper | None = getattr(_of_this_thread, "helper", None)
+    helper = _helper() if seconds else None
     if helper is None:
-        helper = _of_this_thread.helper = _Helper(_connected())
+        return read(*arguments)
     try:
         known, value = helper.call((read, arguments), seconds)
     except _Lost as lost:
@@ -80,6 +79,19 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
     if not known:
         raise value
     return value  # type: ignore[no-any-return]
+
+
+def _helper() -> _Helper | None:
+    """The helper of this thread; none, with a warning, where the system has no room for one."""
+    global _unavailable
+    found: _Helper | None = getattr(_of_this_thread, "helper", None)
+    if found is None and not _unavailable:
+        try:
+            found = _of_this_thread.helper = _Helper(_connected())
+        except (OSError, RuntimeError) as error:
+            _unavailable = True
+            warnings.warn(f"files are read in this process, which a damaged one may end: {error}", stacklevel=4)
+    return found
 
 
 def time_limit() -> float:
@@ -101,7 +113,8 @@ def time_limit() -> float:
 def prepare() -> None:
     """Start the process that helpers come from, without waiting for it, for the workers that this one will have."""
     if time_limit() and _address() is None:
-        _start()
+        with suppress(OSError):  # whoever reads will say so
+            _start()
 
 
 class _Lost(Exception):
@@ -117,7 +130,7 @@ class _Helper:
             message, (descriptor,), *_ = socket.recv_fds(link, 64, 1)
         except (OSError, ValueError):
             link.close()
-            raise RuntimeError("the process that reads files did not start; RAWAUG_READ_SECONDS=0 reads here") from None
+            raise RuntimeError("the process that helpers come from did not start") from None
         link.settimeout(None)
         self.pid, self.memory = int(message), descriptor
         self.view: mmap.mmap | None = None
@@ -198,6 +211,7 @@ def _ending(status: int) -> str:
 
 _of_this_thread = threading.local()
 _starting = threading.Lock()
+_unavailable = False
 
 
 def _address() -> str | None:
@@ -215,7 +229,7 @@ def _connected() -> socket.socket:
         except (ConnectionError, FileNotFoundError):  # its owner has ended
             link.close()
             os.environ.pop(_ADDRESS, None)
-    raise RuntimeError("the process that reads files cannot be reached; RAWAUG_READ_SECONDS=0 reads here")
+    raise RuntimeError("the process that helpers come from cannot be reached")
 
 
 def _start() -> str:
