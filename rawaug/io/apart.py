@@ -78,7 +78,7 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
         raise
     if not known:
         raise value
-    return value  # type: ignore[no-any-return]
+    return value
 
 
 def _helper() -> _Helper | None:

@@ -17,8 +17,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from rawaug.data import PictureFolder
-from rawaug.io import read_picture, write_picture
 from rawaug.io import apart as reading
+from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import apart, prepare, time_limit
 
 pytestmark = pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
