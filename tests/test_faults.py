@@ -25,7 +25,7 @@ from rawaug.commands import pair_files, pair_maker
 from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
 from rawaug.files import replacing, write_json, write_tensors
-from rawaug.io import RawFrame, write_dng, write_picture
+from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.lock import NAME, locked
 from rawaug.shortages import shortage
 from rawaug.training.state import TrainingState
@@ -225,10 +225,9 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
 ) -> None:
     for k in range(3):
         write_picture(_made(tmp_path / "in") / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
-    read = pair_maker.read_picture
 
     def unlucky(path: Path, *rest: Any) -> Any:
-        picture = read(path, *rest)
+        picture = read_picture(path, *rest)
         if path.name == "1.png":
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture
