@@ -120,7 +120,8 @@ def evaluate(
     if kind == "isp":
         if self_ensemble or views or noise is not None or classical or report is not None:
             raise ValueError(
-                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report apply to denoisers only"
+                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report apply to "
+                "denoisers only"
             )
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")

@@ -227,8 +227,8 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
-    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score that is
-    no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
+    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score that
+    is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
     """
     images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
     result: dict[str, Any] = {"images": images}

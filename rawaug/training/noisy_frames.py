@@ -51,7 +51,8 @@ def noisy_only(pair: Pair) -> Pair:
     """The pair without anything derived from a clean frame.
 
     Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` the camera's picture of it, or else its
-    development (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair without one is a RAW file as shot: it is noisy itself.
+    development (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair without one is a RAW
+    file as shot: it is noisy itself.
     """
     if pair.noisy is None:
         return pair

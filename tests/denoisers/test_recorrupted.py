@@ -47,5 +47,5 @@ def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
     noisy, variance = frame()
     average = Recorrupted(lambda z, _: z, ALPHA, 3)
     assert torch.equal(average(noisy, variance), average(noisy, variance))
-    with pytest.raises(ValueError, match="draws must be at least 1 and alpha positive, got 0 and 0.5"):
+    with pytest.raises(ValueError, match=r"draws must be at least 1 and alpha positive, got 0 and 0\.5"):
         Recorrupted(lambda z, _: z, ALPHA, 0)
