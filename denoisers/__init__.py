@@ -54,9 +54,9 @@ _MODULES = {
 __all__ = [
     "BM3D",
     "DENOISERS",
-    "CycleISPDenoiser",
     "DHDN",
     "PMRID",
+    "CycleISPDenoiser",
     "Denoiser",
     "DnCNN",
     "NAFNet",
