@@ -1,9 +1,9 @@
 """The reconstruction table: every method fitted on the same pairs, measured on frames left out.
 
-PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is that
-of a published split: a method is fitted once to all frames, and scored on every frame of another set. PSNR_d is that of a
-denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
-fit's figures go into a file of their own, so that a stopped run can resume.
+PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
+that of a published split: a method is fitted once to all frames, and scored on every frame of another set.
+PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method
+has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
