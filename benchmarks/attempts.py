@@ -68,9 +68,9 @@ def _set_up(path: Path) -> None:
     from rawaug.training.start import first_network
 
     try:
-        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path))
+        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path), ["run"])[0]
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{key: settings[key] for key in settings.keys() - {"recipe", "smoke"}})
+        recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:

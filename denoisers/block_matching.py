@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from denoisers.classical import Classical, Planes, library
+from denoisers.classical import Classical, Planes
 from rawaug.registry import FILTERS
 
 _HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32)
@@ -19,6 +19,8 @@ class BM3D(Classical):
     """
 
     smallest = 16
+    needs = ("bm3d",)
+    advice = "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'"
 
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`.
@@ -26,6 +28,6 @@ class BM3D(Classical):
         Raises:
             ImportError: if the wheel is not installed.
         """
-        bm3d = library("bm3d", "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'")
+        bm3d = self.library("bm3d")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD

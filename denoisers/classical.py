@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,6 +30,16 @@ class Classical(ABC):
 
     smallest: ClassVar[int] = 2
     """The shortest side, in packed pixels, that the method takes."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Libraries that not every installation has."""
+    advice: ClassVar[str] = "run: pip install 'rawaug[train]'"
+    """What to do where one of them is missing."""
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """The line that says what is not installed; None where everything is."""
+        name = next((name for name in cls.needs if find_spec(name) is None), None)
+        return name and f"{name} is not installed; {cls.advice}"
 
     def __init__(self, strength: float = 1.0) -> None:
         if not strength > 0:
@@ -68,14 +79,12 @@ class Classical(ABC):
         clean = np.ascontiguousarray(self.denoise(planes), np.float32) * np.float32(sigma)
         return torch.from_numpy(clean).permute(2, 0, 1).to(image)
 
+    def library(self, name: str) -> Any:
+        """The library ``name``, one of :attr:`needs` or a module of one.
 
-def library(name: str, advice: str = "run: pip install 'rawaug[train]'") -> Any:
-    """A library that not every installation has.
-
-    Raises:
-        ImportError: in one line, with ``advice``, if it is not installed.
-    """
-    try:
+        Raises:
+            ImportError: in one line if something is not installed.
+        """
+        if (reason := self.missing()) is not None:
+            raise ImportError(reason)
         return import_module(name)
-    except ModuleNotFoundError as error:
-        raise ImportError(f"{error.name} is not installed; {advice}") from None

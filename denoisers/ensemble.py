@@ -11,7 +11,8 @@ et al., "Learning Raw Image Denoising with Bayer Pattern Unification and Bayer P
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -44,6 +45,7 @@ class SelfEnsemble(nn.Module):
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
         cfa: pattern of the mosaics that it will be given.
         views: 4, the flips, or 8, the flips with and without a quarter turn (the full set).
+        each: goes through the groups of views of one shape, and may show how far it is, as ``tqdm`` does.
 
     Views of one shape share a batch. Large pictures: ``SelfEnsemble(partial(tiled, model), cfa)`` tiles every view.
 
@@ -57,13 +59,20 @@ class SelfEnsemble(nn.Module):
         True
     """
 
-    def __init__(self, model: Callable[[Tensor, Tensor | None], Tensor], cfa: bayer.CFA | str, views: int = 8) -> None:
+    def __init__(
+        self,
+        model: Callable[[Tensor, Tensor | None], Tensor],
+        cfa: bayer.CFA | str,
+        views: int = 8,
+        each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+    ) -> None:
         super().__init__()
         if views not in VIEWS:
             raise ValueError(f"views must be 4 (flips) or 8 (flips and quarter turns), got {views}")
         self.model = model
         self.cfa = bayer.CFA(cfa)
         self.views = views
+        self.each = each
         self.stride: int = getattr(model, "stride", 1)
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
@@ -74,7 +83,7 @@ class SelfEnsemble(nn.Module):
             alike[picture.shape].append(view)
         mean = torch.zeros_like(noisy)
         count = 0
-        for views in alike.values():
+        for views in self.each(list(alike.values())):
             batch = torch.cat([turned.pop(view) for view in views])
             noise = None if variance is None else torch.cat([to_view(variance, self.cfa, view) for view in views])
             for view, denoised in zip(views, self.model(batch, noise).chunk(len(views)), strict=True):

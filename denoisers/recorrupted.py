@@ -1,7 +1,7 @@
 r"""R2R's average: ``mean over k of f(y + alpha m_k)``, with ``m_k`` drawn with the noise's own variance.
 
-Domain: packed RAW. A network that was trained on recorrupted frames meets at a test what it knows, and the average
-takes off most of what the added noise costs. Source: Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
+Domain: packed RAW. A network that was trained on recorrupted frames gets the input it knows, and the average removes
+most of what the added noise costs. Source: Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ overlap that is too small. Along each side all tiles have the same size, the sma
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ def tiled(
     variance: Tensor | None = None,
     tile: int = 1536,
     overlap: int = 96,
+    each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients.
 
@@ -44,6 +46,7 @@ def tiled(
         variance: the noise variance of each value, shape of ``noisy``.
         tile: side of a piece in packed pixels, overlap included.
         overlap: context on each inner side, dropped from the result.
+        each: goes through the tiles, and may show how far it is, as ``tqdm`` does.
 
     Raises:
         ValueError: if the overlap leaves nothing of a tile, tile or overlap are no multiples of the model's stride, or
@@ -64,10 +67,9 @@ def tiled(
     denoised = torch.empty_like(noisy)
     # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
     (tops, height), (lefts, width) = (_pieces(side, tile, overlap, stride) for side in noisy.shape[-2:])
-    for top in tops:
-        for left in lefts:
-            window = (..., slice(top, top + height), slice(left, left + width))
-            piece = model(noisy[window], None if variance is None else variance[window])
-            above, before = (overlap if start else 0 for start in (top, left))
-            denoised[..., top + above : top + height, left + before : left + width] = piece[..., above:, before:]
+    for top, left in each([(top, left) for top in tops for left in lefts]):
+        window = (..., slice(top, top + height), slice(left, left + width))
+        piece = model(noisy[window], None if variance is None else variance[window])
+        above, before = (overlap if start else 0 for start in (top, left))
+        denoised[..., top + above : top + height, left + before : left + width] = piece[..., above:, before:]
     return denoised

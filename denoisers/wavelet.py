@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from denoisers.classical import Classical, Planes, library
+from denoisers.classical import Classical, Planes
 from rawaug.registry import FILTERS
 
 
@@ -14,9 +14,11 @@ from rawaug.registry import FILTERS
 class Wavelet(Classical):
     """Translation-invariant Haar shrinkage (scikit-image, PyWavelets): hard threshold at 3 sigma, mean of 16 shifts."""
 
+    needs = ("skimage", "pywt")
+
     def denoise(self, planes: Planes) -> Planes:
         """See :meth:`Classical.denoise`."""
-        denoise_wavelet = library("skimage.restoration").denoise_wavelet
+        denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))

@@ -7,16 +7,23 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from rawaug._version import __version__
 from rawaug.extras import MissingExtra
 from rawaug.printable import printable
+from rawaug.shortages import shortage, without_traceback
 
 BAD_INPUT = 2
+OWN = {
+    "run": "Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.",
+    "completion": "Print a script that completes commands and options in a shell.",
+}
+"""Commands that need the parser itself, beside those of ``rawaug.commands``."""
+SHELLS = ("bash", "zsh", "fish")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,6 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {printable(_one_line(error))}", file=sys.stderr)
         return BAD_INPUT
+    except (RuntimeError, MemoryError) as error:
+        if (reason := shortage(error)) is None:
+            raise
+        print(f"rawaug: {reason}", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
@@ -41,95 +53,120 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
-    from rawaug.experiment.kinds import kind_of
-    from rawaug.experiment.recipe import find_recipe, recipe_list
-    from rawaug.registry import COMMANDS
+    from rawaug.commands.listing import command, listed
+    from rawaug.commands.spelling import given_keys, require_known_keys, require_known_options
+    from rawaug.progress import quiet
 
     if argv == ["run"]:
+        from rawaug.experiment.recipe import recipe_list
+
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
         print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
         return 0
-    kind, shown = "training", None
+    kind, recipe = "training", None
     if argv[:2] == ["run", "--recipe"]:
         argv = ["run", *argv[2:]]
     if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
+        from rawaug.experiment.kinds import KINDS, kind_of
+        from rawaug.experiment.plain_yaml import read_yaml
+        from rawaug.experiment.recipe import defaults_of, find_recipe
+
         recipe = find_recipe(argv[1])
         kind = kind_of(recipe)
-        shown = recipe if {"-h", "--help"} & set(argv) else None
         argv = ["run", "--recipe", str(recipe), *argv[2:]]
-    parser = _parser(kind, shown)
+    names = [*OWN, *listed()]
+    chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
+    parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
     if not argv:
         parser.print_help()
         return 0
+    if chosen is not None:
+        require_known_options(chosen, leaves[chosen], argv)
+    if recipe is not None:
+        require_known_keys(recipe, read_yaml(recipe), leaves["run"])
+        if {"-h", "--help"} & set(argv):
+            leaves["run"].set_defaults(defaults_of(recipe, KINDS[kind].settings))
     parsed = parser.parse_args(argv)
-    command: str = parsed.command
-    arguments = parser.instantiate(parsed)[command]
-    if command == "run":
-        _run(kind, arguments, {word.partition("=")[0].removeprefix("--") for word in argv if word.startswith("--")})
-    else:
-        name, values = command, vars(arguments)
-        if "action" in values:  # a command of two words
-            name, values = f"{command} {values['action']}", vars(values[values["action"]])
-        call(COMMANDS[name], values)
+    values = vars(parser.instantiate(parsed)[parsed.command])
+    values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
+    with quiet(values["quiet"]):
+        if chosen == "run":
+            _run(kind, values, given_keys(argv))
+        elif chosen == "completion":
+            print(parser.get_completion_script(f"shtab-{values['shell']}"))
+        else:
+            call(command(str(chosen)), values)
     return 0
 
 
-def _parser(kind: str, recipe: Path | None = None) -> Any:
-    """The parser of every command; ``run`` takes the keys of ``kind``, in whose help stand the values of ``recipe``."""
+def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
+    """The parser of every command, and by name those of the ``wanted`` ones, which alone have their arguments."""
     from jsonargparse import ArgumentParser
 
-    from rawaug.commands.arguments import add_arguments, summary
-    from rawaug.experiment.kinds import KINDS
-    from rawaug.experiment.recipe import defaults_of
-    from rawaug.registry import COMMANDS
+    from rawaug.commands.arguments import add_arguments
+    from rawaug.commands.listing import command, listed
+    from rawaug.commands.spelling import spell_with_hyphens
 
-    def new(description: str) -> Any:
-        return ArgumentParser(exit_on_error=False, description=description)
+    def new(description: str, **settings: Any) -> Any:
+        return ArgumentParser(exit_on_error=False, allow_abbrev=False, description=description, **settings)
 
-    run = new("Run a recipe, resumable: rawaug run RECIPE.yaml [--key value ...]; writes runs/NAME/.")
-    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
-    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
-    run.add_class_arguments(KINDS[kind].settings)
-    if recipe is not None:
-        run.set_defaults(defaults_of(recipe, KINDS[kind].settings))
-    parser = ArgumentParser(prog="rawaug", exit_on_error=False, version=__version__, description=__doc__)
+    parser = new(str(__doc__), prog="rawaug", version=__version__)
     subcommands = parser.add_subcommands(dest="command")
-    subcommands.add_subcommand("run", run, help=run.description)
+    leaves: dict[str, Any] = {}
     groups: dict[str, Any] = {}
-    for name, function in COMMANDS.items():
+    for name, about in {**OWN, **listed()}.items():
         group, _, action = name.partition(" ")
-        command = new(summary(function))
-        add_arguments(command, function)
+        leaves[name] = new(about)
         if not action:
-            subcommands.add_subcommand(name, command, help=command.description)
+            subcommands.add_subcommand(name, leaves[name], help=about)
             continue
         if group not in groups:
             above = new(f"Commands about {group}.")
             subcommands.add_subcommand(group, above, help=above.description)  # the outer one first
             groups[group] = above.add_subcommands(dest="action")
-        groups[group].add_subcommand(action, command, help=command.description)
-    return parser
+        groups[group].add_subcommand(action, leaves[name], help=about)
+    for name, leaf in leaves.items():
+        if name in wanted:
+            if name == "run":
+                _add_run_arguments(leaf, kind)
+            elif name == "completion":
+                leaf.add_argument("shell", choices=SHELLS)
+            else:
+                add_arguments(leaf, command(name))
+        if "--quiet" not in leaf._option_string_actions:  # a command may have its own
+            leaf.add_argument("--quiet", action="store_true", help="print no progress")
+        spell_with_hyphens(leaf)
+    return parser, leaves
 
 
-def _run(kind: str, arguments: Any, given: set[str]) -> None:
+def _add_run_arguments(run: Any, kind: str) -> None:
+    from rawaug.experiment.kinds import KINDS
+
+    run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
+    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
+    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
+    run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
+    run.add_class_arguments(KINDS[kind].settings)
+
+
+def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     from rawaug.experiment.kinds import KINDS
     from rawaug.experiment.plan import with_own_pairs
     from rawaug.experiment.recipe import Recipe
 
-    experiment, settings = KINDS[kind], vars(arguments)
-    file = settings.pop("recipe")
-    quick, dry = settings.pop("smoke"), settings.pop("dry_run")
+    experiment = KINDS[kind]
+    file, _ = settings.pop("recipe"), settings.pop("quiet")
+    quick, dry, overwrite = (settings.pop(flag) for flag in ("smoke", "dry_run", "overwrite"))
     recipe = experiment.settings(**settings)
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
     if not dry:
-        experiment.run(recipe)
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
     elif experiment.dry_run is None:
         raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
     else:
-        experiment.dry_run(recipe)
+        experiment.dry_run(recipe, overwrite)
 
 
 def _one_line(error: Exception) -> str:
@@ -137,7 +174,8 @@ def _one_line(error: Exception) -> str:
         return f"not valid JSON: {error.msg}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split())
+    text = re.sub(r"<class '([\w.]+)'>", r"\1", " ".join(without_traceback(str(error)).split()))
+    return re.sub(r'^Parser key "([^"]+)"', r"\1", text)
 
 
 if __name__ == "__main__":

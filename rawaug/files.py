@@ -7,10 +7,12 @@ must be finite, in tensors and in JSON.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
 import os
+import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import count
@@ -50,8 +52,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
         try:
             yield partial
             partial.replace(path)
+        except OSError as error:
+            if (named := _named(error, path, partial)) is not error:
+                raise named from error
+            raise
         finally:
             partial.unlink(missing_ok=True)
+
+
+def _named(error: OSError, path: Path, partial: Path) -> OSError:
+    """The error with the name of the file that was to be written: a full disk is reported without it."""
+    if "requested and" in str(error):  # NumPy's, of a write that was cut short
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    if error.errno is None or error.filename not in (None, str(partial), partial):
+        return error
+    return OSError(error.errno, error.strerror, str(path))
 
 
 @contextmanager
@@ -117,6 +132,33 @@ def parse_object(text: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"must be a JSON object, got {type(value).__name__}")
     return value
+
+
+def require_writable(path: str | Path, folder: bool = False) -> None:
+    """Refuse, before any work, a file or folder that could not be written at the end; nothing is left on the disk.
+
+    Args:
+        path: of the file, which need not exist, nor its folders.
+        folder: ``path`` is that of a folder.
+
+    Raises:
+        OSError: in one line, with what is in the way.
+
+    Example:
+        >>> require_writable("/dev/null/report.html")
+        Traceback (most recent call last):
+        OSError: /dev/null/report.html: cannot be written: /dev/null is not a folder
+    """
+    path = Path(path)
+    if path.is_dir() and not folder:
+        raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
+    above = next(place for place in (path, *path.absolute().parents) if place.exists() and (folder or place != path))
+    if not above.is_dir():
+        raise OSError(f"{path}: cannot be written: {above} is not a folder")
+    try:
+        tempfile.TemporaryFile(dir=above).close()
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {above}: {error.strerror}") from None
 
 
 def write_json(value: Any, path: str | Path) -> None:

@@ -22,14 +22,17 @@ OLD_PATHS = {Path("rawaug", f"{name}.py") for name in ("augment", "loader", "pai
 BASE = {
     "bayer",
     "camera_names",
+    "devices",
     "extras",
     "files",
+    "lock",
     "metrics",
     "patterns",
     "printable",
     "progress",
     "registry",
     "seeding",
+    "shortages",
     "_version",
 }
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
@@ -37,14 +40,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "_version": set(),
     "bayer": {"seeding"},
     "camera_names": set(),
+    "devices": {"registry"},
     "extras": set(),
     "files": set(),
+    "lock": set(),
     "metrics": set(),
     "patterns": {"bayer"},
     "printable": set(),
     "progress": set(),
     "registry": set(),
     "seeding": set(),
+    "shortages": set(),
     "denoisers": {"bayer", "files", "registry"},
     "kernels": {"bayer"},
     "noise": BASE | {"kernels"},
@@ -57,6 +63,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "commands": CAMERA | {"plugin", "data", "io", "evaluation", "training"},
     "experiment": CAMERA | {"plugin", "data", "io", "evaluation", "training", "commands"},
     "cli": BASE | {"commands", "experiment"},
+    "__main__": {"cli"},
 }
 
 

@@ -83,7 +83,7 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     quick = [
-        "--train.validate_every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test_count", "1",
+        "--train.validate-every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test-count", "1",
         "--denoiser.settings", '{"width": 4, "scales": 2}', "--classical", "[]", "--untouched", "[]",
     ]  # fmt: skip
     command = ["run", "synthetic", "--seed", "3", "--seeds", "2", "--steps", "2", "--device", "cpu", *quick]
@@ -95,12 +95,12 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     assert results["recipe"]["train"]["steps"] == 2
     weights = tmp_path / "synthetic" / "seed3" / "convex" / "denoiser.safetensors"
     before = weights.stat().st_mtime_ns
-    same_weights = ["--train.checkpoint_every", "1", "--data.memory_mb", "8", "--device", "auto"]
+    same_weights = ["--train.checkpoint-every", "1", "--data.memory-mb", "8", "--device", "auto"]
     capsys.readouterr()
     assert main([*command, *same_weights]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == said.count("already evaluated") == 4
-    assert main([*command, *same_weights, "--data.test_count", "2"]) == 0
+    assert main([*command, *same_weights, "--data.test-count", "2", "--overwrite"]) == 0
     said = capsys.readouterr().out
     assert said.count("already trained") == 4 and "already evaluated" not in said
     assert weights.stat().st_mtime_ns == before
@@ -116,7 +116,7 @@ def test_what_cannot_be_run_is_refused_before_anything_is_fitted(capsys: pytest.
         Recipe(arms={**arm, "r2r": ArmConfig(estimator="r2r")})
     with pytest.raises(ValueError, match="augmented: 1"):
         Recipe(arms=arm, data=DataConfig(pairs=None), camera="universal")
-    for flags in (["--steps", "0"], ["--train.batch", "0"], ["--train.crop", "63"], ["--train.checkpoint_every", "0"]):
+    for flags in (["--steps", "0"], ["--train.batch", "0"], ["--train.crop", "63"], ["--train.checkpoint-every", "0"]):
         assert flags[0].removeprefix("--train.").removeprefix("--") in refused(capsys, "run", "fewshot", *flags)
     assert "noise 'Foo' is unknown" in refused(capsys, "run", "fewshot", "--noise", "Foo")
     assert "thickness" in refused(capsys, "run", "fewshot", "--denoiser.settings", "{thickness: 3}")

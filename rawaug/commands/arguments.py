@@ -12,11 +12,6 @@ from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
 
-def summary(function: Callable[..., Any]) -> str:
-    """The first line of the docstring."""
-    return (inspect.getdoc(function) or "").partition("\n")[0]
-
-
 def add_arguments(parser: Any, function: Callable[..., Any]) -> None:
     """Add the arguments of ``function`` to a parser of jsonargparse."""
     from docstring_parser import parse

@@ -4,7 +4,8 @@ r"""``rawaug denoise``: RAW files to denoised DNGs.
 
 on the mosaic as the sensor gave it, before any gain map, in tiles. The result has the source's levels, colour, lens
 corrections, orientation and EXIF and differs from it by noise alone; its NoiseProfile tag is gone with the noise, so
-that a RAW developer does not smooth once more. A mosaic of another pattern than the network's is continued by a
+that a RAW developer does not smooth once more. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the
+noise's variance is left, and NoiseProfile says so. A mosaic of another pattern than the network's is continued by a
 mirrored line on the sides where the patterns differ, and cropped after.
 """
 
@@ -17,23 +18,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 import denoisers
-from denoisers.network import Denoiser
 from denoisers.pretrained import DEFAULT, find
 from rawaug import bayer
-from rawaug.bayer import CFA
+from rawaug.commands.frame_denoisers import ClassicalDenoiser, FrameDenoiser, NetworkDenoiser
 from rawaug.commands.synth import require_same_settings
 from rawaug.data.raw_folder import EXTENSIONS
-from rawaug.data.sample import Sample
-from rawaug.evaluation.scores import denoise
-from rawaug.files import sha256
-from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.files import require_writable
+from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
+from rawaug.io.raw import develop
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import one_at_a_time
 from rawaug.noise import (
     EldLevels,
     FixedLevels,
@@ -45,7 +43,7 @@ from rawaug.noise import (
 )
 from rawaug.printable import printable
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS
+from rawaug.registry import COMMANDS, Spec
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float] | MeasuredLevels
@@ -59,25 +57,60 @@ def run(
     source: str,
     out: str,
     *,
-    denoiser: str = DEFAULT,
+    denoiser: str | None = None,
+    classical: str | dict[str, Any] | None = None,
     noise: tuple[float, float] | str = "auto",
+    strength: float = 1.0,
     self_ensemble: bool = False,
+    device: str = "auto",
+    preview: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
 
     Args:
         source: a RAW file, or a folder of them.
         out: output DNG, or output folder.
-        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser.
+        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
+        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         noise: auto (NoiseProfile, else estimate), profile, estimate, camera (the law that the denoiser was trained
             for), an ISP's .safetensors (the law in it), a measured camera's name, or [shot_var, read_var].
-        self_ensemble: average eight views, at eight times the cost.
+        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
+        self_ensemble: average eight views of a network, at eight times the cost.
+        device: where a network runs: auto, cpu, cuda, cuda:1, mps.
+        preview: also write the result, developed by LibRaw, as this .jpg or .png.
+        overwrite: replace existing results.
+
+    Raises:
+        ValueError: if a file of a folder could not be denoised, after all others.
     """
-    law = stored_noise(noise, denoiser)
-    if Path(source).is_dir():
-        print_denoised(denoise_folder(source, out, denoiser, law, self_ensemble))
-    else:
-        print_denoised(DenoisedFolder([denoise_file(source, out, denoiser, law, self_ensemble)]))
+    method = frame_denoiser(denoiser, classical, self_ensemble, device)
+    law = stored_noise(noise, DEFAULT if denoiser is None else denoiser)
+    if not Path(source).is_dir():
+        done = denoise_file(source, out, method, law, strength=strength, preview=preview, overwrite=overwrite)
+        print_denoised(DenoisedFolder([done]))
+        return
+    if preview is not None:
+        raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
+    result = denoise_folder(source, out, method, law, strength=strength, overwrite=overwrite)
+    print_denoised(result)
+    if result.broken:
+        raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
+
+
+def frame_denoiser(
+    denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
+) -> FrameDenoiser:
+    """What denoises: the network, the classical filter, or the network that is taken where neither is named.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is none such, or both are named.
+    """
+    if classical is None:
+        return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
+    if denoiser is not None or self_ensemble:
+        raise ValueError("classical: a filter takes neither --denoiser nor --self-ensemble; give one or the other")
+    return ClassicalDenoiser(classical)
 
 
 @dataclass(frozen=True)
@@ -108,28 +141,6 @@ class DenoisedFolder:
     files: list[Denoised] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
-
-
-def denoise_mosaic(
-    model: Denoiser, cfa: CFA, frame: RawFrame, levels: tuple[float, float], self_ensemble: bool = False
-) -> Tensor:
-    """The frame's mosaic denoised, float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black.
-
-    Args:
-        model: a network for packed RAW, on any device.
-        cfa: the pattern of the mosaics that it was trained on.
-        frame: what to denoise.
-        levels: (shot_var, read_var).
-        self_ensemble: average eight views.
-    """
-    height, width = frame.mosaic.shape[-2:]
-    rows, columns = frame.cfa.shift_to(cfa)
-    packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
-    shot_var, read_var = levels
-    variance = packed.clamp(min=0).mul_(shot_var).add_(read_var)
-    denoised = denoise(model, Sample(packed, packed, variance), cfa, 8 if self_ensemble else 1)
-    mosaic = bayer.unpack(denoised, cfa)[0]
-    return mosaic[..., rows : rows + height, columns : columns + width].clamp(max=1.0)
 
 
 def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
@@ -209,54 +220,79 @@ def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
 def denoise_file(
     source: str | Path,
     out: str | Path,
-    weights: str | Path = DEFAULT,
+    method: FrameDenoiser | str | Path = DEFAULT,
     noise: Noise = "auto",
-    self_ensemble: bool = False,
+    *,
+    strength: float = 1.0,
+    preview: str | Path | None = None,
+    overwrite: bool = False,
 ) -> Denoised:
     """Denoise one RAW file of any kind that :func:`rawaug.io.read_raw` reads, to a DNG.
 
     Args:
         source: the RAW file.
         out: the DNG to write; its folder is made.
-        weights: a denoiser's file, or the name of a shipped one.
+        method: what denoises, as :func:`frame_denoiser` makes it; or a network's file, or the name of a shipped one.
         noise: see :data:`Noise`; ignored by networks without a noise map.
-        self_ensemble: average eight flips and turns, eight times the work.
+        strength: in [0, 1], the share of what the denoiser changes that is applied.
+        preview: picture of the result to write besides, developed by LibRaw.
+        overwrite: replace what is there.
 
     Raises:
-        FileNotFoundError, OSError: if a file is missing or cannot be read.
-        ValueError: if the source is no Bayer RAW, its noise is unknown, or ``out`` is no DNG or the source itself.
+        FileNotFoundError, OSError: if a file is missing or cannot be read or written.
+        ValueError: if the source is no Bayer RAW, its noise is unknown, ``strength`` is not in [0, 1], or ``out`` is
+            no DNG, the source itself, or there already.
 
     Example:
         >>> denoise_file("shot.dng", "shot-denoised.dng")  # doctest: +SKIP
     """
-    return _denoise_file(Path(source), Path(out), _load(weights), noise, self_ensemble)
+    source, out = Path(source), Path(out)
+    if out.suffix.lower() != ".dng":
+        raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
+    if out.resolve() == source.resolve():
+        raise ValueError(f"{out}: is the input file; give another name")
+    for path in (out, *([] if preview is None else [Path(preview)])):
+        if path.exists() and not overwrite:
+            raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
+        require_writable(path)
+    if preview is not None and Path(preview).suffix.lower() not in (".jpg", ".jpeg", ".png"):
+        raise ValueError(f"{preview}: the preview is a .jpg or .png")
+    done = _denoise_file(source, out, _made(method), noise, _checked(strength))
+    if preview is not None:
+        frame = read_raw(out)
+        Path(preview).parent.mkdir(parents=True, exist_ok=True)
+        write_picture(preview, bayer.turn(develop(out), frame.upright_view))
+    return done
 
 
-def _load(weights: str | Path) -> tuple[Denoiser, CFA]:
-    model, info = denoisers.load(find(weights))
-    return model.to(memory_format=torch.channels_last), CFA(info.get("cfa", "RGGB"))  # type: ignore[call-overload]
+def _made(method: FrameDenoiser | str | Path) -> FrameDenoiser:
+    return NetworkDenoiser(method) if isinstance(method, (str, Path)) else method
+
+
+def _checked(strength: float) -> float:
+    if not 0.0 <= strength <= 1.0:
+        raise ValueError(f"strength must be between 0 and 1, got {strength}; --noise takes higher levels")
+    return strength
 
 
 def _denoise_file(
     source: Path,
     out: Path,
-    loaded: tuple[Denoiser, CFA],
+    method: FrameDenoiser,
     noise: Noise,
-    self_ensemble: bool,
+    strength: float,
     read: Callable[[Path], RawFrame] = read_raw,
 ) -> Denoised:
     start = time.perf_counter()
-    if out.suffix.lower() != ".dng":
-        raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
-    if out.resolve() == source.resolve():
-        raise ValueError(f"{out}: is the input file; give another name")
-    model, cfa = loaded
     frame = read(source)
-    shot_var, read_var, noise_source = levels_of(frame, noise) if model.reads_variance else (*_NO_NOISE, "not needed")
-    mosaic = denoise_mosaic(model, cfa, frame, (shot_var, read_var), self_ensemble)
+    shot_var, read_var, noise_source = levels_of(frame, noise) if method.reads_levels else (*_NO_NOISE, "not needed")
+    mosaic = frame.mosaic.lerp(method(frame, (shot_var, read_var)), strength)
     below = _clip_below_zero(mosaic, frame)
+    known = (shot_var, read_var) if method.reads_levels else frame.noise_profile
+    rest = (1 - strength) ** 2
+    left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_dng(out, replace(frame, mosaic=mosaic, noise_profile=None), source)
+    write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
     return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
 
 
@@ -274,16 +310,24 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     return below / mosaic.numel()
 
 
+@one_at_a_time(lambda source, out, *_, **__: Path(out))
 def denoise_folder(
     source: str | Path,
     out: str | Path,
-    weights: str | Path = DEFAULT,
+    method: FrameDenoiser | str | Path = DEFAULT,
     noise: Noise = "auto",
-    self_ensemble: bool = False,
+    *,
+    strength: float = 1.0,
+    overwrite: bool = False,
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
     A file that cannot be read, or whose decoder crashes or hangs, is named and counted.
+
+    Args:
+        source, out: the folders.
+        method, noise, strength: as in :func:`denoise_file`.
+        overwrite: replace existing results, of other settings too.
 
     Raises:
         FileNotFoundError: if there is no such file of weights.
@@ -292,16 +336,18 @@ def denoise_folder(
     """
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
-    loaded = _load(weights)
-    settings = {"denoiser_sha256": sha256(find(weights)), "self_ensemble": self_ensemble}
-    require_same_settings(out / "denoise.json", {**settings, "noise": _as_json(noise)})
+    require_writable(out, folder=True)
+    made, strength = _made(method), _checked(strength)
+    settings = {**made.settings, "noise": _as_json(noise)}
+    settings |= {} if strength == 1.0 else {"strength": strength}
+    require_same_settings(out / "denoise.json", settings, overwrite)
     result = DenoisedFolder()
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
-        if target.exists():
+        if target.exists() and not overwrite:
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, loaded, noise, self_ensemble, partial(apart, read_raw)))
+            result.files.append(_denoise_file(file, target, made, noise, strength, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):

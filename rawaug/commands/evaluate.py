@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import denoisers
-from denoisers.network import Denoiser
 from denoisers.pretrained import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
@@ -15,15 +14,15 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.readable import Readable
+from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
-    Run,
     Score,
     classical_method,
-    installed_classical,
     label_of,
     network_method,
+    require_classical,
     require_numbers,
     row_of,
     score_classical,
@@ -31,9 +30,9 @@ from rawaug.evaluation.scores import (
     summary,
 )
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import find_weights, read_header, sha256, write_json
+from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS, ESTIMATORS, Spec
 
@@ -69,12 +68,17 @@ def run(
         json: write the result as JSON to this file.
         settings: of pairs:PATH.
     """
-    result = evaluate(
-        weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **vars(settings)
-    )
-    print_scores(result)
+
+    def written(result: dict[str, Any]) -> None:
+        print_scores(result)
+        if json:
+            write_json(result, json)
+
     if json:
-        write_json(result, json)
+        require_writable(json)
+    more = {"first": written, **vars(settings)}
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **more)
+    written(result)
     if report:
         print(f"page: {report}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
@@ -90,6 +94,7 @@ def evaluate(
     device: str = "cpu",
     report: str | Path | None = None,
     views: Literal[4, 8] | None = None,
+    first: Callable[[dict[str, Any]], None] | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
     """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
@@ -105,6 +110,7 @@ def evaluate(
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
         views: of the self-ensemble, 4 or 8; given alone it asks for one.
+        first: called with the result without self-ensemble and classical denoisers where these are still to come.
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
 
     Raises:
@@ -112,16 +118,19 @@ def evaluate(
             is for denoisers and the file is an ISP's, or no frame can be read. Some that cannot are named under
             ``broken``.
     """
-    classical = installed_classical(classical)
+    require_classical(classical)
+    where = find_device(device)
+    if report is not None:
+        require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
     pairs = Readable(open_pairs(data, split="test", **settings))
     data = data if isinstance(data, str) else f"{len(pairs)} pairs"
+    about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
         if self_ensemble or views or noise is not None or classical or report is not None:
             raise ValueError(
-                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report apply to "
-                "denoisers only"
+                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report are for denoisers"
             )
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
@@ -130,10 +139,23 @@ def evaluate(
     else:
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
-        model = model.to(device)
+        model = model.to(where)
         at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
         ensemble = views or (8 if self_ensemble else 1)
-        result = _denoiser_result(model, pairs, levels, cfa, seed, ensemble, classical, at_test)
+
+        def scored(count: int, label: str) -> dict[str, Any]:
+            method = network_method(model, cfa, views=count, at_test=at_test)
+            return summary([score for score, *_ in score_method(method, pairs, levels, cfa, seed, label)])
+
+        plain = scored(1, "evaluate")
+        result = {"self_ensemble": False, "seed": seed, **plain}
+        if first is not None and (ensemble > 1 or classical):
+            first({**about[0], **result, **about[1]})
+        if ensemble > 1:
+            several = scored(ensemble, f"evaluate, {ensemble} views")
+            result = {"self_ensemble": True, "views": ensemble, "seed": seed, "plain": plain, **several}
+        if classical:
+            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
         _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
@@ -145,36 +167,9 @@ def evaluate(
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
         result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
-    return {"kind": kind, "data": data, **result, "weights_sha256": sha256(weights), "version": __version__}
+    return {**about[0], **result, **about[1]}
 
 
 def _require_some(pairs: Readable) -> None:
     if len(pairs.broken) == len(pairs):
         raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
-
-
-def _denoiser_result(
-    model: Denoiser,
-    pairs: Sequence[Pair],
-    noise: NoiseModel,
-    cfa: CFA,
-    seed: int,
-    views: int,
-    classical: Sequence[Spec],
-    at_test: Callable[[Run], Run],
-) -> dict[str, Any]:
-    """The summary of a denoiser; with self-ensemble, the one without under ``plain``."""
-    result: dict[str, Any] = {"self_ensemble": views > 1, "seed": seed}
-
-    def scored(count: int, label: str) -> dict[str, Any]:
-        method = network_method(model, cfa, views=count, at_test=at_test)
-        return summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, label)])
-
-    plain = scored(1, "evaluate")
-    if views > 1:
-        result |= {"views": views, "plain": plain, **scored(views, f"evaluate, {views} views")}
-    else:
-        result |= plain
-    if classical:
-        result["classical"] = score_classical(classical, pairs, noise, cfa, seed)
-    return result

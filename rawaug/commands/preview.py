@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.extras import extra
+from rawaug.files import require_writable
 from rawaug.io import encode_srgb, read_picture
 from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.isp.model import DictionaryISP
@@ -71,9 +72,10 @@ def preview(
     """
     if count < 0:
         raise ValueError(f"count must be at least 0, got {count}")
+    out = Path(out) if Path(out).suffix else Path(f"{out}.png")
+    require_writable(out)
     isp = DictionaryISP.from_pretrained(weights)
     whole = even_sided(read_picture(picture, max_pixels))
-    out = Path(out) if Path(out).suffix else Path(f"{out}.png")
     out.parent.mkdir(parents=True, exist_ok=True)
     atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")
     _draw_stages(isp, whole, count, seed).savefig(out, dpi=130)

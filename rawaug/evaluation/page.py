@@ -11,7 +11,7 @@ import csv
 import html
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -35,15 +35,27 @@ WHOLE = 640
 ON_PAGE = 12
 """Largest number of frames on the page."""
 
+CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
+"""Columns of a log that are drawn, with what they are."""
+LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
+
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; margin: 1rem 0; }
+h1, h3, figcaption { overflow-wrap: anywhere; }
+.table { overflow-x: auto; margin: 1rem 0; } table { border-collapse: collapse; }
 th, td { padding: .25rem .8rem; border-bottom: 1px solid #ddd; text-align: right; font-variant-numeric: tabular-nums; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff; }
 .frame { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-start; margin-bottom: 2rem; }
 figure { margin: 0; } figcaption { font-size: 13px; }
-.window img { width: 256px; image-rendering: pixelated; }
+.window { width: 256px; } .window img { width: 100%; image-rendering: pixelated; }
+.curve { flex: 1 1 20rem; max-width: 36rem; } .curve img { width: 100%; }
 img { max-width: 100%; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
+@media (max-width: 40rem) {
+  body { margin: 1rem auto; padding: 0 .6rem; font-size: 14px; } h1 { font-size: 1.3rem; }
+  th, td { padding: .2rem .4rem; } th { vertical-align: bottom; } .table { font-size: 13px; }
+  td:first-child { min-width: 6rem; max-width: 35vw; overflow-wrap: anywhere; }
+  .window { width: calc(50% - .3rem); }
+}
 """
 
 
@@ -65,9 +77,10 @@ class Page:
             self.parts.append(f"<p>{html.escape(note)}</p>")
         self.parts += ["<h2>Every image</h2>", _images_table(results, classical)]
 
-    def add_curves(self, png: bytes) -> None:
-        """A figure as :func:`draw_curves` makes it."""
-        self.parts += ["<h2>Training</h2>", f"<p>{_picture(png, 'training curves')}</p>", "<h2>Pictures</h2>"]
+    def add_curves(self, pngs: Mapping[str, bytes]) -> None:
+        """Figures as :func:`draw_curves` makes them."""
+        figures = (f'<figure class="curve">{_picture(png, title)}</figure>' for title, png in pngs.items())
+        self.parts += ["<h2>Training</h2>", f'<div class="frame">{"".join(figures)}</div>', "<h2>Pictures</h2>"]
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
@@ -110,7 +123,8 @@ def _write(path: Path, title: str, parts: Sequence[str], settings: Mapping[str, 
     shown = html.escape(json.dumps(settings, indent=1))
     body = "\n".join([*parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
     head = (
-        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title>"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
@@ -144,34 +158,47 @@ def encode_png(srgb: Tensor) -> bytes:
     return file.getvalue()
 
 
-def draw_curves(logs: Mapping[str, Sequence[Path]]) -> bytes:
-    """Loss and validation PSNR over the steps as a PNG file, from the ``log.csv`` of every seed of every arm.
+def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
+    """Loss and validation PSNR over the steps as PNG files by title, from the ``log.csv`` of every seed of every arm.
 
-    Thin lines are the thirds of the validation frames with least (dotted), middling and most noise (dash-dotted).
+    The loss is the mean since the row before. Thin lines are the thirds of the validation frames with least (dotted),
+    middling and most noise (dash-dotted). A curve of one point is a dot. What no log has is left out.
     """
+    rows = {(arm, k): _read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
+    colours = {arm: f"C{k % 10}" for k, arm in enumerate(logs)}
+    return {title: _draw_curve(key, title, rows, colours) for key, title in CURVES.items() if _has(key, rows.values())}
+
+
+Log = Sequence[Mapping[str, str]]
+
+
+def _read_log(path: Path) -> Log:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _has(key: str, logs: Iterable[Log]) -> bool:
+    return any(row.get(key) for rows in logs for row in rows)
+
+
+def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:
     with extra("train"):
         from matplotlib.figure import Figure
 
-    lines = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
-    figure = Figure(figsize=(15, 3.6), layout="constrained")
-    axes = dict(zip(("loss", "psnr", "psnr_srgb"), figure.subplots(1, 3), strict=True))
-    for colour, (arm, paths) in enumerate(logs.items()):
-        for k, path in enumerate(paths):
-            with path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-            for key, part in product(axes, lines):
-                points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
-                width, label = (0.7, None) if part else (1.4, None if k else arm)
-                style = {"color": f"C{colour % 10}", "linestyle": lines[part], "linewidth": width, "label": label}
-                if points:
-                    axes[key].plot(*zip(*points, strict=True), **style)
-    axes["loss"].set(xlabel="step", ylabel="loss", yscale="log")
-    axes["psnr"].set(xlabel="step", ylabel="validation PSNR, RAW (dB)")
-    axes["psnr_srgb"].set(xlabel="step", ylabel="validation PSNR, sRGB (dB)")
-    axes["psnr"].legend(fontsize=8)
-    file_like = io.BytesIO()
-    figure.savefig(file_like, dpi=110)
-    return file_like.getvalue()
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for ((arm, k), rows), (part, line) in product(logs.items(), LINES.items()):
+        points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
+        width, label = (0.7, None) if part else (1.4, None if k else arm)
+        style = {"color": colours[arm], "linestyle": line, "linewidth": width, "label": label}
+        if points:
+            axis.plot(*zip(*points, strict=True), marker="o" if len(points) == 1 else "", **style)
+    axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8)
+    file = io.BytesIO()
+    figure.savefig(file, dpi=130)
+    return file.getvalue()
 
 
 def _picture(png: bytes, alt: str) -> str:
@@ -183,7 +210,7 @@ def _table(head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
     body = "".join(line("td", [name, *cells]) for name, cells in rows.items())
-    return f"<table><thead>{line('th', head)}</thead><tbody>{body}</tbody></table>"
+    return f'<div class="table"><table><thead>{line("th", head)}</thead><tbody>{body}</tbody></table></div>'
 
 
 def _images_table(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> str:

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -101,14 +100,19 @@ def denoise(
         mosaic = bayer.unpack(denoise(model, shifted, own, views, at_test=at_test), own)
         height, width = mosaic.shape[-2:]
         return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
-    run: Run = partial(denoisers.tiled, model)
+    run: Run = partial(denoisers.tiled, model, each=counted("tile"))
     if at_test is not None:
         run = at_test(run)
     if views > 1:
-        run = denoisers.SelfEnsemble(run, cfa, views)
+        run = denoisers.SelfEnsemble(run, cfa, views=views, each=counted("view group"))
     device = next(model.parameters()).device
     denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
     return denoised.cpu()
+
+
+def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Goes through the parts of a frame, where there are several with progress: its tiles, or views of one shape."""
+    return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
 
 
 def score_method(
@@ -159,27 +163,28 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
-    """Check the names and settings of classical denoisers.
+    """Check names, settings and libraries of classical denoisers.
 
     Raises:
-        ValueError: if one is unknown.
+        ValueError: if one is unknown, or its library is not installed.
     """
     for spec in specs:
-        FILTERS.make(spec)
+        reason = FILTERS.make(spec).missing()
+        if reason is not None:
+            raise ValueError(f"classical: {name_and_settings(spec)[0]}: {reason}")
 
 
 def installed_classical(specs: Sequence[Spec]) -> list[Spec]:
-    """The classical denoisers without BM3D where its wheel is missing, which is then printed.
+    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed.
 
     Raises:
-        ValueError: if a name is unknown.
+        ValueError: as :func:`require_classical`, for the others.
     """
-    require_classical(specs)
-    if find_spec("bm3d") is not None:
-        return list(specs)
-    kept = [spec for spec in specs if name_and_settings(spec)[0] != "BM3D"]
+    bm3d = {"BM3D": FILTERS["BM3D"].missing()}
+    kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
     if len(kept) < len(specs):
-        print("classical: BM3D is left out; it needs the bm3d wheel, which is for non-commercial use: pip install bm3d")
+        print(f"classical: BM3D is left out: {bm3d['BM3D']}")
+    require_classical(kept)
     return kept
 
 
@@ -227,8 +232,8 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
-    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score that
-    is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
+    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score
+    that is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
     """
     images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
     result: dict[str, Any] = {"images": images}

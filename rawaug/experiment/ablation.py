@@ -20,6 +20,7 @@ from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import print_rows
+from rawaug.experiment.run_folder import claim, require_free
 from rawaug.extras import extra
 from rawaug.files import write_json
 from rawaug.isp import conditioning
@@ -65,12 +66,13 @@ def smoke_ablation(ablation: Ablation) -> Ablation:
     return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", fit=ablation.fit.smoke())
 
 
-def ablate(ablation: Ablation) -> dict[str, Any]:
-    """Run an ablation: a table, ``ablation.json`` and ``ablation.png``."""
+def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
+    """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
+    require_free(ablation, overwrite)
     pairs = list(open_pairs(ablation.data, split="train"))
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
-    config, folder = replace(ablation.fit, seed=ablation.seed), Path(ablation.out) / ablation.name
+    config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
     for left_out in progress(pairs, label="ablation", unit="frame"):

@@ -23,9 +23,11 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
 from rawaug.data.sample import Sample
+from rawaug.devices import find_device
 from rawaug.evaluation.page import write_figure_page
 from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
 from rawaug.evaluation.tables import METRICS
+from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.registry import Spec
@@ -88,11 +90,18 @@ def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
     return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
 
 
-def sweep(settings: DenoiserSweep) -> dict[str, Any]:
-    """Run a sweep; what stands in ``table.json``: by method its scores by ISO and its seconds a mosaic megapixel."""
+def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
+    """Run a sweep; what stands in ``table.json``: by method its scores by ISO and its seconds a mosaic megapixel.
+
+    Args:
+        settings: of the sweep.
+        overwrite: replace another of its name.
+    """
+    require_free(settings, overwrite)
     noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
     makers = _makers(settings)
     frames = [_clean(pair, settings.crop) for spec in settings.data for pair in _opened(spec, settings.count)]
+    claim(settings, overwrite)
     rows: dict[str, Any] = {}
     for name, make in makers.items():
         seconds, rows[name] = list[float](), {"iso": {}}
@@ -122,14 +131,15 @@ Maker = Callable[[Pair, NoiseModel, int], Method]
 
 def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
     """Every method by name, the noisy input first."""
+    device = find_device(settings.device)
     makers: dict[str, Maker] = {"noisy input": lambda pair, noise, seed: lambda _, sample: sample.noisy}
     for spec in installed_classical(settings.classical):
         makers[label_of(spec)] = _filter(spec)
     for name in settings.denoisers:
         model, info = denoisers.load(find(name))
-        makers[Path(name).stem] = _network(model.to(settings.device), CFA(info.get("cfa", "RGGB")), clip=False)
+        makers[Path(name).stem] = _network(model.to(device), CFA(info.get("cfa", "RGGB")), clip=False)
     if settings.pmrid is not None:
-        makers["PMRID as published"] = _network(_published(settings.pmrid).to(settings.device), CFA.RGGB, clip=True)
+        makers["PMRID as published"] = _network(_published(settings.pmrid).to(device), CFA.RGGB, clip=True)
     return makers
 
 
@@ -186,7 +196,7 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    folder, rows = Path(settings.out) / settings.name, result["rows"]
+    folder, rows = run_folder(settings), result["rows"]
     write_json(result, folder / "table.json")
     png = _figure(rows, settings)
     with replacing(folder / "figure.png") as partial:

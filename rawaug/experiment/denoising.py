@@ -7,13 +7,12 @@ a stopped run resumes.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-
-import torch
 
 import denoisers
 from denoisers.network import Denoiser
@@ -24,6 +23,7 @@ from rawaug.data import PictureFolder
 from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
 from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
+from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -38,12 +38,15 @@ from rawaug.evaluation.scores import (
 )
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.rehearsal import rehearse
+from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.extras import extra
-from rawaug.files import find_weights, fingerprint, sha256, write_json
+from rawaug.files import find_weights, fingerprint, replacing, sha256, write_json
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import one_at_a_time
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.training.loop import train
@@ -54,12 +57,16 @@ from rawaug.training.train_config import weights_key
 SHOWN = 3
 """Test frames in the picture."""
 
+KINDS = ("plain", "self_ensemble")
+"""How a denoiser is scored, in this order."""
+
 Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
 
 
 def run(
     recipe: Recipe,
+    overwrite: bool = False,
     *,
     pairs: Sequence[Pair] | None = None,
     validation: Sequence[Pair] | None = None,
@@ -71,20 +78,26 @@ def run(
 
     Args:
         recipe: what is run.
+        overwrite: replace a run of this name with other settings; what does not depend on them is kept.
         pairs, validation, test: in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name. With
             ``pairs`` alone a part of them is held out for validation.
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
-    return _Run(recipe, {key: frames for key, frames in given.items() if frames is not None}).all_stages()
+    given_frames = {key: frames for key, frames in given.items() if frames is not None}
+    return _Run(recipe, overwrite, given_frames).all_stages()
 
 
-def dry_run(recipe: Recipe) -> None:
+def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
+
+    Args:
+        recipe: what would be run.
+        overwrite: it would replace a run of this name with other settings.
 
     Raises:
         OSError, ValueError: for the first thing found wrong.
     """
-    prepared = _Run(recipe)
+    prepared = _Run(recipe, overwrite)
     print("\n".join(prepared.plan.lines(recipe)))
     rehearse(recipe, prepared.plan)
     print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
@@ -93,10 +106,13 @@ def dry_run(recipe: Recipe) -> None:
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
-    def __init__(self, recipe: Recipe, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})) -> None:
+    def __init__(
+        self, recipe: Recipe, overwrite: bool = False, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})
+    ) -> None:
         recipe = with_given_pairs(recipe, given)
-        self.recipe, self.data = recipe, recipe.data
-        self.folder = Path(recipe.out) / recipe.name
+        require_runnable(recipe, overwrite)
+        self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
+        self.folder = run_folder(recipe)
         self.classical = installed_classical(recipe.classical)
         if recipe.noise != "camera":
             noise_model(recipe.noise)
@@ -119,9 +135,12 @@ class _Run:
             self.pictures = PairPictures(self.pairs)
         require_usable(self.recipe, self.pairs, self.validation)
 
+    @one_at_a_time(lambda self: self.folder if _leads() else None)
     def all_stages(self) -> Results:
         recipe = self.recipe
         self.read()
+        if _leads():
+            claim(recipe, self.overwrite)
         results: Results = {arm: [] for arm in recipe.arms}
         models: dict[str, Denoiser] = {}
         for seed in range(recipe.seed, recipe.seed + recipe.seeds):
@@ -208,39 +227,43 @@ class _Run:
         settings = [] if self.recipe.views == 8 else [self.recipe.views]
         key = fingerprint(digest, self.data.test, stamps(self.test), *settings)
         path = place / "evaluation.json"
-        if path.is_file() and (known := json.loads(path.read_text())).get("key") == key:
+        known = json.loads(path.read_text()) if path.is_file() else {}
+        result: dict[str, Any] = known if known.get("key") == key else {"key": key}
+        missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
+        if not missing:
             print(f"already evaluated: {path}")
-            return {kind: known[kind] for kind in ("plain", "self_ensemble")}
-        result: dict[str, Any] = {}
-        for kind, views in (("plain", 1), ("self_ensemble", self.recipe.views)):
-            method = self.method(arm, model, isp, views)
+        for kind in missing:
+            method = self.method(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
-        write_json({"key": key, **result}, path)
-        return result
+            write_json(result, path)
+            print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
+        return {kind: result[kind] for kind in KINDS if kind in result}
 
     def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
         """The denoiser of an arm as it is tested."""
         at_test = estimator_of(self.recipe.arms[arm]).at_test
-        return network_method(model.to(_device(self.recipe.device)), isp.cfa, self.pattern(arm, isp), views, at_test)
+        return network_method(
+            model.to(find_device(self.recipe.device)), isp.cfa, self.pattern(arm, isp), views, at_test
+        )
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
         methods = {label_of(spec): classical_method(spec, noise, seed=0) for spec in self.classical}
         for name, (model, info) in self.untouched.items():
-            methods[name] = network_method(model.to(_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
+            methods[name] = network_method(model.to(find_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
         return methods
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
         recipe, cfa = self.recipe, isp.cfa
         others = self.untrained(noise, cfa)
-        classical = {
-            name: summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
-            for name, method in others.items()
-        }
+        classical: dict[str, Any] = {}
         everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
         write_json(everything, self.folder / "results.json")
+        for name, method in others.items():
+            classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
+            write_json(everything, self.folder / "results.json")
         settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
         title = f"{recipe.name}: {settings}, tested on {self.data.test}"
         page, shown = Page(title, results, classical), list[Row]()
@@ -262,8 +285,18 @@ class _Run:
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
         if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
             print(self.pictures.report())
-        runs = [run[kind] for arm in results.values() for run in arm for kind in ("plain", "self_ensemble")]
-        require_numbers([*runs, *classical.values()])
+        print("\n".join(self.usage(results)))
+        summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
+        require_numbers([*summaries, *classical.values()])
+
+    def usage(self, results: Results) -> list[str]:
+        """The files of weights, and the command that uses those of the arm with the highest PSNR."""
+        seeds = range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
+        places = {arm: [self.folder / f"seed{s}" / arm / "denoiser.safetensors" for s in seeds] for arm in results}
+        lines = [f"denoiser, {arm}: {place}" for arm, found in places.items() for place in found]
+        runs = {(arm, k): run["plain"] for arm, found in results.items() for k, run in enumerate(found)}
+        best, seed = max(runs, key=lambda run: runs[run].get("psnr", 0.0))
+        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {places[best][seed]}"]
 
 
 def _settings(part: Any) -> dict[str, Any]:
@@ -280,14 +313,6 @@ def _leads() -> bool:
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
-def _device(accelerator: str) -> torch.device:
-    """Where Fabric would put a network."""
-    with extra("train"):
-        from lightning_fabric import Fabric
-
-    return Fabric(accelerator=accelerator, devices=1).device
-
-
 def _discard_other_checkpoint(place: Path, key: str) -> None:
     """A checkpoint of other settings cannot be gone on from."""
     place.mkdir(parents=True, exist_ok=True)
@@ -295,4 +320,5 @@ def _discard_other_checkpoint(place: Path, key: str) -> None:
     if not stamp.is_file() or stamp.read_text() != key:
         for file in ("last.pt", "log.csv"):
             (place / file).unlink(missing_ok=True)
-    stamp.write_text(key)
+        with replacing(stamp) as partial:  # a kill must not leave half a key: the checkpoint would be discarded
+            partial.write_text(key)

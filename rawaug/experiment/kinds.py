@@ -19,15 +19,15 @@ class Kind(NamedTuple):
 
     Args:
         settings: dataclass of its keys.
-        run: does it.
+        run: does it; called with the settings and whether another run of the name is replaced.
         smoke: its settings in a form of seconds.
         dry_run: says what would be done and tries what could fail late; None where it cannot be had.
     """
 
     settings: type[Any]
-    run: Callable[[Any], Any]
+    run: Callable[[Any, bool], Any]
     smoke: Callable[[Any], Any]
-    dry_run: Callable[[Any], None] | None = None
+    dry_run: Callable[[Any, bool], None] | None = None
 
 
 KINDS = {

@@ -13,7 +13,7 @@ from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
@@ -139,6 +139,7 @@ class Recipe:
             BM3D is left out, with a line that says so, where its wheel is not installed.
         views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
         untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
         seeds: number of runs, with seeds ``seed``, ``seed + 1``, ...; several give mean and spread.
@@ -158,6 +159,7 @@ class Recipe:
     classical: list[str | dict[str, Any]] = field(default_factory=list)
     views: Literal[4, 8] = 8
     untouched: list[str] = field(default_factory=list)
+    self_ensemble: bool = True
     steps: int | None = None
     seed: int = 0
     seeds: int = 1
@@ -245,22 +247,15 @@ def _listed() -> list[tuple[str, Path]]:
 def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
     """What a recipe's file sets, by the keys of the command line such as ``data.count``; arms are one key.
 
-    Raises:
-        ValueError: if it sets a key that ``settings``, a dataclass, does not have.
+    Args:
+        file: whose keys are known.
+        settings: the dataclass of its kind.
     """
     found: dict[str, Any] = {}
     hints = get_type_hints(settings)
     for key, value in (read_yaml(file) or {}).items():
-        if key not in hints:
-            raise ValueError(f"{file}: unknown key {key}{nearest(key, hints)}")
-        if not is_dataclass(hints[key]):
-            found[key] = value
-            continue
-        inner = get_type_hints(hints[key])
-        for name, setting in (value or {}).items():
-            if name not in inner:
-                raise ValueError(f"{file}: unknown key {key}.{name}{nearest(name, inner)}")
-            found[f"{key}.{name}"] = setting
+        parts = {f"{key}.{name}": part for name, part in (value or {}).items()} if is_dataclass(hints[key]) else None
+        found |= {key: value} if parts is None else parts
     return found
 
 

@@ -2,8 +2,8 @@
 
 PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
 that of a published split: a method is fitted once to all frames, and scored on every frame of another set.
-PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method
-has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
+PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no
+method has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rawaug.data.select import selected
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.early_checks import require_precision
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -39,6 +40,7 @@ from rawaug.experiment.methods import (
     mosaic_only_psnr,
     score_rows,
 )
+from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
@@ -134,14 +136,19 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
     )
 
 
-def compare(comparison: Comparison) -> dict[str, dict[str, Any]]:
-    """Run a comparison; the rows as in ``table.json``."""
-    return _Comparison(comparison).table()
+def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
+    """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
+    require_free(comparison, overwrite)
+    if comparison.downstream is not None:
+        require_precision(comparison.downstream.train.precision)
+    comparing = _Comparison(comparison)
+    claim(comparison, overwrite)
+    return comparing.table()
 
 
 class _Comparison:
     def __init__(self, settings: Comparison) -> None:
-        self.settings, self.folder = settings, Path(settings.out) / settings.name
+        self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
         self.pairs = [found[k] for k in selected(found, len(found), settings.count, settings.select)]
         if settings.test:

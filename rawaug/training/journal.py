@@ -1,4 +1,4 @@
-"""What a training writes while it runs: ``log.csv``, and curves for TensorBoard."""
+"""What a training writes while it runs: ``log.csv``, and curves and crops for TensorBoard."""
 
 from __future__ import annotations
 
@@ -6,14 +6,22 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 
+from torch import nn
+
 from rawaug.extras import extra
 from rawaug.files import replacing
+from rawaug.training.validation import Watched, panels
+
+SHOWN, SHOWINGS = 3, 20
+"""Validation frames of which TensorBoard shows crops, and how often at most."""
 
 
 class Journal:
     """``log.csv`` and TensorBoard's files of a run from ``start`` on; what a killed run logged beyond it is dropped.
 
     A row has the mean loss since the row before, the validation PSNR, the learning rate of the step and the speed.
+    TensorBoard shows the middles of :data:`SHOWN` validation frames besides. A run from its beginning clears what
+    another one has left.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
@@ -24,7 +32,11 @@ class Journal:
         if self.path.is_file():
             head, *rows = self.path.read_text().splitlines(keepends=True)
             kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
-            self.path.write_text("".join([head, *kept]) if kept else "")
+            with replacing(self.path) as partial:
+                partial.write_text("".join([head, *kept]) if kept else "")
+        for events in folder.glob("events.out.tfevents.*") if not start else ():
+            events.unlink()
+        self.next_shown = 0
         self.writer = SummaryWriter(str(folder), purge_step=start + 1 if start else None)
 
     def log(self, step: int, **values: float) -> None:
@@ -40,6 +52,13 @@ class Journal:
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
+
+    def show(self, step: int, steps: int, net: nn.Module, frames: Sequence[Watched]) -> None:
+        """Noisy, denoised and clean crops in TensorBoard, at most :data:`SHOWINGS` times in ``steps``."""
+        if self.next_shown <= step:
+            self.next_shown = step + steps // SHOWINGS
+            for k, frame in enumerate(frames[:SHOWN]):
+                self.writer.add_image(f"noisy_denoised_clean/{k}", panels(net, frame), step)
 
     def close(self) -> None:
         """Write what is left."""

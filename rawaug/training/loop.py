@@ -87,6 +87,7 @@ def train(
             row["samples_per_second"] = (step - start) * stream.batch / (time.perf_counter() - began)
             if journal is not None:
                 journal.log(step, **row)
+                journal.show(step, config.steps, estimator.corrected(state.averaged), validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
             state.save(folder / "last.pt")

@@ -21,6 +21,8 @@ from rawaug.data.sample import Sample
 from rawaug.metrics import psnr
 
 PARTS = ("low", "middle", "high")
+PANEL = 96
+"""Largest side, in packed pixels, of the crops that are shown."""
 
 
 class Watched(NamedTuple):
@@ -62,6 +64,26 @@ def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) ->
     noise = [frame.variance.mean().item() for frame in frames]
     scores = _by_part("psnr", raw, noise)
     return scores | (_by_part("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
+
+
+@torch.no_grad()
+def panels(net: nn.Module, frame: Watched) -> Tensor:
+    """The middle of a frame noisy, denoised and clean, beside each other: sRGB ``(3, h, 3 w)`` in [0, 1].
+
+    Where the camera is not known the mean of the greens is shown, through the power 1/2.2.
+    """
+    height, width = (min(side, PANEL) for side in frame.noisy.shape[-2:])
+    top, left = ((side - size) // 2 for side, size in zip(frame.noisy.shape[-2:], (height, width), strict=True))
+    noisy, clean, variance = (x[..., top : top + height, left : left + width] for x in frame[:3])
+    device = next((weights.device for weights in net.parameters()), noisy.device)
+    net.eval()
+    denoised = net(noisy.to(device), variance.to(device)).cpu()
+    net.train()
+    return torch.cat([(frame.develop or _grey)(packed) for packed in (noisy, denoised, clean)], dim=-1)
+
+
+def _grey(packed: Tensor) -> Tensor:
+    return packed[0, 1:3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
 
 
 def _by_part(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:

@@ -1,6 +1,8 @@
 """Tiles give the untiled result, at any size, wherever the overlap covers the receptive radius."""
 
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -95,3 +97,17 @@ def test_a_tile_is_at_least_two_strides() -> None:
 def test_an_overlap_that_leaves_nothing_is_refused(overlap: int) -> None:
     with pytest.raises(ValueError, match="less than half the tile"):
         tiled(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)
+
+
+def test_tiles_are_gone_through_one_by_one_for_whoever_counts() -> None:
+    seen, noisy = [], torch.rand(1, 4, 100, 60)
+
+    def each(parts: Sequence[Any]) -> Iterator[Any]:
+        for part in parts:
+            yield part
+            seen.append(len(parts))
+
+    assert torch.equal(tiled(lambda y, _: y, noisy, tile=64, overlap=8, each=each), noisy)
+    assert seen == [2, 2]
+    SelfEnsemble(lambda y, _: y, "RGGB", each=each)(noisy)
+    assert len(seen) > 4 and set(seen[2:]) == {len(seen) - 2}

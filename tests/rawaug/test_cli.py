@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import runpy
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,9 +18,9 @@ from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
-    "--train.steps", "4", "--train.validate_every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
+    "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
     "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--data.test_count", "2", "--classical", "[]",
+    "--data.test-count", "2", "--classical", "[]",
 ]  # fmt: skip
 
 
@@ -49,22 +52,121 @@ def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
 
 
-def test_run_is_resumable_and_ends_with_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_is_resumable_and_ends_with_table_and_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path)]
-    assert main(command) == 0
+    place = tmp_path / "fewshot" / "seed0" / "real"
+
+    def no_views(*_: object, **settings: object) -> None:
+        raise ValueError("killed before the self-ensemble")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rawaug.evaluation.scores.denoisers.SelfEnsemble", no_views)
+        assert "killed before" in refused(capsys, *command, "--quiet")
+    plain = json.loads((place / "evaluation.json").read_text())
+    assert plain["plain"]["psnr"] > 20 and "self_ensemble" not in plain  # written as it came
+    assert main([*command, "--self-ensemble", "false"]) == 0
     text = capsys.readouterr().out
     assert "augmented" in text and "picture.png" in text
     results = json.loads((tmp_path / "fewshot" / "results.json").read_text())
     assert set(results["results"]) == {"real", "augmented", "finetuned", "finetuned_augmented"}
+    assert not any("self_ensemble" in runs[0] for runs in results["results"].values())
     assert (tmp_path / "fewshot" / "picture.png").stat().st_size > 10_000
-    weights = tmp_path / "fewshot" / "seed0" / "real" / "denoiser.safetensors"
-    before = weights.stat().st_mtime_ns
+    best = max(results["results"], key=lambda arm: results["results"][arm][0]["plain"]["psnr"])
+    weights = tmp_path / "fewshot" / "seed0" / best / "denoiser.safetensors"
+    *listed, last = text.strip().splitlines()
+    assert last == f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {weights}"
+    assert f"denoiser, real: {place / 'denoiser.safetensors'}" in listed
+    before = (place / "denoiser.safetensors").stat().st_mtime_ns
     assert main(command) == 0
-    assert "already trained" in capsys.readouterr().out
-    assert weights.stat().st_mtime_ns == before
-    assert main([*command, "--train.learning_rate", "0.002"]) == 0
-    assert weights.stat().st_mtime_ns != before  # other settings are another run
+    text = capsys.readouterr().out
+    assert text.count("already trained") == 4 and "evaluated real, seed 0, self_ensemble: " in text
+    scores = json.loads((place / "evaluation.json").read_text())
+    assert scores["plain"] == plain["plain"] and scores["self_ensemble"]["psnr"] > 20
+    other = [*command, "--train.learning-rate", "0.002"]
+    said = refused(capsys, *other)  # other settings are another run
+    assert "holds a run with other settings (train.learning_rate 0.0007, now 0.002); give this run another" in said
+    assert (place / "denoiser.safetensors").stat().st_mtime_ns == before
+    assert main([*other, "--overwrite", "--self-ensemble", "false"]) == 0
+    assert (place / "denoiser.safetensors").stat().st_mtime_ns != before
+    assert len(list(place.glob("events.out.tfevents.*"))) == 1
     assert main(["evaluate", str(weights), "--data", "demo:validation", "--self-ensemble"]) == 0
+
+
+def test_options_are_spelt_one_way_and_in_full(capsys: pytest.CaptureFixture[str]) -> None:
+    fit = ["fit", "demo:train", "--out", "x.safetensors"]
+    assert refused(capsys, *fit, "--learning_rate", "1") == (
+        "rawaug: --learning_rate: no such option (nearest: --learning-rate); see rawaug fit --help"
+    )
+    assert "(nearest: --pixels)" in refused(capsys, *fit, "--pix", "512")
+    assert "(nearest: --train.learning-rate)" in refused(capsys, "run", "fewshot", "--train.learning", "1")
+    assert "(nearest: --train.steps)" in refused(capsys, "run", "fewshot", "--train.stepz=3")
+    assert "(nearest: --first); see rawaug data check" in refused(capsys, "data", "check", "x", "--frist", "2")
+    assert refused(capsys, *fit, "--pixels", "many") == "rawaug: pixels: Expected a int. Got value: many"
+    assert "augmented must be between" in refused(capsys, "run", "fewshot", "--arms.real.augmented", "7")
+
+
+def test_help_is_quick() -> None:
+    code = (
+        "import sys, time; from rawaug.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: print(time.process_time(), 'torch' in sys.modules)"
+    )
+    runs = (subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3))
+    for run in runs:
+        assert "Denoise a RAW file, or a folder of them, to DNG" in run.stdout and "Commands about data" in run.stdout
+        seconds, has_torch = run.stdout.splitlines()[-1].split()
+        assert has_torch == "False"
+        if float(seconds) < 0.5:
+            return
+    pytest.fail(f"rawaug --help took {seconds} s of a processor")
+
+
+def test_it_is_a_module_too(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["rawaug", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("rawaug", run_name="__main__")
+    assert ended.value.code == 0 and capsys.readouterr().out.startswith("rawaug 0.")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_options(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "train.learning-rate" in script and "--train.learning_rate" not in script
+    if shell == "bash":
+        (tmp_path / "complete").write_text(script)
+        ask = "COMP_WORDS=(rawaug denoise --self); COMP_CWORD=2; _shtab_rawaug; echo ${COMPREPLY[@]}"
+        done = subprocess.run(
+            ["bash", "-c", f"source complete; {ask}"], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == "--self-ensemble"
+
+
+def test_quiet_prints_no_progress(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0")
+    fit = ["fit", "demo:validation", "--out", str(tmp_path / "isp.safetensors"), *QUICK_FIT]
+    assert main(fit) == 0
+    assert "steps, 00:00 elapsed" in capsys.readouterr().err
+    assert main([*fit, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_evaluate_finds_what_is_wrong_before_it_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rawaug.commands.evaluate.open_pairs", lambda *_, **__: pytest.fail("data was read"))
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    evaluate = ["evaluate", "rawaug-small", "--data", "demo:test"]
+    assert "nearest: cuda" in refused(capsys, *evaluate, "--device", "cudaa")
+    assert "this machine has none" in refused(capsys, *evaluate, "--device", "cuda")
+    assert "bm3d is not installed; licensed for non" in refused(capsys, *evaluate, "--classical", "[BM3D]")
+    for option in ("--json", "--report"):
+        assert "cannot be written: is a folder" in refused(capsys, *evaluate, option, str(tmp_path))
 
 
 def test_test_frames_must_be_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -96,7 +198,7 @@ def test_bad_input_is_one_line(
 def test_an_unknown_key_in_a_recipe_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = tmp_path / "mine.yaml"
     recipe.write_text("name: mine\ntrain: {stepz: 3}\narms: {real: {}}\n")
-    assert "stepz" in refused(capsys, "run", str(recipe))
+    assert "mine.yaml: train.stepz: no such key (nearest: train.steps)" in refused(capsys, "run", str(recipe))
 
 
 def test_weights_of_no_use_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

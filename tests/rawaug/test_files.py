@@ -18,6 +18,7 @@ from rawaug.files import (
     read_header,
     read_tensors,
     replacing,
+    require_writable,
     sha256,
     write_json,
     write_tensors,
@@ -72,6 +73,31 @@ def test_weights_are_found_by_name_and_by_path(tmp_path: Path) -> None:
 def test_hashes() -> None:
     assert digest(b"abc") == digest(b"a", b"bc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1}) != fingerprint({"a": 2, "b": 1})
+
+
+def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    require_writable(tmp_path / "new" / "folder" / "report.html")
+    require_writable(tmp_path / "file")
+    require_writable(tmp_path, folder=True)
+    require_writable(tmp_path / "new", folder=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    for path, folder, why in (
+        (tmp_path, False, "is a folder; give the name of a file"),
+        (tmp_path / "file" / "report.html", False, "file is not a folder"),
+        (tmp_path / "file", True, "file is not a folder"),
+    ):
+        with pytest.raises(OSError, match=f"cannot be written: .*{why}"):
+            require_writable(path, folder=folder)
+
+
+def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(dir: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(dir))
+
+    monkeypatch.setattr("rawaug.files.tempfile.TemporaryFile", denied)
+    with pytest.raises(OSError, match=r"report\.html: cannot be written: .*: Permission denied"):
+        require_writable(tmp_path / "report.html")
 
 
 def test_two_writers_of_one_file_do_not_meet_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:

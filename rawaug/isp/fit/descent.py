@@ -76,7 +76,8 @@ class Descent:
             tensors: what is optimised.
             steps: of Adam.
             learning_rate: at the start; falls to 0 by half a cosine.
-            report: called every ``report_steps`` steps and after the last; its text goes to the progress bar.
+            report: called every ``report_steps`` steps and after the last; its text goes to the progress bar, after the
+                mean loss.
             watch: a score, taken at the start and as often; the tensors come back that had the highest.
         """
         optimiser = torch.optim.Adam(list(tensors.values()), lr=learning_rate)
@@ -86,17 +87,19 @@ class Descent:
         for tensor in tensors.values():
             tensor.requires_grad_()
         bar = progress(range(start, steps), label=stage, unit="step", initial=start, total=steps, shown=self.progress)
-        saved = time.monotonic()
+        saved, losses = time.monotonic(), list[Tensor]()
         for step in bar:
             optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
             value = loss(keyed_generator(self.seed, stage, step))
             optimiser.zero_grad(set_to_none=True)
             value.backward()
             optimiser.step()
+            losses.append(value.detach())
             if (step + 1) % self.report_steps == 0 or step + 1 == steps:
                 scores = "" if report is None else report()
                 scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
-                bar.set_postfix_str(f"loss {value.item():.2e} {scores}", refresh=False)
+                bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores}", refresh=False)
+                losses.clear()
             if self.path is not None and time.monotonic() - saved > SAVE_SECONDS:
                 self._keep(stage, step + 1, tensors, optimiser)
                 saved = time.monotonic()

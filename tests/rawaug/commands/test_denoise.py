@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder, denoise_mosaic, levels_of
-from rawaug.io import RawFrame, read_raw, write_dng
+from rawaug.commands.denoise import denoise_file, denoise_folder, levels_of
+from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
+from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
 LEVELS = (1e-3, 1e-5)
@@ -161,8 +163,97 @@ def test_the_command(tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pyt
     assert "is the input file" in capsys.readouterr().err
     assert main(["denoise", str(source), str(tmp_path / "b.tif"), "--denoiser", str(identity)]) == 2
     assert "name ending in .dng" in capsys.readouterr().err
-    assert main(["denoise", str(tmp_path / "gone.dng"), str(tmp_path / "b.dng"), "--denoiser", str(identity)]) == 2
+    assert main(["denoise", str(tmp_path / "gone.dng"), str(tmp_path / "c.dng"), "--denoiser", str(identity)]) == 2
     assert "gone.dng: no such RAW file" in capsys.readouterr().err
+
+
+def test_a_strength_below_1_leaves_that_much_of_the_noise(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = shot(tmp_path / "a.dng", bayer_dng)
+    monkeypatch.setattr(denoisers.UNet, "forward", lambda self, noisy, variance=None: noisy + 0.1)
+    denoise_file(source, tmp_path / "b.dng", identity, strength=0.75)
+    before, after = read_raw(source), read_raw(tmp_path / "b.dng")
+    assert (after.mosaic - before.mosaic).mean().item() == pytest.approx(0.075, abs=1e-4)
+    assert after.noise_profile == pytest.approx((LEVELS[0] / 16, LEVELS[1] / 16))
+    denoise_file(source, tmp_path / "c.dng", identity, strength=0.0)
+    assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
+    for strength in (-0.1, 1.5):
+        with pytest.raises(ValueError, match=f"strength must be between 0 and 1, got {strength}"):
+            denoise_file(source, tmp_path / "d.dng", identity, strength=strength)
+
+
+def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> None:
+    clean = a_scene(CFA.RGGB)
+    source = shot(tmp_path / "a.dng", bayer_dng)
+    out = str(tmp_path / "b.dng")
+    assert main(["denoise", str(source), out, "--classical", "NonLocalMeans"]) == 0
+    before, after = ((read_raw(path).mosaic - clean)[..., 8:-8, 8:-8].square().mean() for path in (source, out))
+    assert after < before / 3
+    frame = read_raw(source)
+    white = dataclasses.replace(frame, mosaic=clean + 0.01 * torch.randn(clean.shape))
+    rest = (ClassicalDenoiser("TotalVariation")(white, (0.0, 1e-4)) - clean).square().mean()
+    assert rest < 1e-4 / 2
+
+
+def test_what_is_there_stays_without_overwrite(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out, preview = shot(tmp_path / "a.dng", bayer_dng, orientation=6), tmp_path / "b.dng", tmp_path / "p.jpg"
+    command = ["denoise", str(source), str(out), "--denoiser", str(identity)]
+    assert main([*command, "--preview", str(preview)]) == 0
+    assert read_picture(preview).shape == (3, 128, 96)  # upright
+    before = out.stat().st_mtime_ns
+    assert main(command) == 2
+    assert "b.dng: exists; give another name, or --overwrite" in capsys.readouterr().err
+    assert main([*command[:2], str(tmp_path / "c.dng"), *command[3:], "--preview", str(preview)]) == 2
+    assert "p.jpg: exists" in capsys.readouterr().err and not (tmp_path / "c.dng").exists()
+    assert out.stat().st_mtime_ns == before
+    assert main([*command, "--overwrite"]) == 0
+    assert out.stat().st_mtime_ns > before
+
+
+def test_a_folder_with_a_broken_file_is_done_and_fails(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    (source / "a.nef").write_bytes(b"no RAW")
+    shot(source / "b.dng", bayer_dng)
+    command = ["denoise", str(source), str(out), "--denoiser", str(identity)]
+    assert main(command) == 2
+    said = capsys.readouterr()
+    assert (out / "b.dng").is_file() and "a.nef" in said.out
+    assert said.err.strip().splitlines()[-1].endswith("1 of its files could not be denoised, listed above")
+    before = (out / "b.dng").stat().st_mtime_ns
+    assert main([*command, "--strength", "0.5"]) == 2
+    assert "made with strength None, not 0.5" in capsys.readouterr().err
+    assert main([*command, "--strength", "0.5", "--overwrite"]) == 2
+    assert (out / "b.dng").stat().st_mtime_ns > before
+    (source / "a.nef").unlink()
+    assert main([*command, "--strength", "0.5"]) == 0
+
+
+def test_wrong_wishes_are_refused_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("rawaug.commands.denoise.read_raw", lambda _: pytest.fail("a file was read"))
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    (tmp_path / "in").mkdir()
+    for wish, message in (
+        (["--device", "cdua"], "device 'cdua' is unknown; use one of auto, cpu, cuda"),
+        (["--device", "cuda"], "this machine has none"),
+        (["--classical", "BM3D"], "bm3d is not installed"),
+        (["--classical", "Wavelte"], "nearest: Wavelet"),
+        (["--classical", "Wavelet", "--denoiser", "rawaug-small"], "give one or the other"),
+        (["--preview", str(tmp_path / "b.gif")], "the preview is a .jpg or .png"),
+        (["--preview", str(tmp_path)], "exists"),
+    ):
+        assert main(["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng"), *wish]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--preview", "p.jpg"]) == 2
+    assert "is for one file" in capsys.readouterr().err
 
 
 def test_12_megapixels_take_less_than_2_gib(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:

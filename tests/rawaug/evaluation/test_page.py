@@ -29,7 +29,7 @@ class Elements(HTMLParser):
         super().__init__()
         self.open: list[str] = []
         self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.text = ""
+        self.text, self.source = "", text
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -77,7 +77,7 @@ def test_it_is_well_formed_and_says_what_was_measured(page: Elements) -> None:
 def test_its_pictures_open_and_have_the_promised_sizes(page: Elements) -> None:
     sources = [str(attributes["src"]) for tag, attributes in page.found if tag == "img"]
     pictures = [Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))) for source in sources]
-    assert [picture.size for picture in pictures[1:]] == [(2 * WINDOW, 2 * WINDOW)] * 3 + [(640, 160)]
+    assert [picture.size for picture in pictures[2:]] == [(2 * WINDOW, 2 * WINDOW)] * 3 + [(640, 160)]
     assert all(attributes.get("alt") for tag, attributes in page.found if tag == "img")
 
 
@@ -93,3 +93,24 @@ def test_a_png_holds_the_picture() -> None:
     srgb = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
     png = Image.open(io.BytesIO(encode_png(srgb)))
     assert png.size == (7, 5) and png.getpixel((6, 4)) == tuple((srgb[:, 4, 6] * 255).round().int().tolist())
+
+
+def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("step,loss,psnr\n4,0.1,30\n")
+    pictures = draw_curves({"real": [tmp_path / "log.csv"]})
+    assert set(pictures) == {"loss", "validation PSNR, RAW (dB)"}
+    for png in pictures.values():
+        colours = Image.open(io.BytesIO(png)).convert("RGB").getcolors(1 << 20)
+        legend_alone = 60  # pixels of the line beside the arm's name
+        assert sum(count for count, colour in colours if colour == (31, 119, 180)) > legend_alone + 20
+
+
+def test_nothing_is_wider_than_a_phone_but_what_scrolls(page: Elements) -> None:
+    classes = [attributes.get("class") for _, attributes in page.found]
+    tables = [k for k, (tag, _) in enumerate(page.found) if tag == "table"]
+    assert len(tables) == 3 and all(classes[k - 1] == "table" for k in tables)
+    (style,) = re.findall(r"<style>(.*?)</style>", page.source, re.DOTALL)
+    assert re.search(r"\.table \{ overflow-x: auto", style) and "img { max-width: 100%" in style
+    assert all(int(width) < 400 for width in re.findall(r"[^-]width: (\d+)px", style))
+    viewport = next(attributes["content"] for _, attributes in page.found if attributes.get("name") == "viewport")
+    assert viewport == "width=device-width, initial-scale=1"

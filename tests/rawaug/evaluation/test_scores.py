@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 import denoisers
+from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands.evaluate import evaluate
 from rawaug.data import Pair, demo_pairs
+from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import (
     Score,
     classical_method,
     compared,
+    denoise,
     frozen_levels,
     frozen_sample,
+    installed_classical,
+    require_classical,
     score_method,
     summary,
 )
@@ -75,7 +82,9 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> Non
     assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
-    again = evaluate(identity, "demo:validation", self_ensemble=True)
+    early: list[dict[str, Any]] = []
+    again = evaluate(identity, "demo:validation", self_ensemble=True, first=early.append)
+    assert early == [result]  # known before the views are scored
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
@@ -153,6 +162,29 @@ def test_what_is_for_denoisers_is_refused_for_an_isp(tmp_path: Path) -> None:
     for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
         with pytest.raises(ValueError, match="is an ISP"):
             evaluate("universal-small", "demo:test", **flags)
+
+
+def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0")
+    packed = torch.rand(1, 4, 4, 2000, generator=torch.Generator().manual_seed(0))
+    model = denoisers.build("UNet", width=4, scales=2)
+    assert torch.equal(denoise(model, Sample(packed, packed, packed), CFA.GRBG, False), packed)
+    assert capsys.readouterr().err.startswith("frame: 1/2 tiles, 00:00 elapsed")
+    denoise(model, Sample(*(packed[..., :8] for _ in range(3))), CFA.GRBG, True)
+    assert "view groups, " in capsys.readouterr().err
+
+
+def test_a_filter_whose_library_is_missing_is_refused_and_bm3d_left_out_of_recipes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    with pytest.raises(ValueError, match="classical: BM3D: bm3d is not installed"):
+        require_classical(["Wavelet", "BM3D"])
+    assert installed_classical(["Wavelet", "BM3D"]) == ["Wavelet"]
+    assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    with pytest.raises(ValueError, match=r"classical: NonLocalMeans: skimage is not installed; run: pip install"):
+        installed_classical(["NonLocalMeans"])
 
 
 @pytest.fixture

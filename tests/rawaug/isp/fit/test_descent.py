@@ -122,3 +122,16 @@ def _refusing(restore: Callable[..., int]) -> Callable[..., int]:
         return step
 
     return restored
+
+
+def test_what_it_shows_is_the_mean_loss_since_the_report_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+
+    class Bar(list[int]):
+        def set_postfix_str(self, text: str, refresh: bool) -> None:
+            shown.append(float(text.split()[1]))
+
+    monkeypatch.setattr(descent, "progress", lambda steps, **_: Bar(steps))
+    x, values = torch.zeros(1), iter([1.0, 2.0, 3.0, 4.0, 5.0, 60.0, 10.0])
+    Descent(None, "key", 0, False, report_steps=5).run("line", lambda _: next(values) + 0 * x.sum(), {"x": x}, 7, 0.1)
+    assert shown == [3.0, 35.0]

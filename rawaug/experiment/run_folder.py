@@ -1,0 +1,102 @@
+"""The folder of a run: ``OUT/NAME``, which holds one run alone.
+
+``run.json`` holds the settings of the run. The same settings resume it; others are refused, but for those that change
+neither weights nor scores.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rawaug.files import require_writable, write_json
+from rawaug.training.train_config import SAME_WEIGHTS
+
+STAMP = "run.json"
+FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble"})
+"""Keys of a run that may change when it is resumed: where it runs, and what only adds to its results."""
+FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
+"""Such keys of its parts."""
+
+
+def run_folder(settings: Any) -> Path:
+    """The folder of a run.
+
+    Args:
+        settings: of any kind of experiment, with ``out`` and ``name``.
+
+    Raises:
+        ValueError: if the name leads out of ``out``, or is that of ``out`` itself.
+
+    Example:
+        >>> from rawaug.experiment.ablation import Ablation
+        >>> run_folder(Ablation(name="../mine"))
+        Traceback (most recent call last):
+        ValueError: name '../mine': must be a folder within runs; give a name without .. and not beginning with /
+    """
+    out, name = Path(settings.out), Path(settings.name)
+    if name.is_absolute() or ".." in name.parts or not name.parts:
+        raise ValueError(
+            f"name {settings.name!r}: must be a folder within {out}; give a name without .. and not beginning with /"
+        )
+    return out / name
+
+
+def require_free(settings: Any, overwrite: bool = False) -> Path:
+    """The folder of a run, checked: it can be written, and is empty or this run's.
+
+    Args:
+        settings: of any kind of experiment.
+        overwrite: take the folder of another run.
+
+    Raises:
+        ValueError: if it holds another run, naming the settings that differ.
+        OSError: if it cannot be written.
+    """
+    folder = run_folder(settings)
+    require_writable(folder, folder=True)
+    if overwrite or not folder.is_dir() or not any(folder.iterdir()):
+        return folder
+    advice = "give this run another --name, or --overwrite to replace that one"
+    stamp = folder / STAMP
+    if not stamp.is_file():
+        raise ValueError(f"{folder}: holds files, but not the settings of a run ({STAMP}); {advice}")
+    try:
+        known = dict(_flat(json.loads(stamp.read_text())))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{stamp}: not valid JSON ({error.msg}); {advice}") from None
+    asked = dict(_flat(_as_json(settings)))
+    changed = [key for key in sorted(known | asked) if known.get(key) != asked.get(key) and not _free(key)]
+    if changed:
+        differences = ", ".join(f"{key} {known.get(key)}, now {asked.get(key)}" for key in changed[:3])
+        more = f", and {len(changed) - 3} more" if len(changed) > 3 else ""
+        raise ValueError(f"{folder}: holds a run with other settings ({differences}{more}); {advice}")
+    return folder
+
+
+def claim(settings: Any, overwrite: bool = False) -> Path:
+    """:func:`require_free`, and the settings written there."""
+    folder = require_free(settings, overwrite)
+    write_json(_as_json(settings), folder / STAMP)
+    return folder
+
+
+def _as_json(settings: Any) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
+    return content
+
+
+def _flat(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys, as on the command line, and their values."""
+    for key, inner in value.items():
+        if isinstance(inner, Mapping) and inner:
+            yield from _flat(inner, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", inner or None if isinstance(inner, Mapping) else inner
+
+
+def _free(key: str) -> bool:
+    return key in FREE or key.rpartition(".")[2] in FREE_ANYWHERE

@@ -1,0 +1,52 @@
+"""What would stop a run late is one line before any work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rawaug.experiment import denoising
+from rawaug.experiment.early_checks import require_runnable
+from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.extras import MissingExtra
+from rawaug.training.train_config import TrainConfig
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Recipe:
+    return Recipe(name="mine", arms={"real": ArmConfig()}, out=str(tmp_path), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"device": "cdua"}, r"device 'cdua' is unknown; .*nearest: cuda"),
+        ({"device": "cuda"}, r"device 'cuda': 1 needed, this machine has none"),
+        ({"device": "cuda:1"}, "CUDA_VISIBLE_DEVICES"),
+        ({"devices": 0}, "devices must be at least 1"),
+        ({"train": TrainConfig(precision="bf16-mixde")}, r"train\.precision: .*'bf16-mixde' is invalid"),
+        ({"classical": ["Wavelet"]}, r"classical: Wavelet: pywt is not installed; run: pip install"),
+        ({"name": "../mine"}, "must be a folder within"),
+        ({"out": "/dev/null"}, "/dev/null/mine: cannot be written"),
+    ],
+)
+def test_it_is_found_before_any_work(
+    recipe: Recipe, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    monkeypatch.setitem(__import__("sys").modules, "pywt", None)
+    monkeypatch.setattr(denoising, "planned", lambda *_: pytest.fail("data was read"))
+    with pytest.raises((ValueError, OSError), match=message):
+        denoising.run(replace(recipe, **change))
+    assert not list(Path(recipe.out).iterdir())
+
+
+def test_a_run_that_can_go_on_passes_and_leaves_nothing(recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    require_runnable(replace(recipe, train=TrainConfig(precision="bf16-mixed"), classical=["NonLocalMeans"]))
+    assert not list(Path(recipe.out).iterdir())
+    monkeypatch.setitem(__import__("sys").modules, "tensorboard", None)
+    with pytest.raises(MissingExtra, match="tensorboard is not installed"):
+        require_runnable(recipe)

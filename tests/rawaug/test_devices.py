@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from rawaug.devices import find_device
+
+
+def test_devices_are_found_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    assert find_device("auto") == find_device("cpu") == torch.device("cpu")
+    for name in ("cuda", "gpu", "mps", "cuda:0"):
+        with pytest.raises(ValueError, match=f"device '{name}': 1 needed, this machine has none; use cpu or auto"):
+            find_device(name)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert find_device("auto") == find_device("gpu") == torch.device("cuda")
+    assert find_device("cuda:1") == torch.device("cuda", 1)
+    for name, count in (("cuda:2", 1), ("cuda", 3)):
+        with pytest.raises(ValueError, match="this machine has 2"):
+            find_device(name, count=count)
+    for name in ("cudaa", "cuda:one", ""):
+        with pytest.raises(ValueError, match="is unknown; use one of auto, cpu, cuda"):
+            find_device(name)
