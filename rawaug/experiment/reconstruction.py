@@ -167,14 +167,15 @@ class _Comparison:
         names = [pair.name for pair in self.pairs]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
-        if settings.longer and not 1 <= settings.longer_frames <= len(names):
-            raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
         self.scored: Sequence[Pair] = self.pairs
         if settings.test:
             test = open_pairs(settings.test, split="test")
             self.scored = SomePairs(test, range(len(test))[: settings.test_count])
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")
+        if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
+            where, count = settings.test or settings.data, len(self.scored)
+            raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
         self._fitted: tuple[str, Fitted] | None = None
         side = settings.downstream.train.crop if settings.downstream else 2
         self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
