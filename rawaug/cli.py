@@ -15,6 +15,7 @@ from typing import Any
 from rawaug._version import __version__
 from rawaug.extras import MissingExtra
 from rawaug.printable import printable
+from rawaug.shortages import shortage, without_traceback
 
 BAD_INPUT = 2
 OWN = {
@@ -39,6 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except (ValueError, OSError, ArgumentError, MissingExtra) as error:
         print(f"rawaug: {printable(_one_line(error))}", file=sys.stderr)
+        return BAD_INPUT
+    except (RuntimeError, MemoryError) as error:
+        if (reason := shortage(error)) is None:
+            raise
+        print(f"rawaug: {reason}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
@@ -156,7 +162,7 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
     if not dry:
-        experiment.run(recipe, overwrite)
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
     elif experiment.dry_run is None:
         raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
     else:
@@ -168,7 +174,7 @@ def _one_line(error: Exception) -> str:
         return f"not valid JSON: {error.msg}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    text = re.sub(r"<class '([\w.]+)'>", r"\1", " ".join(str(error).split()))
+    text = re.sub(r"<class '([\w.]+)'>", r"\1", " ".join(without_traceback(str(error)).split()))
     return re.sub(r'^Parser key "([^"]+)"', r"\1", text)
 
 

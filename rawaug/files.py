@@ -7,6 +7,7 @@ must be finite, in tensors and in JSON.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -51,8 +52,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
         try:
             yield partial
             partial.replace(path)
+        except OSError as error:
+            if (named := _named(error, path, partial)) is not error:
+                raise named from error
+            raise
         finally:
             partial.unlink(missing_ok=True)
+
+
+def _named(error: OSError, path: Path, partial: Path) -> OSError:
+    """The error with the name of the file that was to be written: a full disk is reported without it."""
+    if "requested and" in str(error):  # NumPy's, of a write that was cut short
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    if error.errno is None or error.filename not in (None, str(partial), partial):
+        return error
+    return OSError(error.errno, error.strerror, str(path))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import denoisers
-from benchmarks import augment, denoise, networks
+from benchmarks import augment, denoise, networks, shards
 
 CPU = torch.device("cpu")
 
@@ -79,3 +79,15 @@ def test_a_form_without_room_is_reported_and_not_timed(monkeypatch: pytest.Monke
     assert denoise.measure(full, torch.rand(1, 4, 8, 8), repeats=1) == {  # type: ignore[arg-type]
         f"{form}, {p}": {} for form in ("whole", "tiles") for p in ("float32", "bfloat16")
     }
+
+
+def test_folders_are_compared_by_names_and_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        shards.generate(tmp_path / name, 2, 16, 24)
+    one, other = (shards.digest(tmp_path / name) for name in ("a", "b"))
+    assert one == other and one[1] > 0
+    first = tmp_path / "a/000/000000.jpg"
+    first.rename(tmp_path / "a/000/renamed.jpg")
+    assert shards.digest(tmp_path / "a")[0] != one[0]
+    (tmp_path / "b/000/000001.jpg").write_bytes(b"other")
+    assert shards.digest(tmp_path / "b")[0] != other[0]

@@ -31,6 +31,7 @@ from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
 from rawaug.io.raw import develop
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import one_at_a_time
 from rawaug.noise import (
     EldLevels,
     FixedLevels,
@@ -309,6 +310,7 @@ def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     return below / mosaic.numel()
 
 
+@one_at_a_time(lambda source, out, *_, **__: Path(out))
 def denoise_folder(
     source: str | Path,
     out: str | Path,

@@ -15,6 +15,7 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.files import require_writable
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
+from rawaug.lock import locked
 from rawaug.noise import MeasuredLevels, camera_law, plot_noise
 from rawaug.registry import COMMANDS
 
@@ -49,18 +50,19 @@ def run(
     require_writable(out)
     figure = Path(out).with_name(f"{Path(out).stem}-noise.png")
     figure.parent.mkdir(parents=True, exist_ok=True)
-    isp = fit(
-        data,
-        noise_figure=figure,
-        state=f"{out}.state",
-        camera_jpeg=camera_jpeg,
-        held_out=held_out,
-        noise=noise,
-        dark=dark,
-        **vars(config),
-    )
-    isp.info["data"] = data
-    isp.save(out)
+    with locked(Path(f"{out}.lock")):
+        isp = fit(
+            data,
+            noise_figure=figure,
+            state=f"{out}.state",
+            camera_jpeg=camera_jpeg,
+            held_out=held_out,
+            noise=noise,
+            dark=dark,
+            **vars(config),
+        )
+        isp.info["data"] = data
+        isp.save(out)
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
     for score in isp.info.get("held_out", [])[-1:]:
         print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")

@@ -80,10 +80,9 @@ class PictureTask:
     def make(self, maker: PairMaker) -> Outcome:
         """Write the missing pairs."""
         try:
-            pairs = maker.pairs(self.picture, self.key, self.numbers)
+            origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
         except (OSError, ValueError) as error:
             return Outcome(0, {self.key: str(error)})
-        origin = maker.origin(self.picture)
         for number, pair in pairs:
             write_pair(_numbered(self.stem, number), pair, maker.augment, maker.settings.format, origin)
         return Outcome(len(self.numbers), {})

@@ -83,25 +83,30 @@ class PairMaker:
         self.settings, self.max_pixels = settings, max_pixels
         self.augment = augmentation(settings.isp, settings.noise, settings.sampling)
 
-    def origin(self, picture: Path) -> Origin:
-        """Of the pairs of a picture's file."""
-        s = self.settings
-        return Origin(str(picture), sha256(picture), s.isp, s.isp_sha256, s.noise)
+    def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
+        """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers.
 
-    def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> Iterator[tuple[int, RawPair]]:
-        """Pairs ``(4, h, w)`` of a file by their numbers; ``key`` is the picture's name in its folder.
+        Args:
+            picture: the file.
+            key: its name in its folder.
+            numbers: of the pairs.
 
         Raises:
-            OSError, ValueError: if it cannot be read, here and not on iteration.
+            OSError, ValueError: if it cannot be read, or changes meanwhile, here and not on iteration.
         """
+        before, content = picture.stat(), sha256(picture)
         srgb = even_sided(apart(read_picture, picture, self.max_pixels))
+        after = picture.stat()
+        if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+            raise ValueError(f"{picture}: changed while it was read; run the same command again")
+        s = self.settings
 
         def made() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:
                 params = self.augment.sample(srgb, keyed_generator(self.settings.seed, "synth", key, number))
                 yield number, self.augment.apply(srgb, params)
 
-        return made()
+        return Origin(str(picture), content, s.isp, s.isp_sha256, s.noise), made()
 
 
 def replayed(

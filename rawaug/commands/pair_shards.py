@@ -92,11 +92,10 @@ class ShardTask:
             for index, name in enumerate(self.names, self.first):
                 picture = self.source / name
                 try:
-                    pairs = maker.pairs(picture, name, range(self.per_image))
+                    origin, pairs = maker.pairs(picture, name, range(self.per_image))
                 except (OSError, ValueError) as error:
                     broken[name] = str(error).replace(str(picture), name)
                     continue
-                origin = maker.origin(picture)
                 for number, pair in pairs:
                     _add_sample(tar, f"{index:08d}_{number}", pair, _described(pair, maker, origin, name, number))
                     made += 1

@@ -31,6 +31,7 @@ from rawaug.evaluation.tables import print_rows
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io.apart import prepare
 from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.lock import NAME, locked
 from rawaug.plugin.augment import Sampling
 from rawaug.printable import printable
 from rawaug.progress import progress
@@ -120,8 +121,9 @@ def synth(
 
     Raises:
         FileNotFoundError: if there is no such folder or ISP.
-        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings.
-        OSError: if a worker dies.
+        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings
+            or is in use by another run.
+        OSError: if a worker dies, or the output folder is removed meanwhile.
     """
     start = time.perf_counter()
     weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
@@ -137,16 +139,17 @@ def synth(
     part, parts = part_of(shard)
     PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
     result = Synthesis(out)
-    if format == "webdataset":
-        shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
-        fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
-        require_same_settings(out / "synth.json", _portable(settings) | fixed)
-        _work_off(shards[part - 1 :: parts], settings, max_pixels, workers, result)
-        pair_shards.finish(shards, settings, out)
-    else:
-        tasks = list(picture_tasks(pictures, source, out, per_image))
-        require_same_settings(out / "synth.json", vars(settings))
-        _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
+    with locked(out / (NAME if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
+        if format == "webdataset":
+            shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
+            fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
+            require_same_settings(out / "synth.json", _portable(settings) | fixed)
+            _work_off(shards[part - 1 :: parts], settings, max_pixels, workers, result)
+            pair_shards.finish(shards, settings, out)
+        else:
+            tasks = list(picture_tasks(pictures, source, out, per_image))
+            require_same_settings(out / "synth.json", vars(settings))
+            _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())

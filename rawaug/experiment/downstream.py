@@ -99,7 +99,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     """Mean scores on the test frames; their noise is frozen with seed 0."""
     pairs = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
-    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, False, "PSNR_d")]
+    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
     return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
 
 

@@ -11,7 +11,9 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
 from rawaug.data.remembered import Remembered
+from rawaug.data.select import selected
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
@@ -115,9 +117,12 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     for part, frames in {"pairs": pairs, "validation": [] if held_out else validation}.items():
         if (seen := shared_frame(test, frames)) is not None:
             raise ValueError(f"data.test: {seen} is also in data.{part}; test on unseen frames")
-    pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
+    chosen = SomePairs(pairs, selected(pairs, kept, data.count, data.select))
+    pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
+    if pictures is None:
+        pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
     return Plan(
-        pairs=SomePairs(pairs, range(kept)[: data.count]),
+        pairs=chosen,
         validation=validation,
         test=test if data.test_count is None else SomePairs(test, range(len(test))[: data.test_count]),
         pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,

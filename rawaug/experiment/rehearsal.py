@@ -87,7 +87,7 @@ def _isp(recipe: Recipe, pairs: Sequence[Pair]) -> DictionaryISP:
     """The recipe's own, or a fit of two steps."""
     if recipe.camera is not None:
         return DictionaryISP.from_pretrained(find_weights(recipe.camera))
-    quick = replace(recipe.isp, steps=2, pixels=512, batch=128, joint_steps=0, encoders="off")
+    quick = replace(recipe.isp.smoke(), joint_steps=0, encoders="off")
     return fit(pairs, progress=False, noise="on" if recipe.noise == "camera" else "off", **asdict(quick))
 
 

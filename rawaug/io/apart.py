@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -117,6 +118,7 @@ class _Helper:
         self.pid, self.memory = int(message), descriptor
         self.view: mmap.mmap | None = None
         self.connection = Connection(link.detach())
+        self.let_go = weakref.finalize(self, _close, self.connection, descriptor)
 
     def call(self, request: Any, seconds: float) -> tuple[bool, Any]:
         """Whether there is a value, and the value or the error.
@@ -135,7 +137,7 @@ class _Helper:
         except (EOFError, ConnectionError):
             kind, content, sizes = "died", 0, ()
         if kind == "died":
-            self.close()
+            self.let_go()
             raise _Lost(f"crashes the decoder ({_ending(content)}); leave it out, or copy it again")
         return kind == "value", pickle.loads(content, buffers=self._copied(sizes))
 
@@ -154,18 +156,13 @@ class _Helper:
         """End the process, whatever it does."""
         with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
-        self.close()
+        self.let_go()
 
-    def close(self) -> None:
-        """Let go of it; it ends by itself."""
-        if self.memory >= 0:
-            self.connection.close()
-            os.close(self.memory)
-            self.memory, self.view = -1, None
 
-    def __del__(self) -> None:
-        if hasattr(self, "connection"):
-            self.close()
+def _close(connection: Connection, descriptor: int) -> None:
+    """Let go of a helper, which then ends by itself."""
+    connection.close()
+    os.close(descriptor)
 
 
 def _ending(status: int) -> str:

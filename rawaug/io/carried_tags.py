@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rawaug.extras import extra
-from rawaug.io.tiff_tags import CFA_PHOTOMETRIC, all_pages, opened_tiff
+from rawaug.io.tiff_tags import all_pages, main_mosaic, opened_tiff
 
 _DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
@@ -92,7 +92,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
             dng = any(_DNG_VERSION in page.tags for page in pages)
-            mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC][:1] if dng else []
+            mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []
             tags: dict[int, Tag] = {}
             for page in (pages[0], *mosaics):
                 kept = [tag for tag in page.tags if (tag.code not in _DROPPED if dng else tag.code in _OF_ANY_TIFF)]

@@ -194,7 +194,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     white_balance = _white_balance(raw)
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     return RawFrame(
-        mosaic=_normalised(raw.raw_image_visible, black, white),
+        mosaic=_normalised(raw.raw_image_visible, _black_of_sites(path, raw, black, tags), white),
         cfa=cfa,
         black=tuple(float(black[site]) for site in cfa.sites),  # type: ignore[arg-type]
         white=white,
@@ -213,16 +213,51 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
+    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions.
+
+    Where a DNG's active area begins at an odd row or column, LibRaw leaves that one out, and gives the remaining sites
+    the levels of their neighbours.
+    """
     levels = raw.black_level_per_channel
     black = np.array([[levels[k] for k in row] for row in cell], np.float32)
-    exact = np.array(tags.black, np.float32).reshape(2, 2) if tags.black is not None else black
-    return exact if np.abs(exact - black).max() < 1 else black
+    if tags.black is None:
+        return black
+    exact = np.array(tags.black, np.float32).reshape(2, 2)
+    allowed = 2 if tags.black_rows or tags.black_columns else 1  # LibRaw rounds the means of rows and columns as well
+    if np.abs(exact - black).max() >= allowed:
+        return black
+    rows, columns = _left_out(raw, tags)
+    return np.roll(exact, (-rows, -columns), axis=(0, 1))
+
+
+def _left_out(raw: Any, tags: TiffTags) -> tuple[int, int]:
+    """The rows and columns of a DNG's active area that the visible mosaic begins after, 0 or 1 of each."""
+    rows, columns = raw.sizes.top_margin - tags.area[0], raw.sizes.left_margin - tags.area[1]
+    return (rows, columns) if {rows, columns} <= {0, 1} else (0, 0)
+
+
+def _black_of_sites(path: Path, raw: Any, black: np.ndarray, tags: TiffTags) -> np.ndarray:
+    """Levels ``(H, W)`` of a DNG whose rows or columns have their own; ``(2, 2)`` of all others."""
+    if not (tags.black_rows or tags.black_columns):
+        return black
+    (height, width), first = raw.raw_image_visible.shape, _left_out(raw, tags)
+    lines = []
+    for above, start, length in zip((tags.black_rows, tags.black_columns), first, (height, width), strict=True):
+        if above and len(above) != start + length:
+            raise OSError(
+                f"{path}: its TIFF tags are damaged (black levels of {len(above)} lines, not {start + length})"
+            )
+        lines.append(np.array(above or (0.0,) * (start + length), np.float32)[start:])
+    cells = np.tile(black, (-(-height // 2), -(-width // 2)))[:height, :width]
+    return np.asarray(cells + lines[0][:, None] + lines[1])
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
-    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(2, 2)``."""
+    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(2, 2)`` or ``(H, W)``."""
     height, width = (side // 2 * 2 for side in numbers.shape)
+    if black.shape != (2, 2):
+        numbers, black = numbers[:height, :width], black[:height, :width]
+        return torch.from_numpy(np.minimum((numbers - black) / (white - black), 1, dtype=np.float32)[None])
     cells = numbers[:height, :width].astype(np.float32).reshape(height // 2, 2, width // 2, 2)
     cells -= black[None, :, None, :]
     cells /= (white - black)[None, :, None, :]

@@ -20,10 +20,11 @@ from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.tiff_directories import require_no_circle
 
 _MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
-_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50715, 50716)
+_BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
+_ACTIVE_AREA = 50829
 _OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC = 32803
-_RATIONAL = 5
+_RATIONALS = (5, 10)
 _DAMAGE = (
     *(ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError),
     struct.error,
@@ -38,8 +39,11 @@ class TiffTags:
         make, model: of the camera.
         noise_profile: (shot_var, read_var), the mean over colour planes.
         mosaic_end: the byte after a DNG's mosaic; a smaller file is truncated.
-        black: a DNG's black levels, row by row of the cell at the top left of the visible mosaic, fractions kept; None
-            also where they differ from row to row or repeat over more than two.
+        black: a DNG's black levels, row by row of the cell at the top left of the active area, fractions kept; None
+            also where they repeat over more than two rows or columns. Of those that differ from row to row or from
+            column to column it is the mean.
+        black_rows, black_columns: by how much the black of a DNG's rows and columns is above that mean.
+        area: (top, left) of a DNG's active area.
         gain_maps: a DNG's lens shading, empty without.
     """
 
@@ -49,6 +53,9 @@ class TiffTags:
     mosaic_end: int | None = None
     black: tuple[float, float, float, float] | None = None
     gain_maps: tuple[GainMap, ...] = ()
+    black_rows: tuple[float, ...] = ()
+    black_columns: tuple[float, ...] = ()
+    area: tuple[int, int] = (0, 0)
 
 
 def read_tiff_tags(path: Path) -> TiffTags:
@@ -66,9 +73,15 @@ def read_tiff_tags(path: Path) -> TiffTags:
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
             if not any(_DNG_VERSION in page.tags for page in pages):
                 return TiffTags(make, model)
-            mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
-            black, maps = (_black(mosaics[0]), _gain_maps(mosaics[0])) if mosaics else (None, ())
-            return TiffTags(make, model, _noise_profile(pages), _mosaic_end(mosaics), black, maps)
+            mosaic = main_mosaic(pages)
+            profile = _noise_profile(pages)
+            if mosaic is None:
+                return TiffTags(make, model, profile)
+            rows, columns = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
+            black = _black(mosaic, _mean(rows) + _mean(columns))
+            area = mosaic.tags.valueof(_ACTIVE_AREA) or (0, 0)
+            above = (_about_zero(deltas) for deltas in (rows, columns))
+            return TiffTags(make, model, profile, _mosaic_end(mosaic), black, _gain_maps(mosaic), *above, area[:2])
     except tifffile.TiffFileError:
         return TiffTags()
 
@@ -112,6 +125,12 @@ def all_pages(pages: Any) -> Iterator[Any]:
         yield from all_pages(getattr(page, "pages", None) or ())
 
 
+def main_mosaic(pages: list[Any]) -> Any:
+    """The page that LibRaw reads: of several mosaics, as phones write them, the largest; None without any."""
+    mosaics = [page for page in pages if page.photometric == CFA_PHOTOMETRIC]
+    return max(mosaics, key=lambda page: page.imagelength * page.imagewidth, default=None)
+
+
 def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
     for page in pages:
         values = page.tags.valueof(_NOISE_PROFILE)
@@ -123,21 +142,45 @@ def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
     return None
 
 
-def _mosaic_end(mosaics: list[Any]) -> int | None:
-    ends = [
-        offset + count for page in mosaics for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True)
-    ]
-    return max(ends, default=None)
+def _mosaic_end(mosaic: Any) -> int | None:
+    parts = zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)
+    return max((offset + count for offset, count in parts), default=None)
 
 
-def _black(mosaic: Any) -> tuple[float, float, float, float] | None:
+def _numbers(tag: Any) -> Any:
+    """The values of a tag, rationals divided, float64 ``(N,)``."""
+    values = np.ravel(tag.value).astype(np.float64)
+    if tag.dtype not in _RATIONALS:
+        return values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return values[0::2] / values[1::2]
+
+
+def _deltas(mosaic: Any, code: int) -> tuple[float, ...]:
+    """What is added to the black level of each row or column of the active area; empty where nothing is."""
+    tag = mosaic.tags.get(code)
+    if tag is None or not np.any(values := _numbers(tag)):
+        return ()
+    if not np.isfinite(values).all():
+        raise ValueError(f"tag {code}: black levels that are not finite")
+    return tuple(values.tolist())
+
+
+def _about_zero(deltas: tuple[float, ...]) -> tuple[float, ...]:
+    """What is left without the mean; empty where that is nothing."""
+    mean = _mean(deltas)
+    return tuple(delta - mean for delta in deltas) if any(delta != mean for delta in deltas) else ()
+
+
+def _mean(values: tuple[float, ...]) -> float:
+    return sum(values) / len(values) if values else 0.0
+
+
+def _black(mosaic: Any, more: float) -> tuple[float, float, float, float] | None:
     tag = mosaic.tags.get(_BLACK)
-    if tag is None or any(code in mosaic.tags for code in _BLACK_DELTAS):
-        return None
-    levels = np.ravel(tag.value).astype(np.float64)
-    if tag.dtype == _RATIONAL:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            levels = levels[0::2] / levels[1::2]
+    if tag is None:
+        return (more, more, more, more) if more else None
+    levels = _numbers(tag) + more
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
     if len(levels) != rows * columns or 2 % rows or 2 % columns:
         return None

@@ -63,13 +63,14 @@ class BakedISP(nn.Module):
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
         cube = node_colours(nodes)
         tables = Tables(cube, cube)
-        with torch.no_grad(), one_thread():  # the same table in every process
+        plain = torch.autocast(isp.gain.log_gains.device.type, enabled=False)
+        with torch.no_grad(), one_thread(), plain:  # the same table in every process
             for stage in isp.ordered_stages:
                 tables = stage.bake(tables)
             attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
             self.register_buffer("table", _as_table(tables.x2, nodes))
             self.register_buffer("attention", attention)
-        self.chooser = Chooser(isp)
+            self.chooser = Chooser(isp)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""

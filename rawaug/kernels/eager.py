@@ -1,8 +1,8 @@
 """What ``torch.compile`` leaves as it is written: loops that are compiled already, draws from keyed generators.
 
 Dynamo traces Python into tensor operations. It cannot trace Numba's compiler, and a hash or a generator's seed that it
-traced are a constant of the graph. A step marked :func:`eager` breaks the graph instead and runs as it always does:
-the same bits with and without ``torch.compile``.
+traced would be a constant of the graph. A step marked :func:`eager` breaks the graph instead and runs as it always
+does: the same bits with and without ``torch.compile``.
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ class Journal:
         if self.path.is_file():
             head, *rows = self.path.read_text().splitlines(keepends=True)
             kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= start]
-            self.path.write_text("".join([head, *kept]) if kept else "")
+            with replacing(self.path) as partial:
+                partial.write_text("".join([head, *kept]) if kept else "")
         for events in folder.glob("events.out.tfevents.*") if not start else ():
             events.unlink()
         self.next_shown = 0

@@ -7,6 +7,7 @@ falls.
 from __future__ import annotations
 
 import copy
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,10 +58,12 @@ class TrainingState:
         self.step, self.best, self.losses = int(state["step"]), state["best"], state.get("losses", self.losses)
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint, whole or not at all: a kill leaves the one before."""
+        """Write a checkpoint, whole or not at all: a kill or a full disk leaves the one before."""
         state = {key: part.state_dict() for key, part in self._parts.items()}
+        content = io.BytesIO()  # PyTorch's own writer does not say that a disk is full
+        torch.save({**state, "step": self.step, "best": self.best, "losses": self.losses.cpu()}, content)
         with replacing(path) as partial:
-            torch.save({**state, "step": self.step, "best": self.best, "losses": self.losses.cpu()}, partial)
+            partial.write_bytes(content.getbuffer())
 
     def place(self, fabric: Any) -> Any:
         """Move it to Fabric's device.

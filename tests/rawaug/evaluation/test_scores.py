@@ -46,6 +46,18 @@ def identity(tmp_path: Path) -> Path:
     return path
 
 
+def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
+    """A test must not know the clean frame, not even through its noise map."""
+    captured = demo_pairs("test", count=1)[0]
+    assert captured.shot_var is not None and captured.read_var is not None
+    drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
+    for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
+        sample = frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=0)
+        assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
+        expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
+        torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
+
+
 def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> None:
     result = evaluate(identity, "demo:validation")
     assert result["kind"] == "denoiser" and len(result["images"]) == 4

@@ -144,7 +144,7 @@ def test_settings_of_pairs_need_pairs() -> None:
 def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
     own: Path, data: DataConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test, "--isp.curve-steps", "5"]
+    command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test]
     command += ["--data.pictures", data.pictures, "--dry-run", "--out", str(tmp_path / "runs")]
     assert main([*command, *ONE_ARM, *BARE]) == 0
     said = capsys.readouterr().out

@@ -1,0 +1,344 @@
+"""Kills, full disks and two runs at once: what was there stays whole, and a run goes on as if nothing had been.
+
+    python -m benchmarks.faults [--kills 20] [--seed 0] [--commands fit run synth denoise] [--quick] [--json FILE]
+
+Every command runs in a forked child on small generated files. First it runs to its end; then it is killed ``--kills``
+times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill the same
+command is run again to its end in the same folder. Its files must then equal those of the run that was not killed, bit
+for bit (tensors of safetensors; of JSON all but times), and nothing else may be left. Other faults follow, those of a
+small file system as root on Linux only. Exit status 1 if anything differs or ends in more than one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+PATIENCE = 120.0
+OUT = "out"
+LEFT_OUT = (".csv", ".html", ".png", ".lock")
+"""Endings of files that hold times, or pictures of them."""
+
+COMMANDS: dict[str, list[str]] = {
+    "fit": ["fit", "shots", "--out", f"{OUT}/camera.safetensors", "--steps", "40", "--pixels", "512", "--batch", "128",
+            "--noise", "off"],
+    "run": ["run", "recipe.yaml", "--out", OUT],
+    "synth": ["synth", "pictures", OUT, "--per-image", "4", "--workers", "0", "--noise", "[0.001, 1e-5]"],
+    "denoise": ["denoise", "shots", OUT, "--denoiser", "denoiser.safetensors"],
+}  # fmt: skip
+"""In a folder that :func:`make_inputs` has filled."""
+
+RECIPE = """
+name: small
+data: {pairs: "demo:train", count: 1, pictures: "demo:", validation: null, test: "demo:test", test_count: 1}
+isp: {steps: 2, pixels: 512, batch: 128}
+noise: [0.001, 1.0e-5]
+denoiser: {name: DnCNN, settings: {width: 4, depth: 2}}
+train: {steps: 12, batch: 2, crop: 32, warmup: 1, validate_every: 6, checkpoint_every: 2, workers: 0}
+classical: []
+untouched: []
+device: cpu
+arms: {augmented: {augmented: 1.0}}
+"""
+
+
+def make_inputs(folder: Path) -> None:
+    """Pictures, RAW files, a denoiser and a recipe."""
+    import denoisers
+    from rawaug.bayer import CFA
+    from rawaug.io import RawFrame, write_dng, write_picture
+
+    for name in ("pictures", "shots"):
+        (folder / name).mkdir()
+    generator = torch.Generator().manual_seed(0)
+    for k in range(4):
+        coarse = torch.rand(2, 3, 8, 8, generator=generator)
+        picture, light = torch.nn.functional.interpolate(coarse, (96, 128), mode="bilinear")
+        write_picture(folder / "pictures" / f"{k}.png", picture)
+        plane = light[:1] * 0.6 + 0.03 * torch.randn(1, 96, 128, generator=generator).abs()
+        matrix = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
+        frame = RawFrame(plane, CFA.RGGB, (512.0,) * 4, 16383.0, (2.0, 1.0, 1.5), (1.9, 1.0, 1.6), matrix,
+                         "Maker Model", 100.0, (1e-3, 1e-5), 0, f"{k}")  # fmt: skip
+        write_dng(folder / "shots" / f"{k}.dng", frame)
+    denoisers.save(denoisers.build("DnCNN", width=4, depth=3), folder / "denoiser.safetensors", {"cfa": "RGGB"})
+    (folder / "recipe.yaml").write_text(RECIPE)
+
+
+# -- children ---------------------------------------------------------------------------------------------------------
+
+
+class Child:
+    """A forked process that runs a command in ``folder``; what it prints goes to ``folder/log.txt``."""
+
+    def __init__(self, folder: Path, command: list[str], before: Callable[[], None] = lambda: None) -> None:
+        self.log, self.start = folder / "log.txt", time.monotonic()
+        sys.stdout.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            os._exit(_run(folder, self.log, command, before))
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal, if the child is still there."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, number)
+
+    def wait(self) -> int:
+        """The exit status, or minus the signal; TimeoutError if it does not end."""
+        while time.monotonic() - self.start < PATIENCE:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                return os.waitstatus_to_exitcode(status)
+            time.sleep(0.005)
+        self.send(signal.SIGKILL)
+        os.waitpid(self.pid, 0)
+        raise TimeoutError(f"hung for {PATIENCE:g} s; {self.said()}")
+
+    def said(self) -> str:
+        """What it printed last."""
+        return self.log.read_text(errors="replace")[-2000:]
+
+
+def _run(folder: Path, log: Path, command: list[str], before: Callable[[], None]) -> int:
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(file, stream)
+    sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1) for stream in (1, 2))
+    try:
+        for number in SIGNALS[1:]:
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        torch.set_num_threads(1)
+        os.environ["RAWAUG_READ_SECONDS"] = "0"  # decoders in the child itself
+        os.chdir(folder)
+        before()
+        from rawaug.cli import main
+
+        return main(command)
+    except KeyboardInterrupt:  # before the command line was reached
+        return 130
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+        return 1
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """By name, what of each file is compared."""
+    from rawaug.files import read_tensors
+
+    found: dict[str, Any] = {}
+    for file in sorted(folder.rglob("*")):
+        name = str(file.relative_to(folder))
+        if not file.is_file() or file.suffix in LEFT_OUT or file.name.startswith("events.out"):
+            continue
+        if file.suffix == ".safetensors":
+            tensors = read_tensors(file, "it is damaged")[1]
+            found[name] = {key: (value.shape, value.numpy().tobytes()) for key, value in tensors.items()}
+        else:
+            found[name] = file.read_bytes()
+    return found
+
+
+def fresh(folder: Path) -> Path:
+    """The folder without what a run wrote."""
+    shutil.rmtree(folder / OUT, ignore_errors=True)
+    return folder
+
+
+# -- kills ------------------------------------------------------------------------------------------------------------
+
+
+def uninterrupted(folder: Path, name: str) -> tuple[dict[str, Any], float]:
+    """The files of a run that is left alone, and its seconds.
+
+    Raises:
+        ValueError: if it fails.
+    """
+    child = Child(fresh(folder), COMMANDS[name])
+    if status := child.wait():
+        raise ValueError(f"{name}: status {status} without any fault: {child.said()}")
+    return contents(folder / OUT), time.monotonic() - child.start
+
+
+def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole: dict[str, Any]) -> str | None:
+    """What went wrong with a run that was killed after ``delay`` seconds and run again; None if nothing did."""
+    child = Child(fresh(folder), COMMANDS[name])
+    time.sleep(delay)
+    child.send(number)
+    status = child.wait()
+    if status not in (0, -number, 130) or "Traceback" in child.said():
+        return f"{name}, {number.name} after {delay:.2f} s: status {status}: {child.said()}"
+    again = Child(folder, COMMANDS[name])
+    if (status := again.wait()) or "Traceback" in again.said():
+        return f"{name}, {number.name} after {delay:.2f} s, run again: status {status}: {again.said()}"
+    after = contents(folder / OUT)
+    different = sorted(key for key in whole.keys() | after.keys() if whole.get(key) != after.get(key))
+    return f"{name}, {number.name} after {delay:.2f} s: {', '.join(different)} differ" if different else None
+
+
+def kills(folder: Path, names: list[str], count: int, seed: int) -> Iterator[tuple[str, list[str], float]]:
+    """By command: its faults, and the seconds of a run."""
+    for name in names:
+        whole, seconds = uninterrupted(folder, name)
+        moments = random.Random(f"{seed} {name}")
+        outcomes = (
+            killed(folder, name, SIGNALS[k % len(SIGNALS)], moments.uniform(0, seconds), whole) for k in range(count)
+        )
+        yield name, [outcome for outcome in outcomes if outcome], seconds
+
+
+# -- other faults -----------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def small_file_system(place: Path, kilobytes: int) -> Iterator[bool]:
+    """Mount a tmpfs of this size over a folder; False where that is not allowed."""
+    place.mkdir(exist_ok=True)
+    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
+    mounted = shutil.which("mount") is not None and subprocess.run(command, capture_output=True).returncode == 0
+    try:
+        yield mounted
+    finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def one_line(child: Child, *said: str) -> str | None:
+    """What is wrong with how a command ended that had to fail in one line with these words; None if nothing is."""
+    status, text = child.wait(), child.said()
+    lines = [line for line in text.splitlines() if line.startswith("rawaug: ")]
+    if status == 2 and len(lines) == 1 and "Traceback" not in text and all(word in lines[0] for word in said):
+        return None
+    return f"status {status}: {text}"
+
+
+def full_disk(folder: Path, name: str) -> str | None:
+    """A disk with room for a part: one line, and the files that are there are whole."""
+    whole, _ = uninterrupted(folder, name)
+    size = sum(file.stat().st_size for file in (folder / OUT).rglob("*") if file.is_file())
+    with small_file_system(fresh(folder) / OUT, max(16, size // 2048)) as mounted:
+        if not mounted:
+            return None
+        if wrong := one_line(Child(folder, COMMANDS[name]), "No space left on device"):
+            return wrong
+        parts = contents(folder / OUT)
+        half = [file for file in parts if file in whole and parts[file] != whole[file]]
+        return f"incomplete: {', '.join(half)}" if half and name != "run" else None
+
+
+def two_at_once(folder: Path, name: str) -> str | None:
+    """The second of two is refused; the first comes to its end."""
+    whole, _ = uninterrupted(folder, name)
+    first = Child(fresh(folder), COMMANDS[name])
+    while not list(folder.rglob("*.lock")) and time.monotonic() - first.start < PATIENCE:
+        time.sleep(0.002)
+    first.send(signal.SIGSTOP)
+    first.log = first.log.rename(folder / "first.txt")
+    wrong = one_line(Child(folder, COMMANDS[name]), "in use by process", str(first.pid))
+    first.send(signal.SIGCONT)
+    if status := first.wait():
+        return f"the first: status {status}: {first.said()}"
+    return wrong or (None if contents(folder / OUT) == whole else "the first ended with other files")
+
+
+def few_descriptors(folder: Path, name: str) -> str | None:
+    """64 open files are enough."""
+    whole, _ = uninterrupted(folder, name)
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    child = Child(fresh(folder), COMMANDS[name], lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (64, limit)))
+    status = child.wait()
+    return None if status == 0 and contents(folder / OUT) == whole else f"status {status}: {child.said()}"
+
+
+def jumping_clock(folder: Path, name: str) -> str | None:
+    """A wall clock that jumps by years, back and forth, changes nothing."""
+    whole, _ = uninterrupted(folder, name)
+    jumps = random.Random(0)
+
+    def jump() -> None:
+        time.time = lambda: jumps.uniform(0, 4e9)  # type: ignore[assignment]
+
+    child = Child(fresh(folder), COMMANDS[name], jump)
+    status = child.wait()
+    return None if status == 0 and contents(folder / OUT) == whole else f"status {status}: {child.said()}"
+
+
+def removed_folder(folder: Path, name: str) -> str | None:
+    """The output folder is removed in the middle: one line, no false success."""
+    child = Child(fresh(folder), COMMANDS[name])
+    while not list(folder.rglob("*.lock")) and time.monotonic() - child.start < PATIENCE:
+        time.sleep(0.002)
+    child.send(signal.SIGSTOP)
+    shutil.rmtree(folder / OUT)
+    child.send(signal.SIGCONT)
+    return one_line(child, OUT)
+
+
+def unwritable_folder(folder: Path, name: str) -> str | None:
+    """An output folder on a file system that is mounted read-only."""
+    with small_file_system(fresh(folder) / OUT, 64) as mounted:
+        if not mounted:
+            return None
+        subprocess.run(["mount", "-o", "remount,ro", str(folder / OUT)], check=True)
+        return one_line(Child(folder, COMMANDS[name]), OUT, "Read-only file system")
+
+
+FAULTS = {
+    "full disk": full_disk,
+    "two at once": two_at_once,
+    "64 descriptors": few_descriptors,
+    "clock jumps": jumping_clock,
+    "folder removed": removed_folder,
+    "folder read-only": unwritable_folder,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=20, help="of each command")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--quick", action="store_true", help="one kill of each command")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    start, count, results = time.perf_counter(), 1 if args.quick else args.kills, dict[str, Any]()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_inputs(folder)
+        for command, wrong, seconds in kills(folder, args.commands, count, args.seed):
+            results[command] = {"seconds": round(seconds, 2), "kills": count, "wrong": wrong}
+            print(f"{command:8} {seconds:5.1f} s  {count} kills, {len(wrong)} wrong", flush=True)
+            for fault, test in FAULTS.items():
+                found = test(folder, command)
+                results[command][fault] = found
+                print(f"{command:8} {fault}: {found or 'as it should be'}", flush=True)
+    took = round(time.perf_counter() - start)
+    print(f"{took} s")
+    if args.json:
+        args.json.write_text(json.dumps({"seed": args.seed, "seconds": took, **results}, indent=1) + "\n")
+    failed = any(row["wrong"] or any(row[fault] for fault in FAULTS) for row in results.values())
+    for row in results.values():
+        print(*row["wrong"], sep="\n", end="")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

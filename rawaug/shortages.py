@@ -1,0 +1,47 @@
+"""What PyTorch reports when the machine lacks something, as one line with a way out.
+
+PyTorch raises a RuntimeError of several lines where a worker was killed, or shared memory, file descriptors or memory
+have run out: no fault of a program, so no traceback either.
+"""
+
+from __future__ import annotations
+
+import re
+
+_WAYS_OUT = (
+    (
+        r"out of shared memory|shared memory\(shm\)|bus error|/torch_",
+        "shared memory is full; enlarge /dev/shm or use fewer workers",
+    ),
+    (r"too many open files|ancdata", "too many open files; raise the limit (ulimit -n) or use fewer workers"),
+    (r"out of memory|can't allocate memory", "out of memory; use a smaller batch, crop or tile"),
+    (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
+    (r"no space left on device|pytorchstreamwriter", "the disk is full; make room"),
+)
+"""By what the error says, in lower case, first match."""
+
+
+def shortage(error: BaseException) -> str | None:
+    """What is short and what to do about it, in one line; None for any other error.
+
+    Example:
+        >>> shortage(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
+        'a worker process was killed, perhaps for its memory; use fewer workers, then run the same command again'
+    """
+    if isinstance(error, MemoryError):
+        return f"{_WAYS_OUT[2][1]}, then run the same command again"
+    text = str(error).lower()
+    found = next((way for pattern, way in _WAYS_OUT if re.search(pattern, text, re.DOTALL)), None)
+    return None if found is None else f"{found}, then run the same command again"
+
+
+def without_traceback(text: str) -> str:
+    """The last line of an error that a DataLoader's worker raised, in place of its traceback.
+
+    Example:
+        >>> without_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")
+        'a'
+    """
+    if "Original Traceback" not in text:
+        return text
+    return text.strip().splitlines()[-1].partition(": ")[2]

@@ -1,0 +1,336 @@
+"""Faults of the machine in short form: what was there stays whole, and a run goes on or ends in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+import denoisers
+from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairs
+from rawaug.bayer import CFA
+from rawaug.cli import main
+from rawaug.commands import pair_files, pair_maker
+from rawaug.commands.synth import synth
+from rawaug.data import PictureFolder
+from rawaug.files import replacing, write_json, write_tensors
+from rawaug.io import RawFrame, write_dng, write_picture
+from rawaug.lock import NAME, locked
+from rawaug.shortages import shortage
+from rawaug.training.state import TrainingState
+from rawaug.training.train_config import TrainConfig
+
+ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forks, signals and limits of Linux")
+
+
+@pytest.fixture(scope="module")
+def harness() -> Iterator[Any]:
+    """The benchmark, whose kills these are in short form."""
+    sys.path.insert(0, str(ROOT))
+    from benchmarks import faults
+
+    yield faults
+    sys.path.remove(str(ROOT))
+
+
+@pytest.fixture(scope="module")
+def inputs(harness: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    harness.make_inputs(folder)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decoders in this process: to start another takes seconds."""
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")
+
+
+# -- kills ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "number"), [("fit", "SIGINT"), ("run", "SIGKILL"), ("synth", "SIGTERM"), ("denoise", "SIGKILL")]
+)
+def test_a_killed_command_goes_on_bit_for_bit(harness: Any, inputs: Path, name: str, number: str) -> None:
+    whole, seconds = harness.uninterrupted(inputs, name)
+    assert whole
+    assert harness.killed(inputs, name, getattr(signal, number), 0.7 * seconds, whole) is None
+
+
+def test_a_different_result_is_noticed(harness: Any, inputs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = harness.uninterrupted(inputs, "denoise")
+    whole["0.dng"] = whole["0.dng"][:-1] + b"?"
+    assert "0.dng differ" in harness.killed(inputs, "denoise", signal.SIGKILL, 0.0, whole)
+
+
+# -- one run at a time ------------------------------------------------------------------------------------------------
+
+
+def in_child(work: Callable[[], object]) -> int:
+    """The exit status of ``work`` in a fork of this process; 1 for an exception."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            work()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def test_a_second_run_is_refused_with_the_name_of_the_first(tmp_path: Path) -> None:
+    def second() -> None:
+        with pytest.raises(ValueError, match=rf"{tmp_path}: in use by process {os.getppid()} on .*rawaug\.lock"):
+            locked(tmp_path / NAME).__enter__()
+
+    with locked(tmp_path / NAME):
+        assert in_child(second) == 0
+        with pytest.raises(ValueError, match="in use by this process"):
+            locked(tmp_path / NAME).__enter__()
+    with locked(tmp_path / NAME):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
+    def die() -> None:
+        locked(tmp_path / NAME).__enter__()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    assert in_child(die) == -signal.SIGKILL
+    assert "process" in (tmp_path / NAME).read_text()
+    with locked(tmp_path / NAME):
+        assert f"process {os.getpid()} on" in (tmp_path / NAME).read_text()
+
+
+def test_a_folder_that_was_only_made_for_the_lock_is_taken_away(tmp_path: Path, inputs: Path) -> None:
+    out = tmp_path / "new" / "pairs"
+    with pytest.raises(ValueError, match="'bogus' is unknown"):
+        synth(inputs / "pictures", out, noise="bogus", workers=0)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("command", ["synth", "denoise"])
+def test_two_at_once(command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = {
+        "synth": ["synth", str(inputs / "pictures"), str(tmp_path), "--workers", "0"],
+        "denoise": [
+            "denoise",
+            str(inputs / "shots"),
+            str(tmp_path),
+            "--denoiser",
+            str(inputs / "denoiser.safetensors"),
+        ],
+    }
+    with locked(tmp_path / NAME):
+        assert main(arguments[command]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "in use by" in error
+
+
+# -- disks and folders ------------------------------------------------------------------------------------------------
+
+FRAME = RawFrame(
+    torch.full((1, 128, 128), 0.5), CFA.RGGB, (0.0,) * 4, 4095.0, (2.0, 1.0, 1.5), (2.0, 1.0, 1.5), torch.eye(3),
+    "Maker Model", None, None, 0, "a",
+)  # fmt: skip
+
+
+def _save_picture(path: Path) -> None:
+    with replacing(path) as partial:
+        np.save(partial.open("wb"), np.zeros(40_000, np.float32))
+
+
+def _save_checkpoint(path: Path) -> None:
+    TrainingState(denoisers.build("DnCNN", width=24, depth=4), TrainConfig(steps=1)).save(path)
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "safetensors": lambda path: write_tensors({"x": torch.zeros(40_000)}, {"format": "rawaug"}, path),
+    "json": lambda path: write_json(["x" * 100_000], path),
+    "dng": lambda path: write_dng(path, FRAME),
+    "checkpoint": _save_checkpoint,
+    "denoiser": lambda path: denoisers.save(denoisers.build("DnCNN", width=32, depth=4), path, {"cfa": "RGGB"}),
+    "numpy": _save_picture,
+}
+
+
+@pytest.mark.parametrize("kind", list(WRITERS))
+def test_a_full_disk_leaves_what_was_there_and_says_so(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a.{kind}"
+    WRITERS[kind](path)
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16_384, limits[1]))  # as on a full disk, a write is cut short or fails
+    try:
+        with pytest.raises(OSError) as caught:
+            WRITERS[kind](path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == [path.name]
+    assert caught.value.filename == str(path) and caught.value.strerror
+
+
+def test_an_output_folder_that_is_removed_on_the_way_is_reported(
+    tmp_path: Path, inputs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, calls = pair_files.write_pair, list[Path]()
+
+    def write_and_remove(stem: Path, *rest: Any) -> None:
+        write(stem, *rest)
+        calls.append(stem)
+        if len(calls) == 2:
+            for file in (tmp_path / "out").iterdir():
+                file.unlink()
+            (tmp_path / "out").rmdir()
+
+    monkeypatch.setattr(pair_files, "write_pair", write_and_remove)
+    with pytest.raises(OSError, match="out: was removed or replaced during this run; run the same command again"):
+        synth(inputs / "pictures", tmp_path / "out", workers=0)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
+def test_a_folder_without_the_right_to_write_is_named(tmp_path: Path) -> None:
+    def as_nobody() -> None:
+        os.chdir(tmp_path)
+        os.setuid(65534)
+        with pytest.raises(PermissionError) as caught:
+            locked(Path("out", NAME)).__enter__()
+        assert caught.value.filename is not None
+
+    tmp_path.chmod(0o555)
+    assert in_child(as_nobody) == 0
+
+
+# -- inputs -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["vanishes", "changes"])
+def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for k in range(3):
+        write_picture(_made(tmp_path / "in") / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
+    read = pair_maker.read_picture
+
+    def unlucky(path: Path, *rest: Any) -> Any:
+        picture = read(path, *rest)
+        if path.name == "1.png":
+            path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
+        return picture
+
+    monkeypatch.setattr(pair_maker, "read_picture", unlucky)
+    result = synth(tmp_path / "in", tmp_path / "out", workers=0)
+    assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
+
+
+def test_a_picture_that_vanishes_during_an_epoch_is_replaced_and_reported(tmp_path: Path) -> None:
+    for k in range(8):
+        write_picture(tmp_path / f"{k}.png", torch.full((3, 16, 16), k / 10))
+    folder = PictureFolder(tmp_path, allowed_share=0.3)
+    assert folder[0].shape == (3, 16, 16)
+    (tmp_path / "1.png").unlink()
+    (tmp_path / "5.png").write_bytes(b"something else")
+    assert [int(folder[k][0, 0, 0]) for k in (1, 2, 5)] == [int(folder[k][0, 0, 0]) for k in (2, 2, 6)]
+    assert sorted(file.name for file in folder.skipped) == ["1.png", "5.png"]
+    assert "2 of 8 pictures skipped" in folder.report()
+
+
+# -- workers, descriptors, shared memory, clocks ----------------------------------------------------------------------
+
+
+class Deadly(Dataset[Any]):
+    """Its second sample has the worker killed by the system."""
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        if index:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return torch.zeros(1)
+
+
+class Wrong(Deadly):
+    def __getitem__(self, index: int) -> torch.Tensor:
+        raise ValueError("a.png: is too small")
+
+
+def test_a_worker_that_the_system_kills_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset: list[Dataset[Any]] = [Deadly(), Wrong()]
+    monkeypatch.setattr("rawaug.cli._dispatch", lambda argv: list(DataLoader(dataset.pop(0), num_workers=1)) and 0)
+    assert main([]) == 2
+    assert "a worker process was killed, perhaps for its memory; use fewer workers" in capsys.readouterr().err
+    assert main([]) == 2
+    assert capsys.readouterr().err == "rawaug: a.png: is too small\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "way_out"),
+    [
+        ("unable to allocate shared memory(shm) for file </torch_1>: No space left on device (28)", "enlarge /dev/shm"),
+        ("DataLoader worker (pid 5) is killed by signal: Bus error. It is possible that dataloader's workers are out "
+         "of shared memory. Please try to raise your shared memory limit.", "enlarge /dev/shm"),
+        ("received 0 items of ancdata", "ulimit -n"),
+        ("unable to open shared memory object </torch_1> in read-write mode: Too many open files (24)", "ulimit -n"),
+        ("DataLoader worker (pid(s) 5, 6) exited unexpectedly", "fewer workers"),
+        ("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore lines", "smaller batch"),
+    ],
+)  # fmt: skip
+def test_what_the_machine_lacks_is_said_in_one_line(said: str, way_out: str) -> None:
+    line = shortage(RuntimeError(said))
+    assert line is not None and way_out in line and "\n" not in line
+    assert shortage(RuntimeError("mat1 and mat2 shapes cannot be multiplied")) is None
+    assert "smaller batch" in str(shortage(MemoryError()))
+
+
+def test_64_descriptors_are_enough_for_two_workers() -> None:
+    augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
+
+    def load() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+        pairs = RawPairs([torch.rand(3, 16, 16) for _ in range(24)], augment, crop=8, keys=("noisy", "clean"))
+        loader = DataLoader(pairs, batch_size=2, num_workers=2)
+        assert sum(len(batch["noisy"]) for batch in loader) == 24
+
+    assert in_child(load) == 0
+
+
+def test_a_wall_clock_that_jumps_changes_nothing(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Any
+) -> None:
+    first = synth(inputs / "pictures", tmp_path / "a", workers=0)
+    jumps = iter(range(4 * 10**9, 0, -(10**6)))
+    monkeypatch.setattr(time, "time", lambda: float(next(jumps)))
+    second = synth(inputs / "pictures", tmp_path / "b", workers=0)
+    assert first.made == second.made == 4 and 0 <= second.seconds < 600
+    assert harness.contents(tmp_path / "a") == harness.contents(tmp_path / "b")
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def test_the_figures_are_written(harness: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The benchmark's exit status and file follow what it found."""
+    monkeypatch.setattr(harness, "kills", lambda folder, names, count, seed: iter([("synth", ["0.dng differ"], 1.0)]))
+    monkeypatch.setattr(harness, "FAULTS", {})
+    monkeypatch.setattr(sys, "argv", ["faults", "--commands", "synth", "--json", str(tmp_path / "figures.json")])
+    assert harness.main() == 1
+    assert json.loads((tmp_path / "figures.json").read_text())["synth"]["wrong"] == ["0.dng differ"]
