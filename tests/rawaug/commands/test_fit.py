@@ -18,7 +18,7 @@ from rawaug.io import read_picture, read_raw_and_develop, write_picture
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-QUICK = ["--steps", "4", "--curve_steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
+QUICK = ["--steps", "4", "--curve-steps", "10", "--pixels", "512", "--batch", "128", "--noise", "off"]
 SETTINGS: dict[str, Any] = {"steps": 4, "curve_steps": 10, "pixels": 512, "batch": 128}
 INTERRUPTED = 130
 
