@@ -26,6 +26,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,7 +51,7 @@ TWO_IN_ONE = (".npz", ".mat")
 
 _UNREADABLE = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError),
-    *(ValueError, struct.error, zipfile.BadZipFile, zlib.error),
+    *(SyntaxError, TokenError, ValueError, struct.error, zipfile.BadZipFile, zlib.error),
 )
 
 

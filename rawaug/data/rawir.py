@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -28,7 +29,10 @@ from rawaug.registry import DATASETS
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
 
-_DAMAGE = (ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError)
+_DAMAGE = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError),
+    TokenError,
+)
 """What NumPy raises for headers that say anything."""
 _MAGIC = b"\x93NUMPY"
 
