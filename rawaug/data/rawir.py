@@ -12,8 +12,8 @@ The P20's pictures are cropped and zoomed against their RAW: they are not regist
 from __future__ import annotations
 
 import os
+import tokenize
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -30,8 +30,8 @@ WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
 
 _DAMAGE = (
-    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError),
-    TokenError,
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
+    tokenize.TokenError,
 )
 """What NumPy raises for headers that say anything."""
 _MAGIC = b"\x93NUMPY"
