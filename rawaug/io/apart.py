@@ -84,7 +84,7 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
 def _folder() -> str | None:
     """The working folder, in which the helper finds a relative path; None if it has been removed."""
     try:
-        return os.getcwd()
+        return str(Path.cwd())
     except FileNotFoundError:
         return None
 
