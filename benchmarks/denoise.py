@@ -2,14 +2,16 @@
 
     python -m benchmarks.denoise [--device cpu|cuda] [--denoiser rawaug-small] [--megapixels 12 45] [--quick]
 
-A frame is noise, packed, on the device; its time does not depend on what is in it. ``rawaug denoise`` also reads and
-writes a file. Every form runs ``--repeats`` times after one that is not counted, and the fastest counts.
+A frame is noise, packed, on the device; its time does not depend on what is in it. The last row is ``rawaug denoise``
+of such a frame, from a DNG to a DNG. Every form runs ``--repeats`` times after one that is not counted, and the fastest
+counts.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,6 +24,9 @@ import denoisers
 from benchmarks.augment import machine, memory_used
 from benchmarks.loader import fastest
 from denoisers.pretrained import DEFAULT
+from rawaug import bayer
+from rawaug.commands.denoise import denoise_file, frame_denoiser
+from rawaug.io import RawFrame, write_dng
 
 
 def frame(megapixels: float, device: torch.device) -> Tensor:
@@ -58,6 +63,30 @@ def timed(
     return {"seconds": seconds, "Mpix/s": noisy.numel() / seconds / 1e6, "peak MiB": memory_used(device) / 2**20}
 
 
+def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) -> dict[str, float]:
+    """``rawaug denoise``, reading and writing included."""
+    shot = RawFrame(
+        mosaic=bayer.unpack(noisy[0].cpu(), "RGGB"),
+        cfa=bayer.CFA.RGGB,
+        black=(512.0,) * 4,
+        white=16383.0,
+        white_balance=(2.0, 1.0, 1.5),
+        daylight=(2.0, 1.0, 1.5),
+        color_matrix=torch.eye(3),
+        camera="unknown",
+        iso=None,
+        noise_profile=(1e-3, 1e-5),
+        orientation=0,
+        name="noise",
+    )
+    method = frame_denoiser(denoiser, device=str(device))
+    with tempfile.TemporaryDirectory() as folder:
+        source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")
+        write_dng(source, shot)
+        runs = [denoise_file(source, out, method, overwrite=True).seconds for _ in range(1 + repeats)]
+    return {"seconds": min(runs[1:]), "Mpix/s": noisy.numel() / min(runs[1:]) / 1e6}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
@@ -74,7 +103,9 @@ def main() -> None:
     figures: dict[str, Any] = {"machine": machine(args.device, torch.get_num_threads())}
     print("  ".join(f"{key} {value}" for key, value in figures["machine"].items()))
     for megapixels in args.megapixels:
-        figures[f"{megapixels:g} Mpix"] = rows = measure(model, frame(megapixels, args.device), args.repeats)
+        noisy = frame(megapixels, args.device)
+        figures[f"{megapixels:g} Mpix"] = rows = measure(model, noisy, args.repeats)
+        rows["rawaug denoise"] = command(noisy, args.denoiser, args.device, args.repeats)
         print(f"{megapixels:g} Mpix")
         for name, row in rows.items():
             print(f"  {name:18s}", "  ".join(f"{what} {value:.4g}" for what, value in row.items()) or "out of memory")

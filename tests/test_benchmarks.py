@@ -66,7 +66,8 @@ def test_denoising_is_timed_whole_and_in_tiles(
     monkeypatch.setattr(sys, "argv", ["denoise", "--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
     denoise.main()
     rows = json.loads(out.read_text())["0.01 Mpix"]
-    assert set(rows) == {f"{form}, {p}" for form in ("whole", "tiles") for p in ("float32", "bfloat16")}
+    forms = {f"{form}, {p}" for form in ("whole", "tiles") for p in ("float32", "bfloat16")}
+    assert set(rows) == forms | {"rawaug denoise"}
     assert all(row["seconds"] > 0 for row in rows.values())
     assert denoise.frame(12, CPU).shape == (1, 4, 1414, 2121)
     capsys.readouterr()

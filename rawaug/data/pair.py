@@ -90,13 +90,24 @@ class Pair:
                 "put the dataset's sRGB files or METADATA beside its RAW (docs/datasets.md)"
             )
 
+    def in_pattern(self, cfa: CFA | str) -> Pair:
+        """The frame without the first row or column, where that gives it the pattern ``cfa``; sides stay even."""
+        top, left = self.cfa.shift_to(CFA(cfa))
+        if not (top or left):
+            return self
+        height, width = ((size - first) // 2 * 2 for size, first in zip(self.raw.shape[-2:], (top, left), strict=True))
+        return self._window(slice(top, top + height), slice(left, left + width), CFA(cfa))
+
     def middle(self, side: int) -> Pair:
         """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
         top, left = ((size - side) // 4 * 2 if size > side else 0 for size in self.raw.shape[-2:])
         rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
+        return self._window(rows, columns, self.cfa)
+
+    def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:
         images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
         cut = {key: image[:, rows, columns].contiguous() for key, image in images.items() if image is not None}
-        return replace(self, **cut)
+        return replace(self, **cut, cfa=cfa)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])

@@ -52,7 +52,11 @@ class Plan:
         """What is used of what, a line each."""
         data, (pairs, validation, test) = recipe.data, self.available
         part = f"{data.pairs}, held out" if self.held_out else data.validation
-        camera = f"fitted to the {len(self.pairs)} frames" if recipe.camera is None else f"{recipe.camera}, as it is"
+        camera = (
+            f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
+            if recipe.camera is None
+            else f"{recipe.camera}, as it is"
+        )
         watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
         found = {
             "train": _used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",

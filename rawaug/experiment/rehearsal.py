@@ -74,12 +74,12 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
 
 def _read(frames: Sequence[Pair]) -> list[Pair]:
     """The first frames, at least one if there are any, as many as can be read in time."""
-    found: list[Pair] = []
+    found = [frames[0]] if frames else []  # the first one also waits for the libraries
     start = time.perf_counter()
-    for index in range(len(frames)):
-        found.append(frames[index])
+    for index in range(1, len(frames)):
         if time.perf_counter() - start > READ_SECONDS:
             break
+        found.append(frames[index])
     return found
 
 

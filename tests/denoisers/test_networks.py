@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers import DHDN, Denoiser, DnCNN, UNet
+from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
 from denoisers.nafnet import NAFNet
 from denoisers.network import pad_to_multiple
 from denoisers.pmrid import PMRID
@@ -19,6 +19,9 @@ Make = Callable[..., Any]
 SMALL: dict[str, Make] = {
     "UNet": lambda **settings: UNet(width=4, **settings),
     "DHDN": lambda **settings: DHDN(width=4, **settings),
+    "CycleISPDenoiser": lambda **settings: CycleISPDenoiser(
+        **{"width": 8, "groups": 1, "blocks": 2, "reduction": 4, **settings}
+    ),
     "DnCNN": lambda **settings: DnCNN(width=8, depth=4, **settings),
     "PMRID": lambda **settings: PMRID(width=4, **{"domain": "linear", "variance_map": True, **settings}),
     "NAFNet": lambda **settings: NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1), **settings),
