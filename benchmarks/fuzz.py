@@ -35,7 +35,7 @@ from rawaug.seeding import derived_seed
 
 SECONDS, WAITING_SECONDS, MEBIBYTES = 10.0, 120.0, 2048.0
 """Of a processor for a file, of a wait for it, and of memory."""
-START_SECONDS = 120.0
+START_SECONDS = 600.0
 DECODERS = {
     "raw": "LibRaw",
     "dng": "LibRaw",
@@ -163,7 +163,8 @@ def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str
         shares = np.diff(np.linspace(0, count, len(wanted) + 1).round().astype(int)).tolist()
         try:
             for kind, share in zip(wanted, shares, strict=True):
-                results[kind] = _fuzz_kind(kind, originals[kind], share, seed, worker, folder / kind, keep)
+                row = results[kind] = _fuzz_kind(kind, originals[kind], share, seed, worker, folder / kind, keep)
+                print(f"{kind}: {sum(row[outcome] for outcome in FORBIDDEN)} failures", file=sys.stderr, flush=True)
         finally:
             worker.stop()
     return results

@@ -146,7 +146,24 @@ def _changed_element(body: bytes, rng: np.random.Generator) -> bytes:
 
 # -- safetensors ------------------------------------------------------------------------------------------------------
 
-_VALUES = [None, -1, 0, 10**6, 10**9, 10**30, 1e29, True, "x", "", [], {}, [1] * 10**5, "NaN", "Infinity", "1e999"]
+_VALUES: list[Any] = [
+    None,
+    -1,
+    0,
+    10**6,
+    10**9,
+    10**30,
+    1e29,
+    True,
+    "x",
+    "",
+    [],
+    {},
+    [1] * 10**5,
+    "NaN",
+    "Infinity",
+    "1e999",
+]
 
 
 def safetensors(whole: bytes, rng: np.random.Generator) -> bytes:

@@ -15,7 +15,6 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -24,7 +23,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.evaluation.scores import classical_method, score_method
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.experiment.downstream import DownstreamConfig, DownstreamScore, MadeCrops, score_on, trained_on
+from rawaug.experiment.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
 from rawaug.files import write_json
 from rawaug.isp.baselines import UPI
 from rawaug.isp.model import DictionaryISP
@@ -79,7 +78,7 @@ def filtered(specs: Sequence[str]) -> DownstreamScore:
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
     frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test")]
     scores = [s for s, *_ in score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, "")]
-    return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
+    return mean_of(scores)
 
 
 def named(values: Sequence[str]) -> dict[str, list[str]]:

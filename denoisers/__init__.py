@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from denoisers.block_matching import BM3D
     from denoisers.catalogue import DENOISERS, build
+    from denoisers.cycleisp_denoiser import CycleISPDenoiser
     from denoisers.dhdn import DHDN
     from denoisers.dncnn import DnCNN
     from denoisers.ensemble import SelfEnsemble
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "BM3D": "denoisers.block_matching",
     "DENOISERS": "denoisers.catalogue",
+    "CycleISPDenoiser": "denoisers.cycleisp_denoiser",
     "DHDN": "denoisers.dhdn",
     "Denoiser": "denoisers.network",
     "DnCNN": "denoisers.dncnn",
@@ -54,6 +56,7 @@ __all__ = [
     "DENOISERS",
     "DHDN",
     "PMRID",
+    "CycleISPDenoiser",
     "Denoiser",
     "DnCNN",
     "NAFNet",

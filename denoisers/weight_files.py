@@ -44,7 +44,8 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
         texts = {"config": json.dumps(model.config), "info": json.dumps(info, allow_nan=False)}
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: info must be JSON-serialisable, its numbers finite: {error}") from None
-    tensors = {key: value.detach().cpu() for key, value in model.state_dict().items()}
+    # A PReLU that is used all over stands under several keys, which share its memory: each is written.
+    tensors = {key: value.detach().cpu().clone() for key, value in model.state_dict().items()}
     write_tensors(tensors, {"format": FORMAT, "kind": KIND, "model": name, **texts}, path)
 
 

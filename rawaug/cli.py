@@ -162,7 +162,7 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
     if not dry:
-        experiment.run(recipe, overwrite)
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
     elif experiment.dry_run is None:
         raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
     else:

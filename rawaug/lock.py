@@ -20,13 +20,14 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 NAME = "rawaug.lock"
 """Of the lock file in a folder."""
 
-_held: set[Path] = set()
-"""Of this process, in which POSIX's locks do not exclude each other."""
+_held: set[tuple[Path, int]] = set()
+"""By process: within one, POSIX's locks do not exclude each other, and a child inherits this set."""
 
 
 @contextmanager
@@ -49,23 +50,24 @@ def locked(file: Path) -> Iterator[None]:
     file = file.absolute()
     made = not file.parent.exists()
     file.parent.mkdir(parents=True, exist_ok=True)
-    if file in _held:
+    own = (file, os.getpid())
+    if own in _held:
         raise ValueError(_refusal(file, "this process"))
     with _acquired(file) as handle:
-        _held.add(file)
+        _held.add(own)
         try:
             yield
             if not _is_at(file, handle):
                 raise OSError(f"{file.parent}: was removed or replaced during this run; run the same command again")
         finally:
-            _held.discard(file)
+            _held.discard(own)
             if _is_at(file, handle):
                 file.unlink()
             if made and file.parent.is_dir() and not any(file.parent.iterdir()):
                 file.parent.rmdir()
 
 
-def one_at_a_time(folder: Callable[P, Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator: hold the lock of the folder that the arguments name during a call; of None none."""
 
     def decorator(function: Callable[P, R]) -> Callable[P, R]:

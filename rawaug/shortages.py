@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 
+_MEMORY = "out of memory; use a smaller batch, crop or tile"
 _WAYS_OUT = (
+    (r"too many open files|ancdata", "too many open files; raise the limit (ulimit -n) or use fewer workers"),
     (
         r"out of shared memory|shared memory\(shm\)|bus error|/torch_",
         "shared memory is full; enlarge /dev/shm or use fewer workers",
     ),
-    (r"too many open files|ancdata", "too many open files; raise the limit (ulimit -n) or use fewer workers"),
-    (r"out of memory|can't allocate memory", "out of memory; use a smaller batch, crop or tile"),
+    (r"out of memory|can't allocate memory", _MEMORY),
     (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
     (r"no space left on device|pytorchstreamwriter", "the disk is full; make room"),
 )
@@ -29,7 +30,7 @@ def shortage(error: BaseException) -> str | None:
         'a worker process was killed, perhaps for its memory; use fewer workers, then run the same command again'
     """
     if isinstance(error, MemoryError):
-        return f"{_WAYS_OUT[2][1]}, then run the same command again"
+        return f"{_MEMORY}, then run the same command again"
     text = str(error).lower()
     found = next((way for pattern, way in _WAYS_OUT if re.search(pattern, text, re.DOTALL)), None)
     return None if found is None else f"{found}, then run the same command again"

@@ -25,7 +25,7 @@ from rawaug.commands import pair_files, pair_maker
 from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
 from rawaug.files import replacing, write_json, write_tensors
-from rawaug.io import RawFrame, write_dng, write_picture
+from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.lock import NAME, locked
 from rawaug.shortages import shortage
 from rawaug.training.state import TrainingState
@@ -107,7 +107,8 @@ def test_a_second_run_is_refused_with_the_name_of_the_first(tmp_path: Path) -> N
 
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
     def die() -> None:
-        locked(tmp_path / NAME).__enter__()
+        lock = locked(tmp_path / NAME)
+        lock.__enter__()
         os.kill(os.getpid(), signal.SIGKILL)
 
     assert in_child(die) == -signal.SIGKILL
@@ -149,9 +150,9 @@ FRAME = RawFrame(
 )  # fmt: skip
 
 
-def _save_picture(path: Path) -> None:
-    with replacing(path) as partial:
-        np.save(partial.open("wb"), np.zeros(40_000, np.float32))
+def _save_array(path: Path) -> None:
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.save(file, np.zeros(40_000, np.float32))
 
 
 def _save_checkpoint(path: Path) -> None:
@@ -164,7 +165,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "dng": lambda path: write_dng(path, FRAME),
     "checkpoint": _save_checkpoint,
     "denoiser": lambda path: denoisers.save(denoisers.build("DnCNN", width=32, depth=4), path, {"cfa": "RGGB"}),
-    "numpy": _save_picture,
+    "numpy": _save_array,
 }
 
 
@@ -224,10 +225,9 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
 ) -> None:
     for k in range(3):
         write_picture(_made(tmp_path / "in") / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
-    read = pair_maker.read_picture
 
     def unlucky(path: Path, *rest: Any) -> Any:
-        picture = read(path, *rest)
+        picture = read_picture(path, *rest)
         if path.name == "1.png":
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture

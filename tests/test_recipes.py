@@ -39,6 +39,8 @@ def test_the_recipes_are_all_there() -> None:
         "ablation": "ablation",
         "denoisers": "denoisers",
         "reconstruction": "reconstruction",
+        "fivek/reconstruction": "reconstruction",
+        "sidd/reconstruction": "reconstruction",
     }
 
 

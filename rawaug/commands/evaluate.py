@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import denoisers
-from denoisers.network import Denoiser
 from denoisers.pretrained import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
@@ -27,15 +26,15 @@ from rawaug.evaluation.scores import (
     require_numbers,
     row_of,
     score_classical,
-    score_denoiser,
+    score_method,
     summary,
 )
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import NoiseModel, NoiseSpec, noise_model
+from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS, Spec
+from rawaug.registry import COMMANDS, ESTIMATORS, Spec
 
 
 @COMMANDS.register("evaluate")
@@ -44,6 +43,7 @@ def run(
     *,
     data: str,
     self_ensemble: bool = False,
+    views: Literal[4, 8] | None = None,
     noise: tuple[float, float] | str | dict[str, Any] | None = None,
     seed: int = 0,
     classical: list[str | dict[str, Any]] | None = None,
@@ -58,6 +58,7 @@ def run(
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
         data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs.
         self_ensemble: also score the average over eight views (denoisers).
+        views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
         seed: of that noise.
@@ -76,7 +77,7 @@ def run(
     if json:
         require_writable(json)
     more = {"first": written, **vars(settings)}
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, **more)
+    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **more)
     written(result)
     if report:
         print(f"page: {report}")
@@ -92,6 +93,7 @@ def evaluate(
     classical: Sequence[Spec] = (),
     device: str = "cpu",
     report: str | Path | None = None,
+    views: Literal[4, 8] | None = None,
     first: Callable[[dict[str, Any]], None] | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -107,6 +109,7 @@ def evaluate(
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
+        views: of the self-ensemble, 4 or 8; given alone it asks for one.
         first: called with the result without self-ensemble and classical denoisers where these are still to come.
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
 
@@ -125,9 +128,9 @@ def evaluate(
     data = data if isinstance(data, str) else f"{len(pairs)} pairs"
     about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
-        if self_ensemble or noise is not None or classical or report is not None:
+        if self_ensemble or views or noise is not None or classical or report is not None:
             raise ValueError(
-                f"{weights}: is an ISP; --self-ensemble, --noise, --classical and --report apply to denoisers only"
+                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report are for denoisers"
             )
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
@@ -137,20 +140,28 @@ def evaluate(
         model, info = denoisers.load(weights)
         levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
         model = model.to(where)
-        result = {"self_ensemble": False, "seed": seed}
-        result |= summary([score for score, *_ in score_denoiser(model, pairs, levels, cfa, seed, False, "evaluate")])
-        if first is not None and (self_ensemble or classical):
+        at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+        ensemble = views or (8 if self_ensemble else 1)
+
+        def scored(count: int, label: str) -> dict[str, Any]:
+            method = network_method(model, cfa, views=count, at_test=at_test)
+            return summary([score for score, *_ in score_method(method, pairs, levels, cfa, seed, label)])
+
+        plain = scored(1, "evaluate")
+        result = {"self_ensemble": False, "seed": seed, **plain}
+        if first is not None and (ensemble > 1 or classical):
             first({**about[0], **result, **about[1]})
-        if self_ensemble:
-            result = _with_self_ensemble(result, model, pairs, levels, cfa)
+        if ensemble > 1:
+            several = scored(ensemble, f"evaluate, {ensemble} views")
+            result = {"self_ensemble": True, "views": ensemble, "seed": seed, "plain": plain, **several}
         if classical:
             result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
         _require_some(pairs)
         if report is not None:
-            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if self_ensemble else {})}
+            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
             methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
-            methods["denoised"] = network_method(model, cfa)
+            methods["denoised"] = network_method(model, cfa, at_test=at_test)
             for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
                 page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
@@ -162,13 +173,3 @@ def evaluate(
 def _require_some(pairs: Readable) -> None:
     if len(pairs.broken) == len(pairs):
         raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")
-
-
-def _with_self_ensemble(
-    plain: Mapping[str, Any], model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA
-) -> dict[str, Any]:
-    """The summary of a denoiser averaged over views, with the one without under ``plain``."""
-    settings = {"self_ensemble": True, "seed": plain["seed"]}
-    scored = score_denoiser(model, pairs, noise, cfa, plain["seed"], True, "evaluate, self-ensemble")
-    without = {key: value for key, value in plain.items() if key not in settings}
-    return {**settings, "plain": without, **summary([score for score, *_ in scored])}

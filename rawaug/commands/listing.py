@@ -33,8 +33,9 @@ def command(name: str) -> Callable[..., Any]:
 def _in_source() -> Iterator[tuple[str, str, str]]:
     """Name, module and summary of each command of this package, by file."""
     for file in sorted(Path(__file__).parent.glob("*.py")):
-        for function in ast.parse(file.read_text(encoding="utf-8")).body:
-            for mark in function.decorator_list if isinstance(function, ast.FunctionDef) else ():
+        body = ast.parse(file.read_text(encoding="utf-8")).body
+        for function in (statement for statement in body if isinstance(statement, ast.FunctionDef)):
+            for mark in function.decorator_list:
                 match mark:
                     case ast.Call(func=ast.Attribute(value=ast.Name(id="COMMANDS")), args=[ast.Constant(value=name)]):
                         summary = (ast.get_docstring(function) or "").partition("\n")[0]

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import json
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -50,7 +51,7 @@ TWO_IN_ONE = (".npz", ".mat")
 
 _UNREADABLE = (
     *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError),
-    *(ValueError, struct.error, zipfile.BadZipFile, zlib.error),
+    *(SyntaxError, ValueError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 
 
@@ -67,7 +68,8 @@ class Mosaic(NamedTuple):
     white_balance: tuple[float, float, float] | None
     color_matrix: Tensor | None
     levels: tuple[float, float] | None
-    camera: str
+    camera: str = "unknown"
+    iso: float | None = None
 
 
 def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) -> Mosaic:
@@ -102,7 +104,6 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
         white_balance=stated.white_balance,
         color_matrix=stated.color_matrix,
         levels=None if stated.shot_var is None or stated.read_var is None else (stated.shot_var, stated.read_var),
-        camera="unknown",
     )
 
 
@@ -110,7 +111,7 @@ def _camera_file(file: Path, given: Statements) -> Mosaic:
     frame = apart(read_raw, file)
     Statements(frame.cfa, levels(frame.black), frame.white).joined(given, file)
     gains, matrix = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
-    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera)
+    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera, frame.iso)
 
 
 def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any]]:

@@ -28,6 +28,11 @@ class Pair:
         iso: None if unknown.
         registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
             compare it at a much lower resolution only.
+        rendered: whether ``srgb`` is a rendering in the camera's colours. False: gains and matrix are unknown, and
+            ``srgb`` merely displays the RAW, so that no ISP can be fitted to it or scored on it.
+        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, where there is one.
+        levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``, which a denoiser that is
+            tested must not know.
         color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
 
     Raises:
@@ -45,6 +50,9 @@ class Pair:
     read_var: float | None = None
     camera: str = "unknown"
     registered: bool = True
+    rendered: bool = True
+    noisy_srgb: Tensor | None = None
+    levels_from_clean: bool = False
     color_known: bool = True
     iso: float | None = None
 
@@ -54,6 +62,8 @@ class Pair:
         self._require_shape("raw", self.raw, 1, torch.float32)
         if self.noisy is not None:
             self._require_shape("noisy", self.noisy, 1, torch.float32)
+        if self.noisy_srgb is not None:
+            self._require_shape("noisy_srgb", self.noisy_srgb, 3, torch.uint8)
         if any(side % 2 or side == 0 for side in self.raw.shape[-2:]):
             raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {tuple(self.raw.shape)}")
         if self.color_matrix.shape != (3, 3):
@@ -66,14 +76,38 @@ class Pair:
         if self.noisy is None or self.shot_var is not None:
             return self
         shot_var, read_var = measured_levels(self.raw, self.noisy)
-        return replace(self, shot_var=shot_var, read_var=read_var)
+        return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
+
+    def require_rendered(self) -> None:
+        """Refuse a pair whose colours are unknown.
+
+        Raises:
+            ValueError: if ``srgb`` is no rendering in the camera's colours.
+        """
+        if not self.rendered:
+            raise ValueError(
+                f"{self.name}: has no sRGB picture, and its white balance and colour matrix are unknown; "
+                "put the dataset's sRGB files or METADATA beside its RAW (docs/datasets.md)"
+            )
+
+    def in_pattern(self, cfa: CFA | str) -> Pair:
+        """The frame without the first row or column, where that gives it the pattern ``cfa``; sides stay even."""
+        top, left = self.cfa.shift_to(CFA(cfa))
+        if not (top or left):
+            return self
+        height, width = ((size - first) // 2 * 2 for size, first in zip(self.raw.shape[-2:], (top, left), strict=True))
+        return self._window(slice(top, top + height), slice(left, left + width), CFA(cfa))
 
     def middle(self, side: int) -> Pair:
         """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
         top, left = ((size - side) // 4 * 2 if size > side else 0 for size in self.raw.shape[-2:])
         rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
-        noisy = None if self.noisy is None else self.noisy[:, rows, columns]
-        return replace(self, srgb=self.srgb[:, rows, columns], raw=self.raw[:, rows, columns], noisy=noisy)
+        return self._window(rows, columns, self.cfa)
+
+    def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:
+        images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
+        cut = {key: image[:, rows, columns].contiguous() for key, image in images.items() if image is not None}
+        return replace(self, **cut, cfa=cfa)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])

@@ -22,7 +22,6 @@ from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
 from rawaug.data.pair import Pair
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.statements import Statements
-from rawaug.io.apart import apart
 from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"
@@ -110,8 +109,7 @@ class PairFolder(LazyPairs):
         name, *files = self.pairs[index]
         alone = files[0] == files[1]
         noisy, clean = (
-            apart(read_mosaic, file, which, self.given, alone)
-            for file, which in zip(files, ("noisy", "clean"), strict=True)
+            read_mosaic(file, which, self.given, alone) for file, which in zip(files, ("noisy", "clean"), strict=True)
         )
         for what, one, other in (
             ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),
@@ -135,6 +133,7 @@ class PairFolder(LazyPairs):
             read_var=read_var,
             camera=noisy.camera,
             color_known=stated is not None,
+            iso=noisy.iso,
         )
 
 

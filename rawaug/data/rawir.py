@@ -12,6 +12,7 @@ The P20's pictures are cropped and zoomed against their RAW: they are not regist
 from __future__ import annotations
 
 import os
+import tokenize
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,10 @@ from rawaug.registry import DATASETS
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
 
-_DAMAGE = (ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError)
+_DAMAGE = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
+    tokenize.TokenError,
+)
 """What NumPy raises for headers that say anything."""
 _MAGIC = b"\x93NUMPY"
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pair import Pair
-from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, table_rows
+from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, levels_note, table_rows
 from rawaug.extras import extra
 
 WINDOW = 64
@@ -73,6 +73,8 @@ class Page:
         self.parts = [f"<h1>{html.escape(title)}</h1>", "<h2>Scores</h2>"]
         for columns in (COLUMNS, QUARTERS):
             self.parts.append(_table(["", *columns], table_rows(results, classical, columns)))
+        if note := levels_note(next(iter(results.values()))[0]["plain"]):
+            self.parts.append(f"<p>{html.escape(note)}</p>")
         self.parts += ["<h2>Every image</h2>", _images_table(results, classical)]
 
     def add_curves(self, pngs: Mapping[str, bytes]) -> None:

@@ -29,7 +29,11 @@ def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches:
         pair: the frame.
         white_balance: use the frame's as-shot white balance.
         patches: score this many patches of a registered frame (:func:`windows_of`); None scores all.
+
+    Raises:
+        ValueError: if the pair's picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
     """
+    pair.require_rendered()
     given = pair.white_balance if white_balance else None
     if pair.registered:
         params = conditioning.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)

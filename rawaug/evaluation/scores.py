@@ -32,6 +32,8 @@ from rawaug.progress import progress
 from rawaug.registry import FILTERS, Spec, name_and_settings
 from rawaug.seeding import keyed_generator
 
+Run = Callable[..., Tensor]
+"""``run(noisy, variance) -> denoised``, packed RAW."""
 SHOWN_FAULTS = 5
 
 Method = Callable[[Pair, Sample], Tensor]
@@ -40,7 +42,11 @@ Method = Callable[[Pair, Sample], Tensor]
 
 @dataclass(frozen=True)
 class Score:
-    """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input."""
+    """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input.
+
+    ``levels_from_clean`` is True where the noise levels that the denoiser was given had been measured against the clean
+    frame, else None.
+    """
 
     name: str
     psnr: float
@@ -51,6 +57,7 @@ class Score:
     ssim_noisy: float | None = None
     psnr_srgb_noisy: float | None = None
     ssim_srgb_noisy: float | None = None
+    levels_from_clean: bool | None = None
 
 
 def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
@@ -66,13 +73,22 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
 
 
 @torch.inference_mode()
-def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool, own: CFA | None = None) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, optionally averaged over views.
+def denoise(
+    model: Denoiser,
+    sample: Sample,
+    cfa: CFA,
+    views: int = 1,
+    own: CFA | None = None,
+    at_test: Callable[[Run], Run] | None = None,
+) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, averaged over ``views`` of it.
 
     Args:
         cfa: of the sample's mosaic.
+        views: 1, or 4 or 8 of a self-ensemble.
         own: the pattern that the model was trained for, if another: the mosaic is continued by a mirrored line on the
             sides where the patterns differ, and the result cropped.
+        at_test: what the estimator of the training puts around the network.
 
     Returns:
         The same shape, on the CPU.
@@ -81,12 +97,14 @@ def denoise(model: Denoiser, sample: Sample, cfa: CFA, self_ensemble: bool, own:
         rows, columns = cfa.shift_to(own)
         mosaics = (F.pad(bayer.unpack(x, cfa), (columns, columns, rows, rows), mode="reflect") for x in sample)
         shifted = Sample(*(bayer.pack(mosaic, own) for mosaic in mosaics))
-        mosaic = bayer.unpack(denoise(model, shifted, own, self_ensemble), own)
+        mosaic = bayer.unpack(denoise(model, shifted, own, views, at_test=at_test), own)
         height, width = mosaic.shape[-2:]
         return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
-    run: Any = partial(denoisers.tiled, model, each=counted("tile"))
-    if self_ensemble:
-        run = denoisers.SelfEnsemble(run, cfa, views=8, each=counted("view group"))
+    run: Run = partial(denoisers.tiled, model, each=counted("tile"))
+    if at_test is not None:
+        run = at_test(run)
+    if views > 1:
+        run = denoisers.SelfEnsemble(run, cfa, views=views, each=counted("view group"))
     device = next(model.parameters()).device
     denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
     return denoised.cpu()
@@ -105,20 +123,22 @@ def score_method(
         sample = frozen_sample(pair, noise, cfa, seed)
         denoised = method(pair, sample)
         values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-        yield Score(pair.name, *values), pair, sample, denoised
+        flag = pair.with_levels().levels_from_clean or None
+        yield Score(pair.name, *values, levels_from_clean=flag), pair, sample, denoised
 
 
-def network_method(model: Denoiser, cfa: CFA, own: CFA | None = None, self_ensemble: bool = False) -> Method:
-    """A network as something to score; ``cfa`` and ``own`` as in :func:`denoise`."""
-    return lambda _, sample: denoise(model, sample, cfa, self_ensemble, own)
+def network_method(
+    model: Denoiser, cfa: CFA, own: CFA | None = None, views: int = 1, at_test: Callable[[Run], Run] | None = None
+) -> Method:
+    """A network as something to score; arguments as in :func:`denoise`."""
+    return lambda _, sample: denoise(model, sample, cfa, views, own, at_test)
 
 
 def score_denoiser(
-    model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, self_ensemble: bool, label: str
+    model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, views: int, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
     """:func:`score_method` of a network."""
-    method = network_method(model, cfa, self_ensemble=self_ensemble)
-    return score_method(method, pairs, noise, cfa, seed, label)
+    return score_method(network_method(model, cfa, views=views), pairs, noise, cfa, seed, label)
 
 
 def row_of(methods: Mapping[str, Method], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
@@ -212,10 +232,15 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Sequence[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
-    So is a score that is no number, such as the PSNR of two equal frames; it is named under ``no_numbers``.
+    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score
+    that is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
     """
     images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
     result: dict[str, Any] = {"images": images}
+    for image, score in zip(images, scores, strict=True):
+        image |= {"levels_from_clean": True} if score.levels_from_clean else {}
+    if flagged := sum(bool(score.levels_from_clean) for score in scores):
+        result["levels_from_clean"] = flagged
     wrong: list[str] = []
     for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
         known = []

@@ -136,10 +136,21 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
     (console if console.is_terminal else Console(width=WIDTH)).print(table)
 
 
+def levels_note(summary: Mapping[str, Any]) -> str:
+    """A line on scores whose noise levels came from the clean frames; empty if there are none."""
+    flagged = summary.get("levels_from_clean")
+    if not flagged:
+        return ""
+    images = len(summary["images"])
+    return f"* noise levels of {flagged} of {images} images were measured against their clean frames"
+
+
 def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
     rows = [[method, *cells] for method, cells in table_rows(results, classical, COLUMNS).items()]
     print_rows(title, ["arm", *COLUMNS], rows)
+    if note := levels_note(next(iter(results.values()))[0]["plain"]):
+        print(note)
 
 
 def print_scores(result: Mapping[str, Any]) -> None:
@@ -147,7 +158,7 @@ def print_scores(result: Mapping[str, Any]) -> None:
     denoiser = result["kind"] == "denoiser"
     head = ["PSNR (dB)", "SSIM", "PSNR, sRGB", "SSIM, sRGB"][: None if denoiser else 1]
     metrics = METRICS[: len(head)]
-    images = [[image["name"], *_cells(image, "{}", metrics)] for image in result["images"]]
+    images = [[_name_of(image), *_cells(image, "{}", metrics)] for image in result["images"]]
     shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
     means = [[name, *_cells(result, key, metrics)] for name, key in shown.items() if key.format("psnr") in result]
     others = {"mean, without self-ensemble": result["plain"]} if "plain" in result else {}
@@ -155,6 +166,13 @@ def print_scores(result: Mapping[str, Any]) -> None:
     means += [[name, *_cells(scores, "{}", metrics)] for name, scores in others.items()]
     title = "PSNR_d, RAW denoising" if denoiser else "PSNR_r, RAW reconstruction"
     print_rows(f"{title}: {result['data']}", ["image", *head], images, means)
+    if note := levels_note(result):
+        print(note)
+
+
+def _name_of(image: Mapping[str, Any]) -> str:
+    """With an asterisk where the noise levels were measured against the clean frame."""
+    return f"{image['name']} *" if image.get("levels_from_clean") else str(image["name"])
 
 
 def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:

@@ -150,7 +150,7 @@ def _filter(spec: Spec) -> Maker:
 def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:
     def make(pair: Pair, noise: NoiseModel, seed: int) -> Method:
         def method(_: Pair, sample: Sample) -> Tensor:
-            denoised = denoise(model, sample, CFA(pair.cfa), self_ensemble=False, own=own)
+            denoised = denoise(model, sample, CFA(pair.cfa), own=own)
             return denoised.clamp(0.0, 1.0) if clip else denoised
 
         return method

@@ -22,6 +22,7 @@ from rawaug.commands.fit import fit
 from rawaug.data import PictureFolder
 from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
+from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
@@ -130,6 +131,8 @@ class _Run:
         self.pairs = list(self.plan.pairs)
         if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
+        if self.data.pictures == OWN_PICTURES:
+            self.pictures = PairPictures(self.pairs)
         require_usable(self.recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
@@ -200,6 +203,7 @@ class _Run:
             return model
         levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
         info = {"key": key, "cfa": str(isp.cfa), "noise": levels, "steps": config.steps, "seed": seed, "arm": arm}
+        info |= {} if recipe.arms[arm].sees_clean else {"estimator": recipe.arms[arm].estimator}
         info |= {} if start is None else {"start": network.start, "start_sha256": start.sha256}
         info |= {"real_pairs": [pair.name for pair in self.pairs], "pictures": self.data.pictures}
         denoisers.save(model, path, info)
@@ -220,21 +224,28 @@ class _Run:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
         digest = sha256(place / "denoiser.safetensors")
-        key = fingerprint(digest, self.data.test, stamps(self.test))
+        settings = [] if self.recipe.views == 8 else [self.recipe.views]
+        key = fingerprint(digest, self.data.test, stamps(self.test), *settings)
         path = place / "evaluation.json"
         known = json.loads(path.read_text()) if path.is_file() else {}
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
         missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
         if not missing:
             print(f"already evaluated: {path}")
-        model.to(find_device(self.recipe.device))
         for kind in missing:
-            method = network_method(model, isp.cfa, self.pattern(arm, isp), kind == "self_ensemble")
+            method = self.method(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
             result[kind] = summary([score for score, *_ in scored])
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
+
+    def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
+        """The denoiser of an arm as it is tested."""
+        at_test = estimator_of(self.recipe.arms[arm]).at_test
+        return network_method(
+            model.to(find_device(self.recipe.device)), isp.cfa, self.pattern(arm, isp), views, at_test
+        )
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
@@ -263,7 +274,7 @@ class _Run:
         hidden = [label_of(spec) for spec in self.classical[1:]]
         methods = {name: method for name, method in others.items() if name not in hidden}
         for arm, model in models.items():
-            methods[arm] = network_method(model.to(find_device(recipe.device)), cfa, self.pattern(arm, isp))
+            methods[arm] = self.method(arm, model, isp)
         for pair in shown_on_page(self.test):
             row = row_of(methods, pair, noise, cfa, seed=0)
             page.add_frame(row, cfa)

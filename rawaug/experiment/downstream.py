@@ -21,7 +21,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.sample import Sample
-from rawaug.evaluation.scores import score_denoiser
+from rawaug.evaluation.scores import Score, score_denoiser
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.stages import as_float
@@ -80,6 +80,12 @@ class DownstreamScore(NamedTuple):
     psnr_srgb: float
 
 
+def mean_of(scores: Sequence[Score]) -> DownstreamScore:
+    """The mean over frames; sRGB over those that can be developed."""
+    developed = [score.psnr_srgb for score in scores if score.psnr_srgb is not None]
+    return DownstreamScore(fmean(score.psnr for score in scores), fmean(developed))
+
+
 def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
     net = trained_on(_crops(model, pictures, noise_model(config.noise), config), config, place, seed)
@@ -99,8 +105,8 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     """Mean scores on the test frames; their noise is frozen with seed 0."""
     pairs = (pair for spec in config.test for pair in open_pairs(spec, split="test"))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
-    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, False, "PSNR_d")]
-    return DownstreamScore(fmean(s.psnr for s in scores), fmean(s.psnr_srgb for s in scores))
+    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
+    return mean_of(scores)
 
 
 @singledispatch

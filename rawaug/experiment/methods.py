@@ -98,6 +98,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
 
     An unregistered pair is scored over blocks, by methods that do not learn by descent.
     """
+    pair.require_rendered()
     model = fitted.model
     if not pair.registered:
         return {"rows": _block_rows(model, pair), "mpix_s": None}

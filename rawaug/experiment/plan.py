@@ -11,7 +11,9 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
 from rawaug.data.remembered import Remembered
+from rawaug.data.select import selected
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
@@ -50,7 +52,11 @@ class Plan:
         """What is used of what, a line each."""
         data, (pairs, validation, test) = recipe.data, self.available
         part = f"{data.pairs}, held out" if self.held_out else data.validation
-        camera = f"fitted to the {len(self.pairs)} frames" if recipe.camera is None else f"{recipe.camera}, as it is"
+        camera = (
+            f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
+            if recipe.camera is None
+            else f"{recipe.camera}, as it is"
+        )
         watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
         found = {
             "train": _used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
@@ -115,9 +121,12 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     for part, frames in {"pairs": pairs, "validation": [] if held_out else validation}.items():
         if (seen := shared_frame(test, frames)) is not None:
             raise ValueError(f"data.test: {seen} is also in data.{part}; test on unseen frames")
-    pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
+    chosen = SomePairs(pairs, selected(pairs, kept, data.count, data.select))
+    pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
+    if pictures is None:
+        pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
     return Plan(
-        pairs=SomePairs(pairs, range(kept)[: data.count]),
+        pairs=chosen,
         validation=validation,
         test=test if data.test_count is None else SomePairs(test, range(len(test))[: data.test_count]),
         pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_type_hints
 
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
+from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
@@ -28,7 +29,9 @@ class DataConfig(PairSettings):
         pairs: the few real RAW-sRGB pairs: a folder of RAW files, or ``kind:path``, such as ``pairs:PATH`` for
             noisy/clean pairs; null for none.
         count: number of pairs to use; null for all.
-        pictures: the sRGB pictures to augment with: a folder, or ``demo:``.
+        select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
+            folders.
+        pictures: the sRGB pictures to augment with: a folder, ``demo:``, or ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
@@ -40,6 +43,7 @@ class DataConfig(PairSettings):
 
     pairs: str | None = "demo:train"
     count: int | None = None
+    select: str | list[str] = "first"
     pictures: str = "demo:"
     memory_mb: int = 0
     validation: str | None = "demo:validation"
@@ -50,6 +54,8 @@ class DataConfig(PairSettings):
     def __post_init__(self) -> None:
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
+        if self.pictures == OWN_PICTURES and self.pairs is None:
+            raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
         given = [key for key, value in self._pair_settings().items() if value is not None]
         specs = (self.pairs, self.validation, self.test)
         if given and not any(isinstance(spec, str) and spec.startswith(_PAIRS) for spec in specs):
@@ -131,6 +137,7 @@ class Recipe:
         arms: the variants to compare, by name; all supervised, or all self-supervised (no stage sees a clean frame).
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
+        views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
         untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
         self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
@@ -150,6 +157,7 @@ class Recipe:
     train: TrainConfig = field(default_factory=TrainConfig)
     arms: dict[str, ArmConfig] = field(default_factory=dict)
     classical: list[str | dict[str, Any]] = field(default_factory=list)
+    views: Literal[4, 8] = 8
     untouched: list[str] = field(default_factory=list)
     self_ensemble: bool = True
     steps: int | None = None

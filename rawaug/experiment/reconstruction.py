@@ -1,15 +1,16 @@
 """The reconstruction table: every method fitted on the same pairs, measured on frames left out.
 
-PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. PSNR_d is that of a
-denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no method has seen. Each
-fit's figures go into a file of their own, so that a stopped run can resume.
+PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
+that of a published split: a method is fitted once to all frames, and scored on every frame of another set.
+PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no
+method has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,10 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
+from rawaug.data.identity import shared_frame
+from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.select import selected
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
@@ -28,6 +32,7 @@ from rawaug.experiment.early_checks import require_precision
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
+    Fitted,
     cycle_psnr,
     fit_family,
     is_method,
@@ -52,7 +57,11 @@ class Comparison:
     Args:
         experiment: "reconstruction".
         name: of the output folder within ``out``.
-        data: the pairs, of one CFA; methods that train on crops need them registered.
+        data: the pairs, of one CFA; methods that train on crops need them registered. A dataset's split is ``train``.
+        test: score on these pairs, of the split ``test``, instead of on frames left out of ``data``; frames of any
+            pattern are brought to that of the first training frame.
+        count, select: of ``data``, as in recipes that train, see :mod:`rawaug.data.select`.
+        test_count: number of test pairs; null for all.
         noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
@@ -73,6 +82,10 @@ class Comparison:
     experiment: str = "reconstruction"
     name: str = "reconstruction"
     data: str = "demo:train"
+    test: str | None = None
+    count: int | None = None
+    select: str | list[str] = "first"
+    test_count: int | None = None
     noise: str | None = None
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
     seconds: float = 20.0
@@ -109,6 +122,10 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
         comparison,
         name=f"{comparison.name}-smoke",
         data="demo:validation",
+        test=comparison.test and "demo:test",
+        count=None,
+        select="first",
+        test_count=1,
         pictures="demo:",
         methods=quick or ["dictionary"],
         longer=0.0,
@@ -132,8 +149,11 @@ def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[s
 class _Comparison:
     def __init__(self, settings: Comparison) -> None:
         self.settings, self.folder = settings, run_folder(settings)
-        self.pairs = list(open_pairs(settings.data, split="train"))
-        if len(self.pairs) < 2:
+        found = open_pairs(settings.data, split="train")
+        self.pairs = [found[k] for k in selected(found, len(found), settings.count, settings.select)]
+        if settings.test:
+            self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
+        elif len(self.pairs) < 2:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
@@ -147,8 +167,16 @@ class _Comparison:
         names = [pair.name for pair in self.pairs]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
-        if settings.longer and not 1 <= settings.longer_frames <= len(names):
-            raise ValueError(f"longer_frames is {settings.longer_frames}; {settings.data} has {len(names)} frames")
+        self.scored: Sequence[Pair] = self.pairs
+        if settings.test:
+            test = open_pairs(settings.test, split="test")
+            self.scored = SomePairs(test, range(len(test))[: settings.test_count])
+            if (seen := shared_frame(self.scored, found)) is not None:
+                raise ValueError(f"test: {seen} is also in data; score on unseen frames")
+        if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
+            where, count = settings.test or settings.data, len(self.scored)
+            raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
+        self._fitted: tuple[str, Fitted] | None = None
         side = settings.downstream.train.crop if settings.downstream else 2
         self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
 
@@ -171,7 +199,8 @@ class _Comparison:
     def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
         settings, longer = self.settings, scale != 1.0
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
-        frames = range(settings.longer_frames if longer else len(self.pairs))
+        frames = range(settings.longer_frames if longer else len(self.scored))
+        names = names_of(self.scored)
         bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
         folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
         whole = {} if longer else self._whole(family)
@@ -182,7 +211,7 @@ class _Comparison:
             name = family if row == "blind" else f"{family}, {ROWS[row]}"
             rows[f"{name}, {scale:g} times as long" if longer else name] = {
                 "psnr_r": [statistics.fmean(values) for values in by_seed],
-                "frames": {self.pairs[k].name: [values[k] for values in by_seed] for k in frames},
+                "frames": {names[k]: [values[k] for values in by_seed] for k in frames},
                 "worst25": [worst for worst, _ in quarters],
                 "best25": [best for _, best in quarters],
                 "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
@@ -193,16 +222,23 @@ class _Comparison:
         return rows
 
     def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
-        """Fitted without one frame, scored on it."""
-        settings, left_out = self.settings, self.pairs[frame]
+        """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
+        settings, name = self.settings, names_of(self.scored)[frame]
         seconds = settings.seconds * scale
         budget = (seconds, settings.crop, settings.batch)
         key = fingerprint(family, budget, seed, settings.patches, *self._frames())
-        path = self._path(f"{family}-x{scale:g}-without-{left_out.name}-seed{seed}")
+        path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
         if (known := _read(path, key)) is not None:
             return known
-        fitted = fit_family(family, [p for p in self.pairs if p is not left_out], self.fit, budget, seed)
-        result = score_rows(fitted, left_out, settings.patches)
+        pair = self.scored[frame]
+        if settings.test:
+            pair = pair.in_pattern(self.pairs[0].cfa)
+            if self._fitted is None or self._fitted[0] != key:
+                self._fitted = key, fit_family(family, self.pairs, self.fit, budget, seed)
+            fitted = self._fitted[1]
+        else:
+            fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
+        result = score_rows(fitted, pair, settings.patches)
         result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
         write_json(result, path)
         return result
@@ -236,7 +272,8 @@ class _Comparison:
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
-        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs]
+        test = [self.settings.test] if self.settings.test else []
+        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs], *test
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"
@@ -278,7 +315,8 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
     frames = len(next(iter(rows.values()))["frames"])
-    title = f"{settings.name}: one of {frames} frames left out, {settings.seeds} seed(s), {settings.data}"
+    protocol = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
+    title = f"{settings.name}: {protocol}, {settings.seeds} seed(s), {settings.data}"
     heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
     print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
     threads = torch.get_num_threads()

@@ -74,12 +74,12 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
 
 def _read(frames: Sequence[Pair]) -> list[Pair]:
     """The first frames, at least one if there are any, as many as can be read in time."""
-    found: list[Pair] = []
+    found = [frames[0]] if frames else []  # the first one also waits for the libraries
     start = time.perf_counter()
-    for index in range(len(frames)):
-        found.append(frames[index])
+    for index in range(1, len(frames)):
         if time.perf_counter() - start > READ_SECONDS:
             break
+        found.append(frames[index])
     return found
 
 
@@ -87,7 +87,7 @@ def _isp(recipe: Recipe, pairs: Sequence[Pair]) -> DictionaryISP:
     """The recipe's own, or a fit of two steps."""
     if recipe.camera is not None:
         return DictionaryISP.from_pretrained(find_weights(recipe.camera))
-    quick = replace(recipe.isp, steps=2, pixels=512, batch=128, joint_steps=0, encoders="off")
+    quick = replace(recipe.isp.smoke(), joint_steps=0, encoders="off")
     return fit(pairs, progress=False, noise="on" if recipe.noise == "camera" else "off", **asdict(quick))
 
 

@@ -3,7 +3,8 @@
 LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers wrote. :func:`apart` calls a reader in
 a helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
 ``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets
-a new helper. Each thread of each DataLoader worker has its own.
+a new helper. On a busy machine, where it did not get to use a processor for that long, it has ten times as many. Each
+thread of each DataLoader worker has its own.
 
 Helpers are forked from one clean process (:mod:`rawaug.io.reading_process`), which imports the libraries once: to
 start one takes milliseconds, and no thread of a decoder has to survive a fork. Needs Unix sockets; elsewhere, files are
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import atexit
 import json
+import math
 import mmap
 import os
 import pickle
@@ -24,6 +26,8 @@ import subprocess
 import sys
 import tempfile
 import threading
+import warnings
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -35,6 +39,8 @@ import numpy as np
 T = TypeVar("T")
 
 SECONDS = 60.0
+PATIENCE = 10
+"""Times the limit that a file may take where the helper has not used the limit of a processor: on a busy machine."""
 START_SECONDS = 300.0
 """For the first helper, which waits until the libraries are imported."""
 
@@ -58,11 +64,9 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
         4
     """
     seconds = time_limit()
-    if not seconds:
-        return read(*arguments)
-    helper: _Helper | None = getattr(_of_this_thread, "helper", None)
+    helper = _helper() if seconds else None
     if helper is None:
-        helper = _of_this_thread.helper = _Helper(_connected())
+        return read(*arguments)
     try:
         known, value = helper.call((read, arguments), seconds)
     except _Lost as lost:
@@ -74,7 +78,20 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
         raise
     if not known:
         raise value
-    return value  # type: ignore[no-any-return]
+    return value
+
+
+def _helper() -> _Helper | None:
+    """The helper of this thread; none, with a warning, where the system has no room for one."""
+    global _unavailable
+    found: _Helper | None = getattr(_of_this_thread, "helper", None)
+    if found is None and not _unavailable:
+        try:
+            found = _of_this_thread.helper = _Helper(_connected())
+        except (OSError, RuntimeError) as error:
+            _unavailable = True
+            warnings.warn(f"files are read in this process, which a damaged one may end: {error}", stacklevel=4)
+    return found
 
 
 def time_limit() -> float:
@@ -96,7 +113,8 @@ def time_limit() -> float:
 def prepare() -> None:
     """Start the process that helpers come from, without waiting for it, for the workers that this one will have."""
     if time_limit() and _address() is None:
-        _start()
+        with suppress(OSError):  # whoever reads will say so
+            _start()
 
 
 class _Lost(Exception):
@@ -112,11 +130,12 @@ class _Helper:
             message, (descriptor,), *_ = socket.recv_fds(link, 64, 1)
         except (OSError, ValueError):
             link.close()
-            raise RuntimeError("the process that reads files did not start; RAWAUG_READ_SECONDS=0 reads here") from None
+            raise RuntimeError("the process that helpers come from did not start") from None
         link.settimeout(None)
         self.pid, self.memory = int(message), descriptor
         self.view: mmap.mmap | None = None
         self.connection = Connection(link.detach())
+        self.let_go = weakref.finalize(self, _close, self.connection, descriptor)
 
     def call(self, request: Any, seconds: float) -> tuple[bool, Any]:
         """Whether there is a value, and the value or the error.
@@ -126,7 +145,7 @@ class _Helper:
         """
         try:
             self.connection.send_bytes(pickle.dumps(request))
-            if not self.connection.poll(seconds):
+            if not self._answers(seconds):
                 self.kill()
                 raise _Lost(
                     f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again"
@@ -135,9 +154,19 @@ class _Helper:
         except (EOFError, ConnectionError):
             kind, content, sizes = "died", 0, ()
         if kind == "died":
-            self.close()
+            self.let_go()
             raise _Lost(f"crashes the decoder ({_ending(content)}); leave it out, or copy it again")
         return kind == "value", pickle.loads(content, buffers=self._copied(sizes))
+
+    def _answers(self, seconds: float) -> bool:
+        """Whether an answer comes; a helper that other programs keep from running gets more time."""
+        start = _processor_seconds(self.pid)
+        for _ in range(PATIENCE):
+            if self.connection.poll(seconds):
+                return True
+            if not _processor_seconds(self.pid) < start + seconds:
+                return False
+        return False
 
     def _copied(self, sizes: tuple[int, ...]) -> list[np.ndarray]:
         """The buffers in shared memory, which the next answer overwrites."""
@@ -154,18 +183,22 @@ class _Helper:
         """End the process, whatever it does."""
         with suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
-        self.close()
+        self.let_go()
 
-    def close(self) -> None:
-        """Let go of it; it ends by itself."""
-        if self.memory >= 0:
-            self.connection.close()
-            os.close(self.memory)
-            self.memory, self.view = -1, None
 
-    def __del__(self) -> None:
-        if hasattr(self, "connection"):
-            self.close()
+def _processor_seconds(process: int) -> float:
+    """What a process has used of the processors; infinite where the system does not say."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError):
+        return math.inf
+
+
+def _close(connection: Connection, descriptor: int) -> None:
+    """Let go of a helper, which then ends by itself."""
+    connection.close()
+    os.close(descriptor)
 
 
 def _ending(status: int) -> str:
@@ -178,6 +211,7 @@ def _ending(status: int) -> str:
 
 _of_this_thread = threading.local()
 _starting = threading.Lock()
+_unavailable = False
 
 
 def _address() -> str | None:
@@ -195,7 +229,7 @@ def _connected() -> socket.socket:
         except (ConnectionError, FileNotFoundError):  # its owner has ended
             link.close()
             os.environ.pop(_ADDRESS, None)
-    raise RuntimeError("the process that reads files cannot be reached; RAWAUG_READ_SECONDS=0 reads here")
+    raise RuntimeError("the process that helpers come from cannot be reached")
 
 
 def _start() -> str:

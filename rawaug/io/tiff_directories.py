@@ -21,7 +21,7 @@ class _Layout(NamedTuple):
     """Formats of struct: of an offset, of the number of entries, of an entry up to its value."""
 
     offset: str
-    count: str
+    number: str
     entry: str
 
 
@@ -59,8 +59,8 @@ def require_no_circle(path: Path) -> None:
 
 def _followed(file: BinaryIO, order: str, layout: _Layout, place: int, end: int) -> list[int]:
     """Offsets that a directory names: of its successor and of its children."""
-    place += struct.calcsize(order + layout.count)
-    count = _number(file, order + layout.count, place - struct.calcsize(order + layout.count))
+    place += struct.calcsize(order + layout.number)
+    count = _number(file, order + layout.number, place - struct.calcsize(order + layout.number))
     size, wide = struct.calcsize(order + layout.entry), struct.calcsize(order + layout.offset)
     if place + count * (size + wide) > end:
         return []  # what is cut off is left to whoever reads it

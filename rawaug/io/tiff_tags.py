@@ -80,8 +80,10 @@ def read_tiff_tags(path: Path) -> TiffTags:
             rows, columns = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
             black = _black(mosaic, _mean(rows) + _mean(columns))
             area = mosaic.tags.valueof(_ACTIVE_AREA) or (0, 0)
-            above = (_about_zero(deltas) for deltas in (rows, columns))
-            return TiffTags(make, model, profile, _mosaic_end(mosaic), black, _gain_maps(mosaic), *above, area[:2])
+            rows, columns = _about_zero(rows), _about_zero(columns)
+            return TiffTags(
+                make, model, profile, _mosaic_end(mosaic), black, _gain_maps(mosaic), rows, columns, area[:2]
+            )
     except tifffile.TiffFileError:
         return TiffTags()
 

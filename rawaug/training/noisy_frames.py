@@ -50,11 +50,14 @@ class NoisyFrame(NamedTuple):
 def noisy_only(pair: Pair) -> Pair:
     """The pair without anything derived from a clean frame.
 
-    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` its development (bilinear demosaic, the
-    camera's white balance and matrix, the sRGB curve). A pair without one is a RAW file as shot: it is noisy itself.
+    Of a pair with a noisy capture ``raw`` becomes that capture and ``srgb`` the camera's picture of it, or else its
+    development (bilinear demosaic, the camera's white balance and matrix, the sRGB curve). A pair without one is a RAW
+    file as shot: it is noisy itself.
     """
     if pair.noisy is None:
         return pair
+    if pair.noisy_srgb is not None:
+        return replace(pair, raw=pair.noisy, srgb=pair.noisy_srgb)
     srgb = develop_packed(bayer.pack(pair.noisy[None], pair.cfa), pair.cfa, pair)
     return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
 

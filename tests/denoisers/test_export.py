@@ -53,3 +53,10 @@ def test_onnx_gives_the_same_numbers(network: denoisers.Denoiser, size: tuple[in
         expected = network(noisy, variance).numpy()
     np.testing.assert_allclose(denoised, expected, rtol=1e-4, atol=1e-5)
     assert not np.allclose(expected, noisy.numpy(), atol=1e-3)
+    for level in (0.5, 1.0):  # neither black nor NaN where it is bright and without noise
+        flat = torch.full_like(noisy, level)
+        (bright,) = session.run(None, {"noisy": flat.numpy(), "variance": np.zeros(flat.shape, np.float32)})
+        with torch.no_grad():
+            expected = network(flat, torch.zeros_like(flat)).numpy()
+        np.testing.assert_allclose(bright, expected, rtol=1e-4, atol=1e-5)
+        assert bright.max() > 0.1

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers import DHDN, Denoiser, DnCNN, UNet
+from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
 from denoisers.nafnet import NAFNet
 from denoisers.network import pad_to_multiple
 from denoisers.pmrid import PMRID
@@ -19,6 +19,9 @@ Make = Callable[..., Any]
 SMALL: dict[str, Make] = {
     "UNet": lambda **settings: UNet(width=4, **settings),
     "DHDN": lambda **settings: DHDN(width=4, **settings),
+    "CycleISPDenoiser": lambda **settings: CycleISPDenoiser(
+        **{"width": 8, "groups": 1, "blocks": 2, "reduction": 4, **settings}
+    ),
     "DnCNN": lambda **settings: DnCNN(width=8, depth=4, **settings),
     "PMRID": lambda **settings: PMRID(width=4, **{"domain": "linear", "variance_map": True, **settings}),
     "NAFNet": lambda **settings: NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1), **settings),
@@ -161,6 +164,18 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="domain 'log' is unknown; use one of linear, ksigma, anscombe"):
         make(domain="log")
+
+
+@torch.no_grad()
+def test_dhdn_s_lowest_level_and_what_it_started_from_go_up_together() -> None:
+    """Concatenated as at every other level: C features that were kept beside C that were worked on."""
+    net = awake(DHDN(width=4))
+    seen: dict[str, Tensor] = {}
+    net.encoder[-1].register_forward_hook(lambda _, given, made: seen.update(started=given[0], worked=made))
+    net.up[0].register_forward_pre_hook(lambda _, given: seen.update(up=given[0]))
+    net(*pair(1, 4, 16, 16))
+    assert not torch.equal(seen["started"], seen["worked"])
+    assert torch.equal(seen["up"], torch.cat([seen["worked"], seen["started"]], dim=1))
 
 
 def size(model: Denoiser) -> int:

@@ -51,6 +51,17 @@ def test_convolutions_are_seamless(size: tuple[int, int]) -> None:
     assert min(size) < 24 or (tiled(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
 
 
+def test_no_seam_at_any_size_around_that_of_a_tile() -> None:
+    model = awake(DnCNN(width=4, depth=3, batch_norm=False))
+    with torch.no_grad():
+        for side in range(2, 40):  # tiles of 16 with an overlap of 3: one tile, just more than one, up to four
+            noisy, variance = pair(1, 4, side, 5)
+            for turned in (lambda x: x, lambda x: x.transpose(-1, -2)):
+                whole = model(turned(noisy), turned(variance))
+                pieces = tiled(model, turned(noisy), turned(variance), tile=16, overlap=3)
+                assert (pieces - whole).abs().max() < 1e-5, f"a seam at a side of {side}"
+
+
 @pytest.mark.parametrize("side", [383, 384, 385, 387, 400, 513, 640, 2000])
 def test_equal_tiles_are_no_more_than_needed(side: int) -> None:
     starts, length = _pieces(side, 384, 64, 16)

@@ -134,7 +134,7 @@ def test_it_is_a_module_too(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 def test_shells_complete_commands_and_options(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
-    assert "train.learning-rate" in script and "train.learning_rate" not in script
+    assert "train.learning-rate" in script and "--train.learning_rate" not in script
     if shell == "bash":
         (tmp_path / "complete").write_text(script)
         ask = "COMP_WORDS=(rawaug denoise --self); COMP_CWORD=2; _shtab_rawaug; echo ${COMPREPLY[@]}"

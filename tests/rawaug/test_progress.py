@@ -65,7 +65,7 @@ def test_the_interval_is_that_of_the_log_not_of_each_bar(monkeypatch: pytest.Mon
     monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0.05")
     log, began = io.StringIO(), time.perf_counter()
     for k in range(40):  # each over within the interval
-        list(progress(iter([time.sleep(0.005)]), label=f"picture {k}", unit="image", total=1, stream=log))
+        list(progress(map(time.sleep, [0.005]), label=f"picture {k}", unit="image", total=1, stream=log))
     lines = log.getvalue().splitlines()
     assert 2 <= len(lines) <= (time.perf_counter() - began) / 0.05
 

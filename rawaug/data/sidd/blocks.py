@@ -5,8 +5,10 @@ same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 
 :data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern
 of each frame in a line of ``siddplus_*bayer_patterns.csv``.
 
-The blocks come without colour: it is read from the METADATA files of their scene instances if these are below the
-same folder; else the gains are 1, the colour matrix is the identity, and the picture shows camera colour.
+Their pictures are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
+``siddplus_valid_gt_srgb.mat``) if these are below the same folder, gains and colour matrix from the METADATA files of
+their scene instances. Where there is neither, the gains are 1, the matrix is the identity, the picture shows camera
+colour, and the pair says so (``rendered`` is False): it can test a denoiser, but no ISP.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from rawaug.data.colour import develop_mosaic
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array
 from rawaug.data.pair import Pair
+from rawaug.data.sidd.block_pictures import read_block_pictures, turned_like
 from rawaug.data.sidd.frames import Colour, SiddFrames, colour_of, indexed, noise_level_functions, normalised
 from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
 from rawaug.registry import DATASETS
@@ -39,6 +42,25 @@ MOST_FRAMES = 1000
 T = TypeVar("T")
 
 _NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
+
+
+class _Frame(NamedTuple):
+    """What the blocks of a frame have in common.
+
+    Args:
+        levels: of the noise.
+        levels_from_clean: whether they were measured against the clean blocks.
+        colour: from METADATA; None where there is none.
+        srgb, noisy_srgb: pictures ``(32, 3, H, W)``, as the mosaics lie; None where there are none.
+    """
+
+    cfa: CFA
+    camera: str
+    levels: tuple[float, float]
+    levels_from_clean: bool
+    colour: Colour | None = None
+    srgb: Tensor | None = None
+    noisy_srgb: Tensor | None = None
 
 
 class NoisyBlock(NamedTuple):
@@ -70,7 +92,7 @@ class Once(Generic[T]):
 
 
 class SiddBlocks(LazyPairs):
-    """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB) once the first is read.
+    """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB, pictures 0.5 GB) once the first is read.
 
     Noise levels are those of a ``noise_level_functions.csv`` if there is one below the folder with the scene
     instance, else measured on the 32 blocks of a frame against the clean ones.
@@ -91,21 +113,31 @@ class SiddBlocks(LazyPairs):
         self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
         self._all = Once(self._read_all)
+        self._pictures: dict[str, Tensor] = {}
+        self._frame: tuple[int, _Frame] | None = None
         super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
 
     def read(self, index: int) -> Pair:
         scene, block = divmod(index, BLOCKS)
-        frame = self.scenes[scene]
         clean, noisy = (blocks[scene] for blocks in self._all())
-        levels = self._levels.get(frame.name) or captured_noise(clean.numpy(), noisy.numpy())
-        colour = self._colours.get(frame.name, _NO_COLOUR)
-        return _pair(self.names[index], clean[block], noisy[block], frame.cfa, colour, levels, frame.camera)
+        if self._frame is None or self._frame[0] != scene:
+            self._frame = scene, self._frame_of(scene, clean, noisy)
+        return _pair(self.names[index], block, clean, noisy, self._frame[1])
+
+    def _frame_of(self, scene: int, clean: Tensor, noisy: Tensor) -> _Frame:
+        shot = self.scenes[scene]
+        known = self._levels.get(shot.name)
+        levels = known or captured_noise(clean.numpy(), noisy.numpy())
+        what = f"{self.path}: {shot.name}"
+        pictures = {key: turned_like(every[scene], clean, shot.cfa, what) for key, every in self._pictures.items()}
+        return _Frame(shot.cfa, shot.camera, levels, known is None, self._colours.get(shot.name), **pictures)
 
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (_blocks_of_scenes(file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         self._levels = noise_level_functions(self.path)
         self._colours = _colours(self.path)
+        self._pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
         return clean, noisy
 
 
@@ -114,7 +146,8 @@ class SiddPlusBlocks(LazyPairs):
 
     Args:
         path: contains ``siddplus_valid_noisy_raw.mat``, ``siddplus_valid_gt_raw.mat`` and a
-            ``siddplus_*bayer_patterns.csv`` with a pattern for each frame of 32 blocks, at any depth.
+            ``siddplus_*bayer_patterns.csv`` with a pattern for each frame of 32 blocks, at any depth; pictures in
+            ``siddplus_valid_gt_srgb.mat`` and ``siddplus_valid_noisy_srgb.mat``, if there are any.
 
     Raises:
         FileNotFoundError: if one of them is not there.
@@ -122,25 +155,32 @@ class SiddPlusBlocks(LazyPairs):
     """
 
     def __init__(self, path: str | Path) -> None:
-        path = Path(path)
+        path = self.path = Path(path)
         self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
         patterns = find_file(path, "siddplus_*bayer_patterns.csv")
         self.cfas = _patterns(patterns)
         self._all = Once(self._read_all)
+        self._pictures: dict[str, Tensor] = {}
+        self._frame: tuple[int, _Frame] | None = None
         super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
 
     def read(self, index: int) -> Pair:
-        frame = slice(index // BLOCKS * BLOCKS, (index // BLOCKS + 1) * BLOCKS)
-        clean, noisy = self._all()
-        levels = captured_noise(clean[frame].numpy(), noisy[frame].numpy())
-        cfa = self.cfas[index // BLOCKS]
-        return _pair(self.names[index], clean[index], noisy[index], cfa, _NO_COLOUR, levels, "SIDD+")
+        number, block = divmod(index, BLOCKS)
+        part = slice(number * BLOCKS, (number + 1) * BLOCKS)
+        clean, noisy = (blocks[part] for blocks in self._all())
+        if self._frame is None or self._frame[0] != number:
+            what, cfa = f"{self.path}: frame {number}", self.cfas[number]
+            pictures = {key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()}
+            levels = captured_noise(clean.numpy(), noisy.numpy())
+            self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
+        return _pair(self.names[index], block, clean, noisy, self._frame[1])
 
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         if len(clean) != len(self):
             raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
+        self._pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
         return clean, noisy
 
 
@@ -215,6 +255,17 @@ def find_file(path: Path, pattern: str) -> Path:
     return found[0]
 
 
+def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
+    """The pictures of the clean and of the noisy blocks, of those that there are."""
+    found = {}
+    for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
+        name = pattern.format(kind)
+        if any(path.rglob(name)):
+            side = (clean.shape[-2], clean.shape[-1])
+            found[key] = read_block_pictures(find_file(path, name), tuple(clean.shape[:-3]), side)
+    return found
+
+
 def _patterns(file: Path) -> list[CFA]:
     """A pattern for each frame of 32 blocks."""
     try:
@@ -245,18 +296,26 @@ def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:
         raise ValueError(f"{file}: holds {tuple(noisy.shape)}, its clean counterpart {tuple(clean.shape)}")
 
 
-def _pair(
-    name: str, clean: Tensor, noisy: Tensor, cfa: CFA, colour: Colour, levels: tuple[float, float], camera: str
-) -> Pair:
+def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) -> Pair:
+    """Block ``block`` of a frame's mosaics ``(32, 1, H, W)``."""
+    colour = frame.colour or _NO_COLOUR
+    if frame.srgb is not None:
+        srgb = frame.srgb[block]
+    else:
+        srgb = develop_mosaic(clean[block], frame.cfa, colour.white_balance, colour.matrix)
     return Pair(
         name=name,
-        srgb=develop_mosaic(clean, cfa, colour.white_balance, colour.matrix),
-        raw=clean,
-        cfa=cfa,
+        srgb=srgb,
+        raw=clean[block],
+        cfa=frame.cfa,
         white_balance=colour.white_balance,
         color_matrix=colour.matrix,
-        noisy=noisy,
-        shot_var=levels[0],
-        read_var=levels[1],
-        camera=camera,
+        noisy=noisy[block],
+        shot_var=frame.levels[0],
+        read_var=frame.levels[1],
+        camera=frame.camera,
+        color_known=frame.colour is not None,
+        rendered=frame.srgb is not None or frame.colour is not None,
+        noisy_srgb=None if frame.noisy_srgb is None else frame.noisy_srgb[block],
+        levels_from_clean=frame.levels_from_clean,
     )

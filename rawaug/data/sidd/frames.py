@@ -27,19 +27,21 @@ from rawaug.data.colour import color_matrix, develop_mosaic, white_balance
 from rawaug.data.lazy import LazyPairs
 from rawaug.data.mat import read_array, read_value
 from rawaug.data.pair import Pair
+from rawaug.data.select import FrameLabel
 from rawaug.data.sidd.scenes import HELD_BACK, SiddScene, is_scene
 from rawaug.io import read_picture
 from rawaug.io.apart import apart
 from rawaug.io.picture_files import view_of_orientation
 
-_FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
+_FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
 
 
 class SiddFrames(LazyPairs):
     """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set if present.
 
-    Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame.
-    Where a frame's ``GT_SRGB`` picture is not there, the clean frame is developed as the dataset's makers did.
+    Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame,
+    which the pair says (``levels_from_clean``). Where a frame's ``GT_SRGB`` picture is not there, the clean frame is
+    developed as the dataset's makers did; its ``NOISY_SRGB`` picture is read where there is one.
 
     Args:
         path: contains the folders of the scene instances, at any depth. Those of validation and benchmark are left out.
@@ -72,6 +74,11 @@ class SiddFrames(LazyPairs):
         self.levels = noise_level_functions(self.path)
         super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
 
+    @property
+    def labels(self) -> list[FrameLabel]:
+        """Scene, phone and ISO of every frame."""
+        return [FrameLabel(f"{scene.scene:03d}", scene.phone, scene.iso) for scene, *_ in self.shots]
+
     def read(self, index: int) -> Pair:
         scene, _, files = self.shots[index]
         clean, noisy = (mosaic_of(files[kind]) for kind in ("GT_RAW", "NOISY_RAW"))
@@ -79,14 +86,12 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-        if "GT_SRGB" in files:
-            srgb = _even(turn_back(apart(read_picture, files["GT_SRGB"]), view))
-        else:
-            srgb = develop_mosaic(clean, scene.cfa, gains, matrix)
-        shot_var, read_var = self.levels.get(scene.name) or measured_levels(clean, noisy)
+        pictures = {kind: _turned_back(files[kind], view) for kind in ("GT_SRGB", "NOISY_SRGB") if kind in files}
+        known = self.levels.get(scene.name)
+        shot_var, read_var = known or measured_levels(clean, noisy)
         return Pair(
             name=self.names[index],
-            srgb=srgb.contiguous(),
+            srgb=pictures["GT_SRGB"] if "GT_SRGB" in pictures else develop_mosaic(clean, scene.cfa, gains, matrix),
             raw=clean,
             cfa=scene.cfa,
             white_balance=gains,
@@ -95,6 +100,8 @@ class SiddFrames(LazyPairs):
             shot_var=shot_var,
             read_var=read_var,
             camera=scene.camera,
+            noisy_srgb=pictures.get("NOISY_SRGB"),
+            levels_from_clean=known is None,
         )
 
 
@@ -145,7 +152,8 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
 
 
 def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
-    """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB.
+    """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB,
+    NOISY_SRGB.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -182,6 +190,11 @@ def colour_of(file: Path) -> Colour:
         return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
+
+
+def _turned_back(file: Path, view: int) -> Tensor:
+    """The upright picture in ``file`` as the sensor saw it."""
+    return _even(turn_back(apart(read_picture, file), view)).contiguous()
 
 
 def _even(image: Tensor) -> Tensor:

@@ -13,13 +13,11 @@ leaves open (colour branch: two groups of two blocks; blur: 21 x 21, sigma 12) f
 from __future__ import annotations
 
 import os
-import pickle
-from pathlib import Path
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from denoisers.dual_attention import Trunk, conv, load_published
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
@@ -30,64 +28,13 @@ BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
 """Below it the loss of logarithms looks away: at 12 bits it is four levels above black."""
 
-RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
-"""Names of layers in the published checkpoints, and here."""
-UNUSED = ("blur.", "merge.0.")
-"""Published, after renaming, but constant or without use in the published pass."""
-
-
-class DualAttentionBlock(nn.Module):
-    """``v + merge([spatial attention, channel attention] of conv(act(conv(v))))``."""
-
-    def __init__(self, features: int, reduction: int, act: nn.PReLU) -> None:
-        super().__init__()
-        squeezed = features // reduction
-        self.body = nn.Sequential(_conv(features, features), act, _conv(features, features))
-        self.spatial = nn.Conv2d(2, 1, 3, padding=1, bias=False)
-        self.channel = nn.Sequential(nn.Conv2d(features, squeezed, 1), nn.ReLU(), nn.Conv2d(squeezed, features, 1))
-        self.merge = nn.Conv2d(2 * features, features, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        f = self.body(x)
-        where = self.spatial(torch.cat([f.amax(1, keepdim=True), f.mean(1, keepdim=True)], dim=1)).sigmoid()
-        which = self.channel(f.mean((2, 3), keepdim=True)).sigmoid()
-        return x + self.merge(torch.cat([f * where, f * which], dim=1))
-
-
-class ResidualGroup(nn.Module):
-    """Dual-attention blocks and a convolution, added to their input."""
-
-    def __init__(self, features: int, blocks: int, reduction: int, act: nn.PReLU) -> None:
-        super().__init__()
-        layers: list[nn.Module] = [DualAttentionBlock(features, reduction, act) for _ in range(blocks)]
-        self.body = nn.Sequential(*layers, _conv(features, features))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.body(x)
-
-
-class Trunk(nn.Module):
-    """What the three networks share: a first convolution, groups, a convolution and the one PReLU used all over.
-
-    Args:
-        inputs: channels that come in.
-        features, groups, blocks, reduction: 96, 3, 5 and 8 as published.
-    """
-
-    def __init__(self, inputs: int, features: int, groups: int, blocks: int, reduction: int) -> None:
-        super().__init__()
-        act = nn.PReLU(features)
-        self.head = _conv(inputs, features)
-        layers: list[nn.Module] = [ResidualGroup(features, blocks, reduction, act) for _ in range(groups)]
-        self.body = nn.Sequential(*layers, _conv(features, features), act)
-
 
 class RGB2RAW(Trunk):
     """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
 
     def __init__(self, features: int = 96, groups: int = 3, blocks: int = 5, reduction: int = 8) -> None:
         super().__init__(3, features, groups, blocks, reduction)
-        self.tail = nn.Sequential(_conv(features, 3))
+        self.tail = nn.Sequential(conv(features, 3))
 
     def forward(self, srgb: Tensor) -> Tensor:
         return self.tail(self.body(self.head(srgb)))
@@ -98,7 +45,7 @@ class ColourBranch(Trunk):
 
     def __init__(self, features: int = 96, groups: int = 2, blocks: int = 2, reduction: int = 8) -> None:
         super().__init__(3, features, groups, blocks, reduction)
-        self.tail = nn.Sequential(_conv(features, features), nn.Sigmoid())
+        self.tail = nn.Sequential(conv(features, features), nn.Sigmoid())
 
     def forward(self, srgb: Tensor) -> Tensor:
         from kornia.filters import gaussian_blur2d
@@ -115,7 +62,7 @@ class RAW2RGB(Trunk):
 
     def __init__(self, features: int = 96, groups: int = 3, blocks: int = 5, reduction: int = 8) -> None:
         super().__init__(4, features, groups, blocks, reduction)
-        self.tail = nn.Sequential(_conv(features, features), self.body[-1])
+        self.tail = nn.Sequential(conv(features, features), self.body[-1])
         self.tail_rgb = nn.Sequential(nn.Conv2d(features, 12, 1))
 
     def forward(self, packed: Tensor, colour: Tensor) -> Tensor:
@@ -200,46 +147,7 @@ class CycleISP(CropTrainedISP):
         parts = ("rgb2raw", "raw2rgb", "ccm")
         if part not in parts:
             raise ValueError(f"part {part!r} is unknown; use one of {', '.join(parts)}")
-        network, state = getattr(self, part), _own_names(_read_state(Path(path)))
-        expected = network.state_dict()
-        differing = sorted(expected.keys() ^ state.keys())
-        if differing:
-            what = "unknown" if differing[0] in state else "missing"
-            raise ValueError(f"{path}: layer {differing[0]} is {what} for {part} of this size")
-        for key, value in expected.items():
-            if value.shape != state[key].shape:
-                sizes = f"{tuple(state[key].shape)}, {part} needs {tuple(value.shape)}"
-                raise ValueError(f"{path}: layer {key} is {sizes}; build the model in the published size")
-        network.load_state_dict(state)
+        load_published(getattr(self, part), path, part)
 
     def _render(self, raw: Tensor, reference: Tensor) -> Tensor:
         return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(reference))
-
-
-def _conv(inputs: int, outputs: int) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, padding=1)
-
-
-def _read_state(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-        raise ValueError(f"{path}: not a checkpoint of plain weights: {str(error).splitlines()[0]}") from None
-    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise ValueError(f"{path}: holds no 'state_dict' of tensors; give a checkpoint in CycleISP's layout")
-    return state
-
-
-def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Published names of layers to those here, without the layers that are of no use."""
-    renamed = {}
-    for name, value in state.items():
-        key = name.removeprefix("module.")
-        for published, own in RENAMED:
-            key = key.replace(published, own)
-        if not key.startswith(UNUSED):
-            renamed[key] = value
-    return renamed

@@ -3,16 +3,18 @@ r"""Encoders, last, with tone and dictionaries frozen, and only where frames tha
 ``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``: the RAW that the weights of the reverse
 encoders make, the same for the forward encoders', and the consistency of the two (Conde et al., AAAI 2022, "Training").
 Trained together with the rest on few frames, encoders learn the frames by heart and take tone and matrices with them.
+Whether they help is asked of frames that nothing has seen: for every fold curve, tone and atoms are fitted anew without
+its frames, then constants and encoders are compared on these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from rawaug.isp.fit.atoms import LOG_MSE_EPS, set_priors
+from rawaug.isp.fit.atoms import LOG_MSE_EPS
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.losses import apart, decibels, mean_square
@@ -27,15 +29,23 @@ PIXELS_A_STEP = 1024
 LEARNING_RATE = 1e-3
 CONSISTENCY = 1.0
 
+Refit = Callable[[Sequence[int], str], DictionaryISP]
+"""Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
+
 
 def train_encoders(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[Shot],
+    config: FitConfig,
+    descent: Descent,
+    refit: Refit,
 ) -> None:
     """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` records which."""
     wanted = config.encoders
     isp.use_encoders(False)
     if wanted == "auto" and len(shots) >= FEWEST_FRAMES:
-        gain = _gain_on_frames_left_out(isp, samples, shots, descent)
+        gain = _gain_on_frames_left_out(samples, shots, descent, refit)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
@@ -87,19 +97,16 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
     return pieces[0], pieces[1]
 
 
-def _gain_on_frames_left_out(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], descent: Descent
-) -> float:
-    """Mean dB by which encoders beat constants on frames that neither has seen; leaves the ISP as it was."""
-    start = {name: value.clone() for name, value in isp.state_dict().items()}
+def _gain_on_frames_left_out(samples: PixelSamples, shots: Sequence[Shot], descent: Descent, refit: Refit) -> float:
+    """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
     gain = 0.0
     for fold in range(FOLDS):
         out = list(range(fold, len(shots), FOLDS))
         kept = [k for k in range(len(shots)) if k not in out]
-        set_priors(isp, samples.pick(torch.arange(samples.srgb.shape[-1]), torch.tensor(kept)))
-        _train(isp, samples, shots, kept, descent, f"encoders without part {fold + 1} of {FOLDS}")
-        gain += len(out) * decibels(isp, samples, shots, out)
+        part = f" without part {fold + 1} of {FOLDS}"
+        isp = refit(kept, part)
         isp.use_encoders(False)
         gain -= len(out) * decibels(isp, samples, shots, out)
-        isp.load_state_dict(start)
+        _train(isp, samples, shots, kept, descent, f"encoders{part}")
+        gain += len(out) * decibels(isp, samples, shots, out)
     return gain / len(shots)

@@ -4,7 +4,7 @@ r"""The stages of a fit, in order.
    and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
 2. Tone. The tone network starts as that curve and is refined together with all of stage 1.
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
-4. Encoders, where frames that were left out say that they help.
+4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
 
@@ -76,11 +76,15 @@ def fit_isp(
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
+
+    def refit(frames: Sequence[int], part: str) -> DictionaryISP:
+        index = torch.tensor(frames)
+        some = PixelSamples(*(value[index] for value in samples))
+        return _Fit(some, [shots[k] for k in frames], config, fit.descent, part).reversed_only()
+
     with one_thread():
-        fit.curve()
-        fit.tone(report)
-        fit.atoms(fit.isp)
-        train_encoders(fit.isp, samples, shots, config, fit.descent)
+        fit.reversed_only(report)
+        train_encoders(fit.isp, samples, shots, config, fit.descent, refit)
         fit.forward()
         train_jointly(fit.isp, samples, shots, config, fit.descent)
     fit.descent.finish()
@@ -120,10 +124,12 @@ def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
 
 
 class _Fit:
-    """The ISP under way, with every frame's own colour."""
+    """The ISP under way, with every frame's own colour; ``part`` ends the names of its stages."""
 
-    def __init__(self, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent) -> None:
-        self.samples, self.shots, self.config, self.descent = samples, shots, config, descent
+    def __init__(
+        self, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent, part: str = ""
+    ) -> None:
+        self.samples, self.shots, self.config, self.descent, self.part = samples, shots, config, descent, part
         self.isp = new_isp(shots, config)
         self.tie = Tie(shots)
         self.colour = self._start()
@@ -143,6 +149,13 @@ class _Fit:
     def _start_coarse(self, gamma: float, toe: float) -> None:
         for stage in self.isp.ordered_stages:
             stage.start_coarse(gamma, toe)
+
+    def reversed_only(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
+        """Stages 1 to 3: the reverse pass, without encoders."""
+        self.curve()
+        self.tone(report)
+        self.atoms(self.isp)
+        return self.isp
 
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
@@ -193,7 +206,7 @@ class _Fit:
             return reading_error(predicted, part) + self.tie(self.colour)
 
         steps = CURVE_STEPS if self.config.curve_steps is None else self.config.curve_steps
-        self.descent.run(stage, loss, tensors, steps, CURVE_RATE)
+        self.descent.run(stage + self.part, loss, tensors, steps, CURVE_RATE)
 
     # -- stage 2 ----------------------------------------------------------------------------------------------------
 
@@ -212,7 +225,8 @@ class _Fit:
         def status() -> str:
             return "" if report is None else report(self.snapshot())
 
-        self.descent.run("sRGB to RAW", loss, tensors, self.config.steps, self.config.learning_rate, status)
+        name = f"sRGB to RAW{self.part}"
+        self.descent.run(name, loss, tensors, self.config.steps, self.config.learning_rate, status)
 
     def _few_numbers(self, without: Stage | None = None) -> dict[str, Tensor]:
         used = [stage for stage in self.isp.ordered_stages if stage is not without]

@@ -108,7 +108,8 @@ def sample_pixels(
         noisy: take the captured noisy RAW (and never the clean one).
 
     Raises:
-        ValueError: if there is no pair, or a noisy RAW is asked for and absent.
+        ValueError: if there is no pair, one's colours are unknown, or a noisy RAW is asked for and
+            absent.
     """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:

@@ -10,9 +10,12 @@ r2r                ``y + a m``               ``y - m / a``         E[x | input],
 neighbor2neighbor  one pixel of each cell    its neighbour         E[neighbour | input]: biased where neighbours differ
 =================  ========================  ====================  =====================================================
 
-``m`` is drawn with the noise's own variance ``shot_var y + read_var``. That it is taken at the noisy signal is right on
-average: r2r's input and target stay uncorrelated given x, since E[shot_var y + read_var] is the variance at x. Below
-black the variance is held at ``read_var``, and what the sensor clipped at white is lost to every estimator.
+``m`` is drawn with the noise's own variance, ``shot_var y + read_var``, held at 0. That it is taken at the noisy signal
+is right on average: r2r's input and target stay uncorrelated given x, since E[shot_var y + read_var] is the variance at
+x. Holding it at 0 adds to that mean where y often falls below ``-read_var / shot_var``, that is in shadows of cameras
+whose shot noise is strong beside their read noise: at x = 0 the slope of r2r's target on its input, which should be 0,
+is -0.0002 where ``sqrt(read_var) / shot_var`` is 5, -0.004 at 2 and -0.07 at 1. What the sensor clipped at black (as
+SIDD's published frames are) or at white is lost to every estimator.
 
 Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, that of l1 their median.
 

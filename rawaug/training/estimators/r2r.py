@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
+from denoisers.recorrupted import Recorrupted
 from rawaug.data.sample import Sample
 from rawaug.registry import ESTIMATORS
-from rawaug.training.estimators.self_supervised import SelfSupervised, positive, recorrupted, variance_of
+from rawaug.training.estimators.self_supervised import SelfSupervised, drawing_variance, positive, recorrupted
 
 
 @ESTIMATORS.register("r2r")
@@ -15,14 +18,22 @@ class R2R(SelfSupervised):
 
     Args:
         alpha: small: the input is little noisier than the frame, the target much; 1: both have twice the variance.
+        average: at a test, denoise this many recorrupted copies of a frame and average them, as published; 0 denoises
+            the frame itself.
     """
 
-    def __init__(self, alpha: float = 0.5) -> None:
-        self.alpha = positive(alpha)
+    def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
+        if average < 0:
+            raise ValueError(f"average must be at least 0, got {average}")
+        self.alpha, self.average = positive(alpha), average
 
     def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> Sample:
         """See :meth:`SelfSupervised.apply`."""
         noisy = shots[0]
         noisier, variance = recorrupted(noisy, shot_var, read_var, self.alpha, drawn)
-        target = noisy - variance_of(noisy, shot_var, read_var).sqrt() * drawn / self.alpha
+        target = noisy - drawing_variance(noisy, shot_var, read_var).sqrt() * drawn / self.alpha
         return Sample(noisier, target, variance)
+
+    def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        """See :meth:`Supervised.at_test`."""
+        return Recorrupted(run, self.alpha, self.average) if self.average else run

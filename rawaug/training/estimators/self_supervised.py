@@ -12,8 +12,17 @@ from rawaug.training.estimators.supervised import Supervised
 
 
 def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """The noise variance computed from the noisy signal, shape of ``noisy``."""
+    """The noise map of a frame, computed from the noisy signal clipped at black as in every test; its shape."""
     return read_var + shot_var * noisy.clamp_min(0.0)
+
+
+def drawing_variance(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
+    """The variance with which noise is put on top of ``noisy``: ``shot_var y + read_var``, at least 0.
+
+    The signal is not clipped at black first: of the noisy values around a dark ``x`` half lie below it, and the mean
+    of the variance must be that at ``x``. It is as long as ``y`` rarely falls below ``-read_var / shot_var``.
+    """
+    return (shot_var * noisy + read_var).clamp_min(0.0)
 
 
 class SelfSupervised(Supervised, ABC):
@@ -36,7 +45,7 @@ class SelfSupervised(Supervised, ABC):
 
 def recorrupted(noisy: Tensor, shot_var: float, read_var: float, alpha: float, drawn: Tensor) -> tuple[Tensor, Tensor]:
     """``y + alpha m``, clipped at white, and the variance map of all its noise."""
-    noisier = (noisy + alpha * variance_of(noisy, shot_var, read_var).sqrt() * drawn).clamp(max=1.0)
+    noisier = (noisy + alpha * drawing_variance(noisy, shot_var, read_var).sqrt() * drawn).clamp(max=1.0)
     return noisier, (1.0 + alpha**2) * variance_of(noisier, shot_var, read_var)
 
 

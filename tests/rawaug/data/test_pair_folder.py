@@ -101,7 +101,7 @@ def test_statements_of_a_file_are_taken(tmp_path: Path, suffix: str) -> None:
         packed: dict[str, Any] = {
             k: pack(torch.from_numpy(x.astype(np.int32))[None], "GRBG").numpy() for k, x in both().items()
         }
-        np.savez(tmp_path / "a.npz", **packed, **{k: np.array(v) for k, v in stated.items()})
+        np.savez(tmp_path / "a.npz", **packed, **stated)
     else:
         savemat(tmp_path / "a.mat", {**both(), **stated})
     pair = PairFolder(tmp_path)[0]

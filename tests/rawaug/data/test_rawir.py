@@ -72,6 +72,7 @@ def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
         lambda whole: whole.replace(b"'<u2'", b"'|O'  "),
         lambda whole: whole.replace(b"'shape'", b"'shap['"),
         lambda whole: whole[:40],
+        lambda whole: whole[:40] + b" " * (len(whole) - 40),  # the dictionary in the header does not end
         lambda whole: b"PK\x03\x04" + whole,
         lambda whole: b"",
     ],

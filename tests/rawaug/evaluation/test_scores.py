@@ -46,6 +46,32 @@ def identity(tmp_path: Path) -> Path:
     return path
 
 
+def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
+    """A test must not know the clean frame, not even through its noise map."""
+    captured = demo_pairs("test", count=1)[0]
+    assert captured.shot_var is not None and captured.read_var is not None
+    drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
+    for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
+        sample = frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=0)
+        assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
+        expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
+        torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
+
+
+def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest.CaptureFixture[str]) -> None:
+    pair = demo_pairs("test", count=1)[0].middle(64)
+    measured = replace(pair, name="measured", shot_var=None, read_var=None)  # so that they are measured
+    noise = noise_model((1e-2, 1e-4))
+    pairs = [pair, measured]
+    scored = score_method(lambda _, sample: sample.noisy * 0.99, pairs, noise, pair.cfa, 0, "marked")
+    result = summary([score for score, *_ in scored])
+    assert result["levels_from_clean"] == 1
+    assert [image.get("levels_from_clean") for image in result["images"]] == [None, True]
+    print_scores({"kind": "denoiser", "data": "demo", **result})
+    said = capsys.readouterr().out
+    assert "measured *" in said and "noise levels of 1 of 2 images were measured against their clean frames" in said
+
+
 def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path) -> None:
     result = evaluate(identity, "demo:validation")
     assert result["kind"] == "denoiser" and len(result["images"]) == 4

@@ -38,7 +38,7 @@ def test_it_is_found_before_any_work(
 ) -> None:
     monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     monkeypatch.setitem(__import__("sys").modules, "pywt", None)
-    monkeypatch.setattr(denoising, "open_pairs", lambda *_, **__: pytest.fail("data was read"))
+    monkeypatch.setattr(denoising, "planned", lambda *_: pytest.fail("data was read"))
     with pytest.raises((ValueError, OSError), match=message):
         denoising.run(replace(recipe, **change))
     assert not list(Path(recipe.out).iterdir())

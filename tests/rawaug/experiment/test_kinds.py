@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from rawaug.cli import _parser
+from rawaug.commands.spelling import require_known_keys, require_known_options
 from rawaug.experiment.kinds import KINDS, kind_of
 from rawaug.experiment.methods import FAMILIES, ROWS
+from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import find_recipe
 from rawaug.experiment.reconstruction import Comparison
 from rawaug.isp.baselines import BASELINES
@@ -37,18 +39,20 @@ def test_every_kind_has_settings_that_name_it() -> None:
 def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
     expected = name if name in KINDS else "training"
     assert kind_of(find_recipe(name)) == expected
-    parsed = _parser(expected, ["run"])[0].parse_args(["run", "--recipe", str(find_recipe(name))])
-    assert parsed.run.name == name
+    parser, commands = _parser(expected, ["run"])
+    require_known_keys(name, read_yaml(find_recipe(name)), commands["run"])
+    assert parser.parse_args(["run", "--recipe", str(find_recipe(name))]).run.name == name
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_commands_of_a_header_can_be_given(name: str) -> None:
     commands = re.findall(r"^#   (rawaug run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
     assert len(commands) >= 3 and any("--smoke" in command for command in commands)
-    parser, _ = _parser(kind_of(find_recipe(name)), ["run"])
+    parser, parsers = _parser(kind_of(find_recipe(name)), ["run"])
     for command in commands:
         _, _, named, *rest = shlex.split(command)
         assert named == name
+        require_known_options("run", parsers["run"], rest)
         given = parser.instantiate(parser.parse_args(["run", "--recipe", str(find_recipe(name)), *rest])).run
         kind = KINDS[kind_of(find_recipe(name))]
         recipe = kind.settings(**{key: getattr(given, key) for key in kind.settings.__dataclass_fields__})

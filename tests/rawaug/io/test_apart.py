@@ -6,6 +6,8 @@ import ctypes
 import multiprocessing
 import os
 import signal
+import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from rawaug.data import PictureFolder
+from rawaug.io import apart as reading
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import apart, prepare, time_limit
 
@@ -89,3 +92,14 @@ def test_a_folder_names_the_file_that_crashed_in_a_worker_and_goes_on(
     assert [int(picture[0, 0, 0]) for picture in loader] == [0, 1, 3, 3]
     assert [path.name for path in pictures.skipped] == ["2.png"]
     assert "2.png: crashes the decoder (killed by SIGSEGV)" in pictures.report()
+
+
+def test_where_no_helper_can_start_files_are_read_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "_of_this_thread", threading.local())
+    monkeypatch.setattr(reading, "_unavailable", False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    monkeypatch.delenv("RAWAUG_READERS", raising=False)
+    prepare()
+    with pytest.warns(UserWarning, match="files are read in this process, which a damaged one may end"):
+        assert apart(os.getpid) == os.getpid()
+    assert apart(os.getpid) == os.getpid()  # once is enough

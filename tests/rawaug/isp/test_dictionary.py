@@ -79,6 +79,19 @@ def test_perturbation_grows_with_strength_and_is_keyed() -> None:
     assert torch.equal(again, perturb(weights, 0.1, torch.Generator().manual_seed(1)))
 
 
+def test_perturbed_weights_are_the_nearest_on_the_simplex() -> None:
+    """Not those clipped at 0 and divided by their sum: that draws mixtures towards their middle."""
+    weights, strength = torch.tensor([[0.9, 0.1, 0.0, 0.0]]).expand(200, 4), 0.3
+    noise = torch.randn(200, 4, generator=torch.Generator().manual_seed(1))
+    drawn = perturb(weights, strength, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(drawn, project_to_simplex(weights + strength * noise))
+    torch.testing.assert_close(drawn.sum(1), torch.ones(200))
+    outside = weights + strength * noise
+    for _ in range(20):  # no other point of the simplex is nearer
+        other = convex_weights(200, 4, torch.Generator().manual_seed(_))
+        assert ((drawn - outside).square().sum(1) <= (other - outside).square().sum(1) + 1e-5).all()
+
+
 def test_convex_weights_are_uniform_on_the_simplex() -> None:
     weights = convex_weights(20_000, 3, torch.Generator().manual_seed(0))
     torch.testing.assert_close(weights.sum(1), torch.ones(20_000))

@@ -279,6 +279,41 @@ def test_impossible_configurations_are_refused(settings: dict[str, Any], message
         ISPConfig(**settings)
 
 
+def two_lights() -> DictionaryISP:
+    """Two matrices, two gains, strong fall-off; the forward encoders take the first gains for granted."""
+    isp = DictionaryISP(ISPConfig(colour_atoms=2, gain_atoms=2, cfa="GRBG", attention=False))
+    with torch.no_grad():
+        isp.colour.matrices.copy_(torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(4)) + torch.eye(3))
+        isp.forward_encoders.gain.set_prior(torch.tensor([1.0, 0.0]))
+        cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), 3.0 * torch.eye(2))
+    return isp.requires_grad_(False).eval()
+
+
+def test_the_forward_encoder_of_colour_sees_what_every_inverse_atom_makes(srgb: torch.Tensor) -> None:
+    """An image that the first atom made comes back as it was under the first inverse, and not under the second."""
+    isp, seen = two_lights(), list[torch.Tensor]()
+    isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    x2 = srgb[:, :, ::4, ::4] ** 2.2
+    x3 = torch.einsum("ij,bjhw->bihw", isp.colour.atoms()[0], x2)
+    isp.choose_forward(x3 / isp.gain.channel_gains()[0].reshape(1, 3, 1, 1))
+    (candidates,) = seen
+    torch.testing.assert_close(candidates[:, 0], x2[..., : candidates.shape[-2], :], atol=1e-4, rtol=1e-3)
+    assert (candidates[:, 1] - x2).abs().max() > 0.05
+
+
+def test_the_forward_encoders_are_asked_after_the_shading_is_corrected() -> None:
+    """Of a flat grey scene, dim in the corners, they see the same everywhere."""
+    isp, seen = two_lights(), list[torch.Tensor]()
+    isp.forward_encoders.gain.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    mask = cast(Any, isp.stages["shading"]).mask(place_in_frame(32, 32))
+    raw = 0.3 * mask.expand(1, 1, 32, 32)
+    assert raw.max() / raw.min() > 1.5
+    isp.forward(raw)
+    (images,) = seen
+    inside = images[..., 4:-4, 4:-4]
+    assert (inside.amax((-2, -1)) / inside.amin((-2, -1))).max() < 1.01
+
+
 def test_atoms_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     isp = DictionaryISP(ISPConfig(colour_atoms=2, gain_atoms=2))
     isp.info["held_out"] = [float("nan")]

@@ -55,6 +55,28 @@ def test_unbiased_targets_teach_what_clean_ones_would(estimator: SelfSupervised)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
+def test_in_the_dark_targets_of_r2r_do_not_follow_its_input(alpha: float) -> None:
+    """At black the clean signal is constant, so that the slope has to be 0; noise drawn as of the clipped signal, which
+    half of the time is brighter than the scene, makes it -0.15 at these levels and alpha 0.5."""
+    shot_var, read_var = 5e-3, 1e-4
+    generator = torch.Generator().manual_seed(0)
+    dark = read_var**0.5 * torch.randn(1, 4, 512, 512, generator=generator)
+    estimator = R2R(alpha)
+    drawn = estimator.sample(dark.shape[1:], torch.Generator().manual_seed(7))
+    sample = estimator.apply(dark, shot_var, read_var, drawn)
+    assert slope(sample.clean, sample.noisy) == pytest.approx(0.0, abs=0.005)
+
+
+def test_in_the_dark_noisier_adds_the_noise_that_is_there() -> None:
+    shot_var, read_var = 5e-3, 1e-4
+    dark = read_var**0.5 * torch.randn(1, 4, 400, 400, generator=torch.Generator().manual_seed(0))
+    estimator = Noisier(1.0)
+    drawn = estimator.sample(dark.shape[1:], torch.Generator().manual_seed(7))
+    added = estimator.apply(dark, shot_var, read_var, drawn).noisy - dark[0]
+    assert float(added.var()) == pytest.approx(read_var, rel=0.02)
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0])
 def test_noisier_is_biased_and_its_correction_is_not(alpha: float) -> None:
     taught, right = trained_slope(Noisier(alpha))
     noise = SHOT_VAR * 0.4 + READ_VAR
@@ -145,6 +167,32 @@ def test_the_neighbours_loss_of_the_identity() -> None:
     identity: Any = lambda noisy, variance: noisy  # noqa: E731
     loss = estimator.loss(identity, batch, torch.nn.functional.mse_loss)
     assert float(loss) == pytest.approx(2 * (SHOT_VAR * 0.4 + READ_VAR), rel=0.02)
+
+
+def test_no_gradient_passes_through_the_neighbours_of_the_denoised_frame() -> None:
+    """f = w y, whose loss and gradient can be written down; with a gradient through f(y) it would be another."""
+    _, shots = scene_and_shots(1)
+    estimator = Neighbor2Neighbor(gamma=3.0)
+    drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
+    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    batch = type(sample)(*(x[None] for x in sample))
+    first, second = neighbours(batch.noisy, batch.choice)
+    w = torch.tensor(0.7, requires_grad=True)
+    estimator.loss(lambda noisy, _: w * noisy, batch, torch.nn.functional.mse_loss, progress=0.5).backward()
+    excess = (0.7 * first - second) - 0.7 * (first - second)
+    expected = 2 * ((0.7 * first - second) * first).mean() + 0.5 * 3.0 * 2 * (excess * first).mean()
+    assert w.grad is not None and float(w.grad) == pytest.approx(float(expected), rel=1e-3)
+
+
+def test_r2r_averages_at_a_test_only_where_asked() -> None:
+    def run(noisy: Tensor, variance: Tensor) -> Tensor:
+        return noisy
+
+    assert R2R().at_test(run) is run and Supervised().at_test(run) is run
+    noisy, variance = torch.rand(1, 4, 8, 8), torch.full((1, 4, 8, 8), 1e-3)
+    assert not torch.equal(R2R(0.5, average=2).at_test(run)(noisy, variance), noisy)
+    with pytest.raises(ValueError, match="average must be at least 0, got -1"):
+        R2R(average=-1)
 
 
 def test_impossible_settings_are_refused() -> None:

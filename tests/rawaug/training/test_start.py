@@ -75,7 +75,7 @@ def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
     pair = demo_pairs("test", count=1)[0]
     sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
     for own in CFA:
-        denoised = denoise(Red(width=4, scales=2), sample, pair.cfa, False, own)
+        denoised = denoise(Red(width=4, scales=2), sample, pair.cfa, 1, own)
         # The two greens may exchange their names where the pattern moves by a line.
         ratio = denoised.sum((0, 2, 3)) / sample.noisy.sum((0, 2, 3))
         assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0], rel=1e-4)

@@ -9,7 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from rawaug.isp.baselines.cycleisp import CycleISP, DualAttentionBlock
+from denoisers.dual_attention import DualAttentionBlock
+from rawaug.bayer import mosaic, pack
+from rawaug.isp.baselines.base import Crops
+from rawaug.isp.baselines.cycleisp import CycleISP
 
 SMALL: dict[str, Any] = {"features": 8, "groups": 2, "blocks": 1}
 
@@ -131,3 +134,17 @@ def test_the_reference_colours_the_rendering() -> None:
         model(raw, reference=srgb[..., :12])
     with pytest.raises(ValueError, match="larger than 10 pixels, got 8x16"):
         model(raw[..., :8, :], reference=srgb[..., :8, :])
+
+
+@torch.no_grad()
+def test_the_loss_is_l1_and_l1_of_logarithms_and_of_the_rendering() -> None:
+    model, generator = CycleISP("GBRG", **SMALL), torch.Generator().manual_seed(5)
+    srgb, raw = torch.rand(1, 3, 16, 16, generator=generator), torch.rand(1, 1, 16, 16, generator=generator)
+    crops = Crops(srgb, raw, torch.ones(1, 3))
+    made = mosaic(model.unprocess(srgb), "GBRG")
+    assert made.min() < 1e-3 < made.max()
+    logs = (made.clamp_min(1e-3).log() - raw.clamp_min(1e-3).log()).abs().mean()
+    reverse = (made - raw).abs().mean() + logs
+    assert model.loss(crops, both=False).item() == pytest.approx(reverse.item(), rel=1e-5)
+    rendered = model.raw2rgb(pack(raw, "GBRG"), model.ccm(srgb))
+    assert model.loss(crops, both=True).item() == pytest.approx((reverse + (rendered - srgb).abs().mean()).item(), 1e-5)

@@ -71,3 +71,14 @@ def test_with_jpeg_between_the_way_back_sees_the_compressed_rendering() -> None:
     assert losses[10] > losses[90] + 0.01
     with pytest.raises(ValueError, match="1 to 100"):
         InvISP(blocks=1, growth=4, jpeg_quality=0)
+
+
+@torch.no_grad()
+def test_a_coupling_scales_by_at_most_the_published_bound() -> None:
+    """Saturated, the log-scale is 0.8 one way and -0.8 the other."""
+    block = InvISP(blocks=1, growth=4).flow.blocks[0]
+    x = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(6))
+    plain = block(x)
+    for sign in (1.0, -1.0):
+        block.scale_two.last.bias.fill_(50.0 * sign)  # type: ignore[union-attr]
+        torch.testing.assert_close(block(x)[:, 1:] / plain[:, 1:], torch.full((1, 2, 8, 8), 0.8 * sign).exp())

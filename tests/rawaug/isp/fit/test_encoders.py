@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp
+from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp, pipeline
+from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
@@ -75,3 +77,31 @@ def test_pieces_of_both_thumbnails_show_the_same() -> None:
     for seed in range(5):
         ours, theirs = encoders._same_piece(srgb, 2.0 * srgb, torch.Generator().manual_seed(seed))
         assert torch.equal(2.0 * ours, theirs) and 6 <= ours.shape[2] <= 12 and 8 <= ours.shape[3] <= 16
+
+
+def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
+    exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoders, "STEPS", 1)
+    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
+    fitted: list[set[str]] = []
+    judged: list[tuple[set[str], set[str]]] = []
+
+    class Noted(pipeline._Fit):
+        def reversed_only(self, *args: Any) -> DictionaryISP:
+            isp = super().reversed_only(*args)
+            assert self.samples.srgb.shape[0] == self.colour.matrix.shape[0] == len(self.shots)
+            fitted.append({shot.name for shot in self.shots})
+            return isp
+
+    def decibels(isp: DictionaryISP, samples: Any, shots: Any, frames: list[int]) -> float:
+        judged.append((fitted[-1], {shots[k].name for k in frames}))
+        return 0.0
+
+    monkeypatch.setattr(pipeline, "_Fit", Noted)
+    monkeypatch.setattr(encoders, "decibels", decibels)
+    fit_isp(frames(exact_pair, 4, informative=True), config("auto"), progress=False)
+    everything = {f"shot{k}" for k in range(4)}
+    assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
+    for seen, scored in judged:
+        assert scored and not seen & scored and seen | scored == everything

@@ -1,0 +1,51 @@
+"""R2R's average at a test."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from denoisers.recorrupted import Recorrupted
+
+SHOT_VAR, READ_VAR, ALPHA = 2e-3, 1e-4, 0.5
+
+
+def frame() -> tuple[Tensor, Tensor]:
+    noisy = 0.2 + 0.3 * torch.rand(1, 4, 64, 64, generator=torch.Generator().manual_seed(0))
+    return noisy, SHOT_VAR * noisy + READ_VAR
+
+
+def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
+    noisy, variance = frame()
+    seen: list[tuple[Tensor, Tensor]] = []
+
+    def network(image: Tensor, noise_map: Tensor) -> Tensor:
+        seen.append((image, noise_map))
+        return image
+
+    Recorrupted(network, ALPHA, draws=2)(noisy, variance)
+    (first, first_map), (second, _) = seen
+    added = (first - noisy) / (ALPHA * variance.sqrt())
+    assert float(added.mean()) == pytest.approx(0.0, abs=0.03) and float(added.std()) == pytest.approx(1.0, abs=0.03)
+    torch.testing.assert_close(first_map, (1 + ALPHA**2) * (SHOT_VAR * first + READ_VAR), rtol=1e-3, atol=1e-7)
+    assert not torch.equal(first, second)
+
+
+def test_the_average_of_many_is_that_of_the_network_over_the_noise() -> None:
+    """Of y^2 it is y^2 plus the variance of what was added: one draw is far from it, and the draws are a mean."""
+    noisy, variance = frame()
+    expected = noisy**2 + ALPHA**2 * variance
+
+    def error(draws: int) -> float:
+        return float((Recorrupted(lambda z, _: z**2, ALPHA, draws)(noisy, variance) - expected).square().mean())
+
+    assert error(64) == pytest.approx(error(1) / 64, rel=0.3)
+
+
+def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
+    noisy, variance = frame()
+    average = Recorrupted(lambda z, _: z, ALPHA, 3)
+    assert torch.equal(average(noisy, variance), average(noisy, variance))
+    with pytest.raises(ValueError, match=r"draws must be at least 1 and alpha positive, got 0 and 0\.5"):
+        Recorrupted(lambda z, _: z, ALPHA, 0)
