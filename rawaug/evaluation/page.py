@@ -190,7 +190,7 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
     for ((arm, k), rows), (part, line) in product(logs.items(), LINES.items()):
         points = [(int(row["step"]), float(row[key + part])) for row in rows if row.get(key + part)]
         width, label = (0.7, None) if part else (1.4, None if k else arm)
-        style = {"color": colours[arm], "linestyle": line, "linewidth": width, "label": label}
+        style: dict[str, Any] = {"color": colours[arm], "linestyle": line, "linewidth": width, "label": label}
         if points:
             axis.plot(*zip(*points, strict=True), marker="o" if len(points) == 1 else "", **style)
     axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")

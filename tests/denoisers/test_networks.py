@@ -171,8 +171,9 @@ def test_dhdn_s_lowest_level_and_what_it_started_from_go_up_together() -> None:
     """Concatenated as at every other level: C features that were kept beside C that were worked on."""
     net = awake(DHDN(width=4))
     seen: dict[str, Tensor] = {}
-    net.encoder[-1].register_forward_hook(lambda _, given, made: seen.update(started=given[0], worked=made))
-    net.up[0].register_forward_pre_hook(lambda _, given: seen.update(up=given[0]))
+    lowest, up = net.get_submodule("encoder")[-1], net.get_submodule("up")[0]  # type: ignore[index]
+    lowest.register_forward_hook(lambda _, given, made: seen.update(started=given[0], worked=made))
+    up.register_forward_pre_hook(lambda _, given: seen.update(up=given[0]))
     net(*pair(1, 4, 16, 16))
     assert not torch.equal(seen["started"], seen["worked"])
     assert torch.equal(seen["up"], torch.cat([seen["worked"], seen["started"]], dim=1))

@@ -20,7 +20,8 @@ def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
     noisy, variance = frame()
     seen: list[tuple[Tensor, Tensor]] = []
 
-    def network(image: Tensor, noise_map: Tensor) -> Tensor:
+    def network(image: Tensor, noise_map: Tensor | None = None) -> Tensor:
+        assert noise_map is not None
         seen.append((image, noise_map))
         return image
 

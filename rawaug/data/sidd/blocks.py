@@ -170,7 +170,9 @@ class SiddPlusBlocks(LazyPairs):
         clean, noisy = (blocks[part] for blocks in self._all())
         if self._frame is None or self._frame[0] != number:
             what, cfa = f"{self.path}: frame {number}", self.cfas[number]
-            pictures = {key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()}
+            pictures: dict[str, Any] = {
+                key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()
+            }
             levels = captured_noise(clean.numpy(), noisy.numpy())
             self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
         return _pair(self.names[index], block, clean, noisy, self._frame[1])

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -158,9 +159,11 @@ def _descend(
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     rate = model.learning_rate if learning_rate is None else learning_rate
     optimiser = torch.optim.Adam(parameters, lr=rate)
-    bar = progress_bar(label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
+    bar = progress_bar(count(), label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
     start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
-    while spent < 1.0:
+    for step in bar:
+        if spent >= 1.0:
+            break
         for group in optimiser.param_groups:
             group["lr"] = rate * 0.5 * (1.0 + math.cos(math.pi * spent))
         loss = model.loss(draw(step, parameters[0].device), both)
@@ -168,10 +171,7 @@ def _descend(
         loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, CLIP_NORM)
         optimiser.step()
-        step, value = step + 1, loss.item()
-        elapsed = time.perf_counter() - start
-        spent = budget.spent(elapsed, step)
-        bar.update()
+        value, elapsed = loss.item(), time.perf_counter() - start
+        spent = budget.spent(elapsed, step + 1)
         bar.set_postfix_str(f"loss {value:.2e}, {elapsed:.0f} s", refresh=False)
-    bar.close()
     return step, value

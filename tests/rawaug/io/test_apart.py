@@ -96,7 +96,7 @@ def test_a_folder_names_the_file_that_crashed_in_a_worker_and_goes_on(
         write_picture(tmp_path / f"{k}.png", torch.full((3, 8, 8), k, dtype=torch.uint8))
     monkeypatch.setattr("rawaug.data.picture_folder.read_picture", _crash_on_marked)
     pictures = PictureFolder(tmp_path, allowed_share=0.5)
-    loader = DataLoader(pictures, None, num_workers=1, multiprocessing_context="fork")  # type: ignore[arg-type]
+    loader = DataLoader(pictures, None, num_workers=1, multiprocessing_context="fork")
     assert [int(picture[0, 0, 0]) for picture in loader] == [0, 1, 3, 3]
     assert [path.name for path in pictures.skipped] == ["2.png"]
     assert "2.png: crashes the decoder (killed by SIGSEGV)" in pictures.report()

@@ -277,7 +277,12 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
     patterns = tmp_path / "siddplus_valid_bayer_patterns.csv"
     patterns.write_text("rggb\n" * 32)
     reads = []
-    monkeypatch.setattr(blocks_module, "read_array", lambda file, name: reads.append(file) or read_array(file, name))
+
+    def counted(file: Path, name: str) -> Any:
+        reads.append(file)
+        return read_array(file, name)
+
+    monkeypatch.setattr(blocks_module, "read_array", counted)
     (part,) = check(tmp_path).parts
     assert part.items == 1024 and len(reads) == 2
     assert len(part.broken) == 1 and "has 64 blocks, but there are patterns for 1024" in part.broken[0]

@@ -80,5 +80,5 @@ def test_a_coupling_scales_by_at_most_the_published_bound() -> None:
     x = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(6))
     plain = block(x)
     for sign in (1.0, -1.0):
-        block.scale_two.last.bias.fill_(50.0 * sign)  # type: ignore[union-attr]
+        block.scale_two.last.bias.fill_(50.0 * sign)  # type: ignore[operator, union-attr]
         torch.testing.assert_close(block(x)[:, 1:] / plain[:, 1:], torch.full((1, 2, 8, 8), 0.8 * sign).exp())
