@@ -77,7 +77,7 @@ def panels(net: nn.Module, frame: Watched) -> Tensor:
     noisy, clean, variance = (x[..., top : top + height, left : left + width] for x in frame[:3])
     device = next((weights.device for weights in net.parameters()), noisy.device)
     net.eval()
-    denoised = net(noisy.to(device), variance.to(device)).cpu()
+    denoised = net(noisy.to(device), variance.to(device)).cpu().nan_to_num()  # black where the training has diverged
     net.train()
     return torch.cat([(frame.develop or _grey)(packed) for packed in (noisy, denoised, clean)], dim=-1)
 

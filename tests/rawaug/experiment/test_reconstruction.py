@@ -47,7 +47,7 @@ class Laboratory:
 
     def open_pictures(self, spec: str, min_side: int) -> list[torch.Tensor]:
         self.min_side = min_side
-        return [torch.full((3, 8, 8), 100, dtype=torch.uint8)]
+        return [torch.arange(192, dtype=torch.uint8).reshape(3, 8, 8)]
 
     def fit_family(
         self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
@@ -114,14 +114,14 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
 
     monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: test if split == "test" else train)
     monkeypatch.setattr(reconstruction, "score_rows", score)
-    rows = compare(settings(tmp_path, test="blocks", count=3, methods=["dictionary"], seeds=1))
-    assert [fold[:2] for fold in laboratory.folds] == [("dictionary", "f3")], "one fit, of f0 to f2"
+    rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
+    assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)] * 2, "one fit for all test frames"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
     assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
     monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: train)
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
-        compare(settings(tmp_path, test="known"))
+        compare(settings(tmp_path, test="known", name="other"))
 
 
 def test_table_and_file_say_the_same(
@@ -149,7 +149,7 @@ def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_p
     asked = {budget for family, _, budget, _ in laboratory.folds if family == "unet"}
     assert asked == {(3.0, 64, 2), (30.0, 64, 2)}
     with pytest.raises(ValueError, match="longer_frames is 9; known has 8 frames"):
-        compare(settings(tmp_path, longer=10.0, longer_frames=9))
+        compare(settings(tmp_path, longer=10.0, longer_frames=9), overwrite=True)
 
 
 def test_a_stopped_run_goes_on_from_its_files(laboratory: Laboratory, tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_files_of_other_settings_are_not_used(
     first = settings(tmp_path, downstream=DownstreamConfig(methods=["dictionary"]))
     compare(first)
     before = len(laboratory.folds), len(laboratory.wholes), set(laboratory.denoisers)
-    compare(replace(first, **changes))
+    compare(replace(first, **changes), overwrite=True)
     assert (len(laboratory.folds) - before[0], len(laboratory.wholes) - before[1]) == (folds, wholes)
     later = set(laboratory.denoisers[len(before[2]) :])
     if "seeds" in changes:  # the camera is the same: its denoisers are kept, and one is added
@@ -315,7 +315,7 @@ def test_a_fit_never_sees_the_frame_that_is_left_out(
     def cameras(first: Pair, family: str) -> dict[str, dict[str, torch.Tensor]]:
         laboratory = Fitting(monkeypatch)
         laboratory.pairs = [first, *frames[1:]]
-        folder = tmp_path / str(first is poisoned)
+        folder = tmp_path / family / str(first is poisoned)
         compare(settings(folder, methods=[family], seeds=1, patches=1, fit=TINY))
         return laboratory.found
 
