@@ -121,7 +121,7 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
     assert "3 frames of blocks" in capsys.readouterr().out
     monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: train)
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
-        compare(settings(tmp_path, test="known"))
+        compare(settings(tmp_path, test="known"), overwrite=True)
 
 
 def test_table_and_file_say_the_same(
