@@ -145,9 +145,9 @@ def main() -> int:
         result = measure(Path(folder), args)
     for name, speed in result["mpix_a_processor_second"].items():
         print(f"  {name:28s} {speed:8.2f} Mpix a processor second")
-    print(
-        f"  {result['bytes'] / args.pictures:.0f} bytes a picture; the same bytes: {'yes' if result['same'] else 'NO'}"
-    )
+    print(f"  {result['bytes'] / args.pictures:.0f} bytes a picture")
+    if result["hashes"]:
+        print(f"  the same bytes: {'yes' if result['same'] else 'NO'}")
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0 if result["same"] else 1

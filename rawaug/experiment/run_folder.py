@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.files import require_writable, write_json
+from rawaug.lock import NAME
 from rawaug.training.train_config import SAME_WEIGHTS
 
 STAMP = "run.json"
@@ -58,7 +59,7 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
     """
     folder = run_folder(settings)
     require_writable(folder, folder=True)
-    if overwrite or not folder.is_dir() or not any(folder.iterdir()):
+    if overwrite or not folder.is_dir() or not _filled(folder):
         return folder
     advice = "give this run another --name, or --overwrite to replace that one"
     stamp = folder / STAMP
@@ -87,6 +88,11 @@ def claim(settings: Any, overwrite: bool = False) -> Path:
 def _as_json(settings: Any) -> dict[str, Any]:
     content: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
     return content
+
+
+def _filled(folder: Path) -> bool:
+    """Whether there is more than what a run has as it begins, or left when it was killed there."""
+    return any(file.name != NAME and file.suffix != ".partial" for file in folder.iterdir())
 
 
 def _flat(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -68,7 +68,7 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
     if helper is None:
         return read(*arguments)
     try:
-        known, value = helper.call((read, arguments), seconds)
+        known, value = helper.call((_folder(), read, arguments), seconds)
     except _Lost as lost:
         _of_this_thread.helper = None
         raise OSError(f"{arguments[0]}: {lost}") from None
@@ -79,6 +79,14 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
     if not known:
         raise value
     return value
+
+
+def _folder() -> str | None:
+    """The working folder, in which the helper finds a relative path; None if it has been removed."""
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        return None
 
 
 def _helper() -> _Helper | None:

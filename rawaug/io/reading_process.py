@@ -142,8 +142,10 @@ class _Memory:
 
 
 def _answer(connection: Connection, memory: _Memory) -> None:
-    read, arguments = pickle.loads(connection.recv_bytes())
+    folder, read, arguments = pickle.loads(connection.recv_bytes())
     try:
+        if folder is not None:
+            os.chdir(folder)
         kind, value = "value", read(*arguments)
     except Exception as error:
         kind, value = "error", error

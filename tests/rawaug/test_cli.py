@@ -20,7 +20,7 @@ QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
     "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
     "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--data.test-count", "2", "--classical", "[]",
+    "--data.test-count", "2", "--classical", "[]", "--untouched", "[]",
 ]  # fmt: skip
 
 

@@ -114,14 +114,14 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
 
     monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: test if split == "test" else train)
     monkeypatch.setattr(reconstruction, "score_rows", score)
-    rows = compare(settings(tmp_path, test="blocks", count=3, methods=["dictionary"], seeds=1))
-    assert [fold[:2] for fold in laboratory.folds] == [("dictionary", "f3")], "one fit, of f0 to f2"
+    rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
+    assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)] * 2, "one fit for all test frames"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
     assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
     monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: train)
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
-        compare(settings(tmp_path, test="known"), overwrite=True)
+        compare(settings(tmp_path, test="known", name="other"))
 
 
 def test_table_and_file_say_the_same(

@@ -37,6 +37,14 @@ def test_values_and_errors_come_back_as_they_are(tmp_path: Path) -> None:
         apart(read_picture, path, 100)
 
 
+def test_a_relative_path_is_found_after_a_change_of_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        write_picture(Path(f"{name}.png"), torch.zeros(3, 8, 8, dtype=torch.uint8))
+        assert apart(read_picture, Path(f"{name}.png")).shape == (3, 8, 8)
+
+
 def test_a_crash_and_a_hang_end_one_file(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(OSError, match=r"^0: crashes the decoder \(killed by SIGSEGV\)"):
         apart(ctypes.string_at, 0)

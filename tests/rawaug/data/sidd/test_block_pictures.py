@@ -44,13 +44,13 @@ def pictures(monkeypatch: pytest.MonkeyPatch) -> Tensor:
 
 
 def raw_of(camera: DictionaryISP, pictures: Tensor) -> Tensor:
-    """Mosaics ``(2, 32, SIDE, SIDE)`` in the pattern of each scene's phone."""
+    """Mosaics ``(2, 32, SIDE, SIDE)`` in the pattern of each scene's phone, of 12 bits."""
     mosaics = []
     for name, srgb in zip(SCENES, pictures, strict=True):
         camera.configure(cfa=str(SiddScene.parse(name).cfa))
         mosaics.append(camera.reverse(srgb).raw[:, 0])
     camera.configure(cfa="GRBG")
-    return torch.stack(mosaics)
+    return (4095 * torch.stack(mosaics)).round() / 4095
 
 
 def write_blocks(folder: Path, raw: Tensor, pictures: Tensor | None, views: tuple[int, int] = (6, 1)) -> None:
@@ -73,7 +73,7 @@ def test_a_right_isp_scores_as_such_on_the_published_pictures(
     assert torch.equal(pairs[3].srgb, pictures[0, 3]) and torch.equal(pairs[40].srgb, pictures[1, 8]), "turned back"
     assert pairs[3].rendered and pairs[3].noisy_srgb is not None and torch.equal(pairs[3].noisy_srgb, pictures[0, 3])
     camera.save(tmp_path / "camera.safetensors")
-    assert evaluate(tmp_path / "camera.safetensors", f"sidd:{tmp_path}")["psnr"] > 80.0
+    assert evaluate(tmp_path / "camera.safetensors", f"sidd:{tmp_path}")["psnr"] > 70.0
 
 
 def test_without_pictures_or_metadata_psnr_r_is_refused(
