@@ -92,7 +92,8 @@ def test_the_traced_pass_is_the_reverse_pass(isp: DictionaryISP) -> None:
 def test_the_commands_write_and_print_and_refuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "canon-powershot", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads(json.dumps(as_json("canon-powershot"))) and len(printed["tone_curve"]) == 256 and printed["kind"] == "isp"
+    assert printed == json.loads(json.dumps(as_json("canon-powershot")))
+    assert len(printed["tone_curve"]) == 256 and printed["kind"] == "isp"
     assert main(["info", "rawaug-small", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["name"] == "PMRID"
     assert main(["info", "canon-powershot"]) == 0
