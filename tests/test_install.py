@@ -42,8 +42,8 @@ def test_every_requirement_has_one_pin_that_fits(python: str, platform: str) -> 
     setup = configparser.ConfigParser()
     setup.read(ROOT / "setup.cfg")
     asked = setup["options"]["install_requires"].split("\n")
-    extras = dict(setup.items("options.extras_require", raw=True))
-    asked += [line for extra in LOCKED for line in extras[extra].split("\n")]
+    extras = {extra: setup.get("options.extras_require", extra, raw=True) for extra in LOCKED}
+    asked += [line for lines in extras.values() for line in lines.split("\n")]
     asked = [line for line in asked if line and "%(" not in line]
     where = environment(python, platform)
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]

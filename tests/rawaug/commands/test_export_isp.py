@@ -99,7 +99,7 @@ def test_the_commands_write_and_print_and_refuse(tmp_path: Path, capsys: pytest.
     assert main(["info", "canon-powershot"]) == 0
     assert "tone and gamma, grey code to linear: 16 0.0" in capsys.readouterr().out
     assert main(["export", "canon-powershot", str(tmp_path / "a.cube"), "--white-balance", "[2.0, 1.0, 1.6]"]) == 0
-    assert "a.cube: 1.0 MB" in capsys.readouterr().out
+    assert "a.cube: 1.1 MB" in capsys.readouterr().out
     for arguments, message in (
         (["canon-powershot", str(tmp_path / "a.txt")], "an ISP is exported to .json, .cube, .onnx"),
         (["canon-powershot", str(tmp_path / "a.json"), "--frame", "a.dng"], "--frame: is for denoisers"),
