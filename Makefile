@@ -19,7 +19,7 @@ demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without 
 	$(BIN)/rawaug run recipes/fewshot.yaml
 
 test: lint  ## style, types and all tests
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses 2 --dist worksteal  # processes share bytecode
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
