@@ -30,7 +30,7 @@ from typing import Any
 import torch
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-PATIENCE = 120.0
+PATIENCE = 600.0
 OUT = "out"
 LEFT_OUT = (".csv", ".html", ".png", ".lock")
 """Endings of files that hold times, or pictures of them."""
