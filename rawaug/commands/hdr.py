@@ -1,0 +1,104 @@
+"""``rawaug hdr``: sRGB exposures of a scene to RAW, merged or scaled there, and back to one sRGB picture.
+
+The formulas are in :mod:`rawaug.isp.exposures`. Source: the HDR application of Conde et al., AAAI 2022.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from rawaug.files import require_writable
+from rawaug.io import read_picture, write_picture
+from rawaug.io.picture_exposure import read_exposure
+from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.isp.exposures import merge_exposures, render_exposure
+from rawaug.isp.model import DictionaryISP
+from rawaug.registry import COMMANDS
+
+
+@COMMANDS.register("hdr")
+def run(
+    pictures: list[str],
+    *,
+    out: str,
+    ev: list[float] | None = None,
+    exposure: float = 0.0,
+    isp: str = "universal",
+    overwrite: bool = False,
+    max_pixels: int = MAX_PIXELS,
+) -> None:
+    """Merge exposures of a scene in RAW, or change the exposure of one picture there.
+
+    Args:
+        pictures: sRGB pictures of one scene, aligned and of one size; or a single one.
+        out: the picture to write, 8-bit sRGB.
+        ev: exposure of each picture in stops, as [-2,0,2]; by default from EXIF, relative to the median exposure.
+        exposure: of the result in stops; 0 is that of the picture at 0 EV.
+        isp: ISP file of the camera, or the name of a shipped ISP.
+        overwrite: replace the output file if it exists.
+        max_pixels: a larger picture is refused before it is decoded.
+    """
+    target = Path(out)
+    require_writable(target)
+    if target.exists() and not overwrite:
+        raise FileExistsError(f"{out}: exists; choose another name, or add --overwrite")
+    srgb = hdr(pictures, ev, exposure, isp, max_pixels)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(target, srgb)
+    print(out)
+
+
+def hdr(
+    pictures: Sequence[str | Path],
+    ev: Sequence[float] | None = None,
+    exposure: float = 0.0,
+    isp: str | Path = "universal",
+    max_pixels: int = MAX_PIXELS,
+) -> Tensor:
+    """The merged picture ``(3, H, W)`` in [0, 1]; arguments as in :func:`run`.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or damaged.
+        ValueError: if pictures differ in size, or an exposure is missing, not finite or the same as another.
+    """
+    stops = exposures(pictures, ev)
+    if not all(map(math.isfinite, [*stops, exposure])):
+        raise ValueError(f"exposures must be finite, got {stops} and {exposure}")
+    camera = DictionaryISP.from_pretrained(isp)
+    merged = merge_exposures(camera, [srgb[None] for srgb in _read(pictures, max_pixels)], stops)
+    return render_exposure(camera, merged.image, merged.params, exposure)[0]
+
+
+def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> list[float]:
+    """Stops of each picture: as given, else of EXIF relative to the median; a single picture has 0.
+
+    Raises:
+        ValueError: if they are missing, or given for another number of pictures.
+    """
+    if ev is not None and len(ev) != len(pictures):
+        raise ValueError(f"--ev: one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
+    if ev is not None:
+        return list(ev)
+    if len(pictures) == 1:
+        return [0.0]
+    stated = [read_exposure(path) for path in pictures]
+    median = sorted(stated)[(len(stated) - 1) // 2]
+    return [stops - median for stops in stated]
+
+
+def _read(pictures: Sequence[str | Path], max_pixels: int) -> list[Tensor]:
+    """The pictures, all of the size of the first."""
+    read: list[Tensor] = []
+    for path in pictures:
+        read.append(read_picture(path, max_pixels))
+        (height, width), (first_height, first_width) = read[-1].shape[1:], read[0].shape[1:]
+        if (height, width) != (first_height, first_width):
+            raise ValueError(
+                f"{path}: is {height} x {width}, but {pictures[0]} is {first_height} x {first_width}; "
+                "align and crop them to one size"
+            )
+    return read

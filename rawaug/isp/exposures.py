@@ -1,0 +1,127 @@
+r"""Exposures of a scene, merged or scaled in RAW.
+
+The reverse pass takes a picture of exposure t (2^EV) to RAW y = t E, with E the RAW of the scene at 0 EV. Pictures k of
+one scene give at each pixel
+
+    E = sum_k m_k y_k / sum_k m_k t_k,        m_k = clip((0.95 - max_c x_k) / 0.1, 0, 1),
+
+the maximum-likelihood estimate under Poisson statistics, as photons are summed over summed exposure, of what m_k
+keeps: a pixel whose brightest sRGB channel comes close to white may be clipped. Where every picture is, the shortest
+exposure alone decides. Merging of exposures: Debevec and Malik, "Recovering High Dynamic Range Radiance Maps from
+Photographs", SIGGRAPH 1997; there the response is solved for, here it is the ISP's.
+
+On the way to sRGB, RAW is scaled by 2^EV, and by f(L) / L where its largest linear channel L exceeds middle grey a:
+
+    f(L) = a + (1 - a) g((L - a) / (1 - a)),        g(u) = u (1 + u / v^2) / (1 + u),
+
+with g from Reinhard et al., "Photographic Tone Reproduction for Digital Images", SIGGRAPH 2002, eq. 4, and v such that
+f takes the scene's white to 1. Without highlights above 1, f is the identity.
+
+RAW has all three colours at every pixel here (x5, before the mosaic): merging and scaling act on each value alone, and
+so commute with the mosaic, but no detail is lost to demosaicing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.paper_stages import WhiteBalance
+from rawaug.isp.setting import ISPParams, ISPResult
+from rawaug.isp.stages import display_referred, inverse_gains
+
+MIDDLE_GREY = 0.18
+"""Linear light up to which highlights are not compressed."""
+
+_CLIPPED, _RAMP = 0.95, 0.1
+_LAST_RESORT = 1e-4
+"""Least weight of the shortest exposure, which decides where no other does."""
+
+_SCENE_WHITE = 0.999
+"""Share of the pixels that must not be clipped."""
+
+
+def trust(srgb: Tensor) -> Tensor:
+    """m: how far pixels of sRGB ``(B, 3, H, W)`` in [0, 1] are to be believed not to be clipped, ``(B, 1, H, W)``.
+
+    Example:
+        >>> trust(torch.tensor([0.5, 0.9, 1.0]).expand(1, 3, 1, 3)).flatten().tolist()  # doctest: +ELLIPSIS
+        [1.0, 0.5..., 0.0]
+    """
+    return ((_CLIPPED - srgb.amax(dim=1, keepdim=True)) / _RAMP).clamp(0.0, 1.0)
+
+
+@torch.no_grad()
+def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence[float]) -> ISPResult:
+    """The RAW of a scene at 0 EV from aligned pictures of it; from one picture, its own divided by its exposure.
+
+    All share the setting that the ISP chooses for the picture nearest to 0 EV. Gains are divided by plainly: the
+    highlight-safe ones, which bring clipped sRGB back as saturated RAW, are not linear in the scene.
+
+    Args:
+        isp: the camera.
+        pictures: sRGB ``(B, 3, H, W)`` each, uint8 or float in [0, 1].
+        ev: exposure of each in stops.
+
+    Returns:
+        The RAW ``(B, 3, H, W)``, all colours at every pixel and above 1 where the scene is brighter than white at
+        0 EV, as ``image``, and the setting.
+
+    Raises:
+        ValueError: if there are no pictures, another number of exposures, two equal exposures, or pictures of
+            different shapes.
+    """
+    _require_bracket(pictures, ev)
+    nearest = min(range(len(ev)), key=lambda k: abs(ev[k]))
+    params = isp.choose(display_referred(pictures[nearest]))
+    total = exposure = torch.zeros(())
+    for picture, stops in zip(pictures, ev, strict=True):
+        x = display_referred(picture)
+        weight = trust(x)
+        if stops == min(ev):
+            weight = weight.clamp_min(_LAST_RESORT)
+        total = total + weight * _linear_reverse(isp, x, params)
+        exposure = exposure + weight * 2.0**stops
+    return ISPResult(total / exposure, params)
+
+
+@torch.no_grad()
+def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: float = 0.0) -> Tensor:
+    """RAW ``(B, 3, H, W)`` of :func:`merge_exposures`, scaled by ``2**ev``, as sRGB in [0, 1], highlights compressed."""
+    raw = raw * 2.0**ev
+    light = raw
+    for stage in reversed(isp.ordered_stages):
+        light = stage.forward(light, params) if stage.makes > 2 else light
+    light = light.amax(dim=1, keepdim=True)
+    return isp.forward_pixels(raw * _compressed(light) / light.clamp_min(MIDDLE_GREY), params).clamp(0.0, 1.0)
+
+
+def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
+    """x to x5, gains without their care for highlights."""
+    for stage in isp.ordered_stages:
+        plain = isinstance(stage, WhiteBalance)
+        x = inverse_gains(x, params.gains, knee=None) if plain else stage.reverse(x, params)
+    return x
+
+
+def _compressed(light: Tensor) -> Tensor:
+    """f(L), and a below a: then the ratio to ``max(L, a)`` is 1."""
+    flat = light.flatten(1)
+    brightest = flat.kthvalue(max(round(_SCENE_WHITE * flat.shape[1]), 1), dim=1).values.clamp_min(1.0)
+    white = ((brightest - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)).reshape(-1, 1, 1, 1)
+    u = (light.clamp_min(MIDDLE_GREY) - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)
+    return MIDDLE_GREY + (1.0 - MIDDLE_GREY) * u * (1.0 + u / white**2) / (1.0 + u)
+
+
+def _require_bracket(pictures: Sequence[Tensor], ev: Sequence[float]) -> None:
+    if not pictures or len(pictures) != len(ev):
+        raise ValueError(f"one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
+    if len(set(ev)) != len(ev):
+        raise ValueError(f"exposures must differ, got {' '.join(f'{stops:+g}' for stops in ev)} EV")
+    for k, picture in enumerate(pictures):
+        if picture.shape != pictures[0].shape:
+            shapes = f"{tuple(picture.shape)} and {tuple(pictures[0].shape)}"
+            raise ValueError(f"pictures must have one shape, got {shapes} (the first and number {k + 1})")
