@@ -1,0 +1,75 @@
+"""``rawaug hdr``: the picture it writes, exposures from EXIF, and errors of one line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+from rawaug.cli import main
+from rawaug.commands.hdr import exposures, hdr
+from rawaug.commands.hdr import run as hdr_command
+from rawaug.io import read_picture, write_picture
+from rawaug.io.picture_exposure import read_exposure
+
+
+def shot(path: Path, level: int, seconds: float = 0.0, iso: int = 100, size: tuple[int, int] = (8, 12)) -> str:
+    """A grey JPEG, with EXIF if it was exposed for ``seconds`` at f/4."""
+    spec = oiio.ImageSpec(size[1], size[0], 3, "uint8")
+    if seconds:
+        spec.attribute("ExposureTime", seconds)
+        spec.attribute("FNumber", 4.0)
+        spec.attribute("Exif:PhotographicSensitivity", iso)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.full((*size, 3), level, np.uint8)) and output.close()
+    return str(path)
+
+
+def test_exif_gives_stops_relative_to_the_median(tmp_path: Path) -> None:
+    paths = [
+        shot(tmp_path / "long.jpg", 200, 1 / 15),
+        shot(tmp_path / "short.jpg", 30, 1 / 240),
+        shot(tmp_path / "iso.jpg", 90, 1 / 120, iso=200),
+    ]
+    assert exposures(paths, None) == pytest.approx([2.0, -2.0, 0.0], abs=1e-3)
+    assert read_exposure(paths[0]) == pytest.approx(math.log2(1 / 15 / 16), abs=1e-3)
+
+
+def test_the_command_writes_the_merged_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dark, bright, out = str(tmp_path / "dark.png"), str(tmp_path / "bright.png"), tmp_path / "new" / "out.png"
+    ramp = torch.linspace(0.0, 1.0, 24).expand(3, 8, 24)
+    write_picture(dark, ramp * 0.4)
+    write_picture(bright, ramp)
+    arguments = ["hdr", dark, bright, "--ev", "[-2,0]", "--out", str(out), "--isp", "universal-small"]
+    assert main(arguments) == 0
+    assert capsys.readouterr().out == f"{out}\n"
+    merged = hdr([dark, bright], [-2, 0], isp="universal-small")
+    assert (read_picture(out) / 255.0 - merged).abs().max() <= 0.51 / 255
+    with pytest.raises(FileExistsError, match="add --overwrite"):
+        hdr_command([dark], out=str(out))
+
+
+def test_brighter_by_a_stop(tmp_path: Path) -> None:
+    path = shot(tmp_path / "grey.png", 60)
+    assert hdr([path], exposure=1.0, isp="universal-small").mean() > 1.2 * 60 / 255
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    first, second = shot(tmp_path / "a.jpg", 60, 1 / 60), shot(tmp_path / "b.jpg", 90)
+    wide = shot(tmp_path / "wide.jpg", 90, 1 / 15, size=(8, 16))
+    for pictures, stops, message in (
+        ([first, second], None, r"b\.jpg: its EXIF has no exposure time or f-number or ISO; give .* with --ev$"),
+        ([first, wide], None, r"wide\.jpg: is 8 x 16, but .*a\.jpg is 8 x 12; align and crop"),
+        ([first, second], [0.0], r"--ev: one exposure for each picture is needed, got 1 for 2$"),
+        ([first, second], [0.0, math.inf], r"exposures must be finite"),
+        ([first, second], [1.0, 1.0], r"exposures must differ"),
+    ):
+        with pytest.raises(ValueError, match=message) as error:
+            hdr(pictures, stops, isp="universal-small")
+        assert "\n" not in str(error.value)
+    with pytest.raises(FileNotFoundError, match=r"none\.jpg: no such picture file"):
+        hdr([str(tmp_path / "none.jpg"), first])
