@@ -90,7 +90,7 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
 
 @torch.no_grad()
 def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: float = 0.0) -> Tensor:
-    """RAW ``(B, 3, H, W)`` of :func:`merge_exposures`, scaled by ``2**ev``, as sRGB in [0, 1], highlights compressed."""
+    """RAW ``(B, 3, H, W)`` of :func:`merge_exposures` times ``2**ev``, as sRGB in [0, 1], highlights compressed."""
     raw = raw * 2.0**ev
     light = raw
     for stage in reversed(isp.ordered_stages):
