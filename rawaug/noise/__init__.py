@@ -1,6 +1,7 @@
 """Noise that real sensors make: models, published levels, the estimate of a camera's own, and stabilisation."""
 
 from rawaug.noise.by_name import NoiseSpec, camera_names, noise_levels, noise_model, noise_names
+from rawaug.noise.calibrated import CalibratedNoise, ScaledLevels
 from rawaug.noise.compose import Compose, EldNoise, SensorNoise
 from rawaug.noise.dark import DarkNoise, from_dark_frames
 from rawaug.noise.estimate import NoiseEstimate, NoisePoints, estimate_noise
@@ -13,6 +14,7 @@ from rawaug.noise.sensor import BlackOffset, ColourBias, DefectPixels, Quantisat
 
 __all__ = [
     "BlackOffset",
+    "CalibratedNoise",
     "ColourBias",
     "Compose",
     "DarkNoise",
@@ -34,6 +36,7 @@ __all__ = [
     "Preset",
     "Quantisation",
     "RowNoise",
+    "ScaledLevels",
     "SensorNoise",
     "ShotReadModel",
     "ShotReadNoise",

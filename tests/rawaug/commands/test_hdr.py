@@ -25,6 +25,7 @@ def shot(path: Path, level: int, seconds: float = 0.0, iso: int = 100, size: tup
         spec.attribute("FNumber", 4.0)
         spec.attribute("Exif:PhotographicSensitivity", iso)
     output = oiio.ImageOutput.create(str(path))
+    assert output is not None
     assert output.open(str(path), spec) and output.write_image(np.full((*size, 3), level, np.uint8)) and output.close()
     return str(path)
 
