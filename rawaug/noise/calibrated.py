@@ -1,11 +1,11 @@
 r"""Noise levels scaled so that noisy/clean pairs have a stated mean PSNR.
 
-A picture of mean signal m has noise of mean square ``shot_var m + read_var``, before the clip at white. A factor s on both
-variances shifts every pair's PSNR by ``-10 log10(s)``, so that the factor follows without a search:
+A picture of mean signal m has noise of mean square ``shot_var m + read_var``, before the clip at white. A factor s on
+both variances shifts every pair's PSNR by ``-10 log10(s)``, so that the factor follows without a search:
 
     s = 10^((P_0 - P) / 10),        P_0 = mean(-10 log10(shot_var m + read_var))
 
-over draws of the law and the pictures' m. The paper states P = 41.18 dB for its training pairs (Conde et al., AAAI 2022).
+over draws of the law and the pictures' m. Conde et al., AAAI 2022, state P = 41.18 dB for their training pairs.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ScaledLevels:
 
 
 def expected_pair_psnr(law: NoiseLevels, signal: Sequence[float]) -> float:
-    """P_0: mean PSNR in dB of pairs whose clean pictures have these mean signals, each alike; the same at every call."""
+    """P_0: mean PSNR in dB of pairs whose clean pictures have these mean signals; the same at every call."""
     shot_var, read_var = law.sample(_DRAWS, keyed_generator(0, "pair_psnr"))
     square = torch.outer(torch.tensor(signal, dtype=torch.float64), shot_var.double()) + read_var.double()
     return -10.0 * float(square.log10().mean())
