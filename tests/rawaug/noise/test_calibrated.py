@@ -55,7 +55,8 @@ def test_a_recipe_names_it() -> None:
 def test_what_cannot_be_calibrated_is_refused() -> None:
     with pytest.raises(ValueError, match="pair_psnr must be finite, got inf"):
         CalibratedNoise(math.inf)
-    for signal in (0.0, 1.5, []):
+    none: list[float] = []
+    for signal in (0.0, 1.5, none):
         with pytest.raises(ValueError, match="signal: mean signals must be above 0 and at most 1"):
             CalibratedNoise(41.18, signal)
     with pytest.raises(ValueError, match="have no noise"):
