@@ -101,7 +101,7 @@ class Pattern:
 
         Example:
             >>> pattern("XTRANS").turn_keeping(torch.rand(1, 1, 24, 36), view=1).shape  # mirrored
-            torch.Size([1, 1, 18, 36])
+            torch.Size([1, 1, 24, 30])
         """
         height, width = raw.shape[-2:]
         if height % self.period or width % self.period:

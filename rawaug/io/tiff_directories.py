@@ -7,6 +7,7 @@ in which a reader that trusts them never ends. Source: TIFF 6.0, section 2; BigT
 from __future__ import annotations
 
 import struct
+from graphlib import CycleError, TopologicalSorter
 from os import SEEK_END
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -30,7 +31,9 @@ _LAYOUTS = {42: _Layout("I", "H", "HHI"), 43: _Layout("Q", "Q", "HHQ")}
 
 
 def require_no_circle(path: Path) -> None:
-    """Refuse a TIFF in which a directory is reached twice; other files are left to whoever reads them.
+    """Refuse a TIFF in which a directory leads back to itself; other files are left to whoever reads them.
+
+    A directory that two others name is none: some writers chain the children that a parent lists as well.
 
     Raises:
         ValueError: naming the directory's offset, or if there are more than :data:`MOST_DIRECTORIES`.
@@ -44,17 +47,21 @@ def require_no_circle(path: Path) -> None:
         if layout is None:
             return
         end = file.seek(0, SEEK_END)
-        todo, seen = [_number(file, order + layout.offset, 8 if layout.offset == "Q" else 4)], set[int]()
+        todo = [_number(file, order + layout.offset, 8 if layout.offset == "Q" else 4)]
+        named: dict[int, list[int]] = {}
         while todo:
             place = todo.pop()
-            if not 0 < place < end:
+            if place in named or not 0 < place < end:
                 continue
-            if place in seen:
-                raise ValueError(f"its directories point at one another in a circle, at byte {place}")
-            if len(seen) == MOST_DIRECTORIES:
+            if len(named) == MOST_DIRECTORIES:
                 raise ValueError(f"it has more than {MOST_DIRECTORIES} directories")
-            seen.add(place)
-            todo += _followed(file, order, layout, place, end)
+            named[place] = _followed(file, order, layout, place, end)
+            todo += named[place]
+    try:
+        TopologicalSorter(named).prepare()
+    except CycleError as error:
+        place = error.args[1][0]
+        raise ValueError(f"its directories point at one another in a circle, at byte {place}") from None
 
 
 def _followed(file: BinaryIO, order: str, layout: _Layout, place: int, end: int) -> list[int]:

@@ -67,7 +67,7 @@ def test_no_picture_depends_on_its_batch(make: Make) -> None:
 
 def test_the_noise_map_is_required_and_read(make: Make) -> None:
     noisy, variance = pair(1, 4, 16, 16)
-    model = awake(make())
+    model = awake(make(deviation=True))
     with pytest.raises(ValueError, match="variance_map=True: pass"):
         model(noisy)
     with pytest.raises(ValueError, match="must have the shape"):

@@ -121,7 +121,7 @@ def test_other_files_and_none_are_refused(content: bytes, tmp_path: Path) -> Non
 
 def test_build_names_what_is_unknown() -> None:
     assert build("UNet", width=4).config["width"] == 4
-    with pytest.raises(ValueError, match=r"'Unet' is unknown; use one of DHDN, DnCNN, .*\(nearest: UNet\)"):
+    with pytest.raises(ValueError, match=r"'Unet' is unknown; use one of CycleISPDenoiser, DHDN, .*\(nearest: UNet\)"):
         build("Unet")
     with pytest.raises(ValueError, match="UNet has no setting 'depth'; it has width, scales"):
         build("UNet", depth=3)

@@ -81,6 +81,7 @@ class CycleISP(CropTrainedISP):
         seed: of the initial weights.
 
     Example:
+        >>> import torch
         >>> CycleISP(features=8, groups=1, blocks=1).cycle(torch.rand(1, 3, 12, 16)).shape
         torch.Size([1, 3, 12, 16])
     """

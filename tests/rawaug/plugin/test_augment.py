@@ -87,7 +87,7 @@ def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
 
 
 def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
-    with pytest.raises(ValueError, match="convex, perturb, chosen"):
+    with pytest.raises(ValueError, match="convex, independent, perturb, chosen"):
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
         RawAugment(isp, exposure=(1.0, -1.0))
