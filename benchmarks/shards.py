@@ -35,7 +35,6 @@ from rawaug.data import PictureFolder, demo_pictures
 from rawaug.io import read_picture, write_picture
 from rawaug.seeding import keyed_generator
 
-os.environ["RAWAUG_READ_SECONDS"] = "0"
 ONLINE_CROP = 256
 
 
@@ -140,6 +139,7 @@ def main() -> int:
     args = parser.parse_args()
     args.pictures = 40 if args.quick else args.pictures
     torch.set_num_threads(1)
+    os.environ["RAWAUG_READ_SECONDS"] = "0"  # and that of the processes started here
     print(f"{args.pictures} pictures of {args.size[0]} x {args.size[1]}")
     with tempfile.TemporaryDirectory() as folder:
         result = measure(Path(folder), args)
