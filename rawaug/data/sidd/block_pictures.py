@@ -41,7 +41,8 @@ def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tenso
         ValueError: in the name of ``what``, if they do not show the same.
 
     Example:
-        >>> rgb = torch.rand(2, 3, 8, 8)
+        >>> coarse = torch.rand(2, 3, 2, 2, generator=torch.Generator().manual_seed(0))
+        >>> rgb = coarse.repeat_interleave(4, dim=2).repeat_interleave(4, dim=3)
         >>> pictures = bayer.turn((rgb * 255).to(torch.uint8), 3)
         >>> turned = turned_like(pictures, bayer.mosaic(rgb, CFA.RGGB), CFA.RGGB, "blocks")
         >>> torch.equal(turned, (rgb * 255).to(torch.uint8))
