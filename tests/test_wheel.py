@@ -31,7 +31,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_recipe_runs_by_its_name_from_any_folder(site: Path, tmp_path: Path) -> None:
     script = "import rawaug, sys; from rawaug.cli import main; print(rawaug.__file__); sys.exit(main())"
-    command = [sys.executable, "-c", script, "run", "fewshot", "--smoke", "--classical", "[]"]
+    command = [sys.executable, "-c", script, "run", "fewshot", "--smoke", "--classical", "[]", "--untouched", "[]"]
+    command += ["--arms", '{"augmented": {"augmented": 0.5}}']
     environment = {**os.environ, "PYTHONPATH": str(site), "PYTHONWARNINGS": "ignore"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]

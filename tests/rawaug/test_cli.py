@@ -55,7 +55,8 @@ def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_run_is_resumable_and_ends_with_table_and_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path)]
+    arms = {"real": {"augmented": 0.0}, "augmented": {"augmented": 0.5}}
+    command = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--arms", json.dumps(arms)]
     place = tmp_path / "fewshot" / "seed0" / "real"
 
     def no_views(*_: object, **settings: object) -> None:
@@ -70,7 +71,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     text = capsys.readouterr().out
     assert "augmented" in text and "picture.png" in text
     results = json.loads((tmp_path / "fewshot" / "results.json").read_text())
-    assert set(results["results"]) == {"real", "augmented", "finetuned", "finetuned_augmented"}
+    assert set(results["results"]) == set(arms)
     assert not any("self_ensemble" in runs[0] for runs in results["results"].values())
     assert (tmp_path / "fewshot" / "picture.png").stat().st_size > 10_000
     best = max(results["results"], key=lambda arm: results["results"][arm][0]["plain"]["psnr"])
@@ -81,7 +82,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     before = (place / "denoiser.safetensors").stat().st_mtime_ns
     assert main(command) == 0
     text = capsys.readouterr().out
-    assert text.count("already trained") == 4 and "evaluated real, seed 0, self_ensemble: " in text
+    assert text.count("already trained") == 2 and "evaluated real, seed 0, self_ensemble: " in text
     scores = json.loads((place / "evaluation.json").read_text())
     assert scores["plain"] == plain["plain"] and scores["self_ensemble"]["psnr"] > 20
     other = [*command, "--train.learning-rate", "0.002"]
