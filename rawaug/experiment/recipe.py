@@ -85,6 +85,7 @@ class ArmConfig:
         alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
+        steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
     """
 
     augmented: float = 0.0
@@ -98,10 +99,13 @@ class ArmConfig:
     gamma: float | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
+    steps: int | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.augmented <= 1.0:
             raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps must be at least 1, or null for train.steps, got {self.steps}")
         try:
             name, settings = name_and_settings(self.estimator)
         except ValueError as error:
@@ -189,8 +193,9 @@ class Recipe:
 
     def loop_of(self, arm: str) -> TrainConfig:
         """How the arm is trained."""
-        rate = self.arms[arm].learning_rate
-        return self.train if rate is None else replace(self.train, learning_rate=rate)
+        rate, steps = self.arms[arm].learning_rate, self.arms[arm].steps
+        train = self.train if rate is None else replace(self.train, learning_rate=rate)
+        return train if steps is None else replace(train, steps=min(steps, train.steps))
 
     @property
     def self_supervised(self) -> bool:

@@ -17,6 +17,7 @@ from rawaug.data.lazy import names_of
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs, with_own_pairs
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, recipe_list, shipped_recipes
 from rawaug.io import write_picture
+from rawaug.training.train_config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
 ONE_ARM = ["--arms", '{"real": {"augmented": 0.5}}', "--denoiser.settings", '{"width": 4, "scales": 2}']
@@ -164,3 +165,14 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
         with pytest.raises(SystemExit):
             main(["run", name, "--help"])
         assert shown in capsys.readouterr().out
+
+
+def test_an_arm_takes_at_most_its_own_steps() -> None:
+    recipe = Recipe(
+        camera="universal",
+        train=TrainConfig(steps=40),
+        arms={"scratch": ArmConfig(), "tuned": ArmConfig(steps=10), "more": ArmConfig(steps=90)},
+    )
+    assert [recipe.loop_of(arm).steps for arm in recipe.arms] == [40, 10, 40]
+    with pytest.raises(ValueError, match="steps must be at least 1, or null for"):
+        ArmConfig(steps=0)
