@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 import denoisers
 from denoisers.pretrained import FOLDER
 from rawaug._version import __version__
@@ -18,6 +20,7 @@ from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
+    Method,
     Score,
     classical_method,
     label_of,
@@ -137,37 +140,58 @@ def evaluate(
         result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
         _require_some(pairs)
     else:
-        model, info = denoisers.load(weights)
-        levels, cfa = noise_model(noise or info.get("noise", "cycleisp_sidd")), CFA(info.get("cfa", "RGGB"))
-        model = model.to(where)
-        at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+        scoring = _Scoring(weights, pairs, noise, seed, where)
+        result = scoring.plain()
         ensemble = views or (8 if self_ensemble else 1)
-
-        def scored(count: int, label: str) -> dict[str, Any]:
-            method = network_method(model, cfa, views=count, at_test=at_test)
-            return summary([score for score, *_ in score_method(method, pairs, levels, cfa, seed, label)])
-
-        plain = scored(1, "evaluate")
-        result = {"self_ensemble": False, "seed": seed, **plain}
         if first is not None and (ensemble > 1 or classical):
             first({**about[0], **result, **about[1]})
         if ensemble > 1:
-            several = scored(ensemble, f"evaluate, {ensemble} views")
-            result = {"self_ensemble": True, "views": ensemble, "seed": seed, "plain": plain, **several}
+            result = scoring.with_views(ensemble, result)
         if classical:
-            result["classical"] = score_classical(classical, pairs, levels, cfa, seed)
+            result["classical"] = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
         _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
-            methods = {label_of(spec): classical_method(spec, levels, seed) for spec in classical}
-            methods["denoised"] = network_method(model, cfa, at_test=at_test)
+            methods = {label_of(spec): classical_method(spec, scoring.levels, seed) for spec in classical}
+            methods["denoised"] = scoring.method()
             for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
-                page.add_frame(row_of(methods, pair, levels, cfa, seed), cfa)
+                page.add_frame(row_of(methods, pair, scoring.levels, scoring.cfa, seed), scoring.cfa)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
         result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
     return {**about[0], **result, **about[1]}
+
+
+class _Scoring:
+    """A denoiser on the frames, as it is tested."""
+
+    def __init__(
+        self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: torch.device
+    ) -> None:
+        model, info = denoisers.load(weights)
+        self.model, self.pairs, self.seed = model.to(device), pairs, seed
+        self.levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
+        self.cfa = CFA(info.get("cfa", "RGGB"))
+        self.at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+
+    def plain(self) -> dict[str, Any]:
+        """The summary without self-ensemble."""
+        return {"self_ensemble": False, "seed": self.seed, **self._summary(1, "evaluate")}
+
+    def with_views(self, views: int, plain: dict[str, Any]) -> dict[str, Any]:
+        """The summary of the average over ``views``; the one without is under ``plain``."""
+        several = {"self_ensemble": True, "seed": self.seed, "views": views}
+        without = {key: value for key, value in plain.items() if key not in several}
+        return {**several, "plain": without, **self._summary(views, f"evaluate, {views} views")}
+
+    def method(self, views: int = 1) -> Method:
+        """The denoiser, as what scores and pictures call."""
+        return network_method(self.model, self.cfa, views=views, at_test=self.at_test)
+
+    def _summary(self, views: int, label: str) -> dict[str, Any]:
+        scored = score_method(self.method(views), self.pairs, self.levels, self.cfa, self.seed, label)
+        return summary([score for score, *_ in scored])
 
 
 def _require_some(pairs: Readable) -> None:
