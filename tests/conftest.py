@@ -52,6 +52,24 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
 
 
 @pytest.fixture
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine has no GPU, whatever it has."""
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+
+
+@pytest.fixture
+def unread(registries: list[registry.Registry]) -> str:
+    """The name of a dataset that must not be opened."""
+
+    @registry.DATASETS.register("unread")
+    def opened(path: str = "", split: str = "") -> list[Pair]:
+        pytest.fail("data was read")
+
+    return "unread:"
+
+
+@pytest.fixture
 def given(registries: list[registry.Registry]) -> list[Pair]:
     """What is opened as ``"given:"``, whatever the split: a list to be filled."""
     pairs: list[Pair] = []

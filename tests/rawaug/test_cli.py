@@ -20,7 +20,7 @@ QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
 QUICK_RUN = [
     "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
     "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--data.test-count", "2", "--classical", "[]", "--untouched", "[]",
+    "--data.test-count", "1", "--data.validation-crop", "64", "--classical", "[]", "--untouched", "[]",
 ]  # fmt: skip
 
 
@@ -156,13 +156,12 @@ def test_quiet_prints_no_progress(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("no_gpu")
 def test_evaluate_finds_what_is_wrong_before_it_reads(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    unread: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rawaug.commands.evaluate.open_pairs", lambda *_, **__: pytest.fail("data was read"))
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     monkeypatch.setitem(sys.modules, "bm3d", None)
-    evaluate = ["evaluate", "rawaug-small", "--data", "demo:test"]
+    evaluate = ["evaluate", "rawaug-small", "--data", unread]
     assert "nearest: cuda" in refused(capsys, *evaluate, "--device", "cudaa")
     assert "this machine has none" in refused(capsys, *evaluate, "--device", "cuda")
     assert "bm3d is not installed; licensed for non" in refused(capsys, *evaluate, "--classical", "[BM3D]")

@@ -100,26 +100,28 @@ def test_every_figure_is_the_mean_that_its_name_says(laboratory: Laboratory, tmp
 
 
 def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
-    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train, scored = laboratory.open_pairs("", ""), list[Pair]()
+    scored: list[Pair] = []
     test = [
         Pair(f"t{k}", torch.zeros(3, 6, 6, dtype=torch.uint8), torch.zeros(1, 6, 6), cfa)
         for k, cfa in enumerate((CFA.RGGB, CFA.BGGR, CFA.GRBG))
     ]
 
-    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        scored.append(pair)
-        return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0}
+    class Split(Laboratory):
+        def open_pairs(self, spec: str, split: str) -> list[Pair]:
+            return test if spec == "blocks" else super().open_pairs(spec, split)
 
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: test if split == "test" else train)
-    monkeypatch.setattr(reconstruction, "score_rows", score)
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+            scored.append(pair)
+            return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0}
+
+    laboratory = Split(monkeypatch)
     rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
     assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)] * 2, "one fit for all test frames"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
     assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: train)
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
         compare(settings(tmp_path, test="known", name="other"))
 
