@@ -17,10 +17,14 @@ from rawaug.data import demo_pictures
 from rawaug.io import write_picture
 
 QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
+TINY = [
+    "--data.pairs", "tiny:train", "--data.validation", "tiny:validation", "--data.test", "tiny:test",
+    "--data.pictures", "tiny:",
+]  # fmt: skip
 QUICK_RUN = [
-    "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32", "--isp.steps", "2",
-    "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
-    "--data.test-count", "1", "--data.validation-crop", "64", "--classical", "[]", "--untouched", "[]",
+    *TINY, "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32",
+    "--isp.steps", "2", "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
+    "--classical", "[]", "--untouched", "[]",
 ]  # fmt: skip
 
 
@@ -32,10 +36,11 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return lines[0]
 
 
+@pytest.mark.usefixtures("tiny")
 def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights, scores = str(tmp_path / "isp.safetensors"), tmp_path / "isp.json"
-    assert main(["fit", "demo:train", "--out", weights, *QUICK_FIT]) == 0
-    assert main(["evaluate", weights, "--data", "demo:validation", "--json", str(scores)]) == 0
+    assert main(["fit", "tiny:train", "--out", weights, *QUICK_FIT]) == 0
+    assert main(["evaluate", weights, "--data", "tiny:validation", "--json", str(scores)]) == 0
     assert json.loads(scores.read_text())["kind"] == "isp"
     capsys.readouterr()
     assert main(["info", weights]) == 0
@@ -52,6 +57,7 @@ def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
 
 
+@pytest.mark.usefixtures("tiny")
 def test_run_is_resumable_and_ends_with_table_and_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,7 +98,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     assert main([*other, "--overwrite", "--self-ensemble", "false"]) == 0
     assert (place / "denoiser.safetensors").stat().st_mtime_ns != before
     assert len(list(place.glob("events.out.tfevents.*"))) == 1
-    assert main(["evaluate", str(weights), "--data", "demo:validation", "--self-ensemble"]) == 0
+    assert main(["evaluate", str(weights), "--data", "tiny:validation", "--self-ensemble"]) == 0
 
 
 def test_options_are_spelt_one_way_and_in_full(capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,11 +151,12 @@ def test_shells_complete_commands_and_options(shell: str, tmp_path: Path, capsys
         assert done.stdout.strip() == "--self-ensemble"
 
 
+@pytest.mark.usefixtures("tiny")
 def test_quiet_prints_no_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0")
-    fit = ["fit", "demo:validation", "--out", str(tmp_path / "isp.safetensors"), *QUICK_FIT]
+    fit = ["fit", "tiny:validation", "--out", str(tmp_path / "isp.safetensors"), *QUICK_FIT]
     assert main(fit) == 0
     assert "steps, 00:00 elapsed" in capsys.readouterr().err
     assert main([*fit, "--quiet"]) == 0
@@ -169,11 +176,13 @@ def test_evaluate_finds_what_is_wrong_before_it_reads(
         assert "cannot be written: is a folder" in refused(capsys, *evaluate, option, str(tmp_path))
 
 
+@pytest.mark.usefixtures("tiny")
 def test_test_frames_must_be_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--data.test", "demo:train"]
+    arguments = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--data.test", "tiny:train"]
     assert "train_00_astronaut is also in data.pairs" in refused(capsys, *arguments)
 
 
+@pytest.mark.usefixtures("tiny")
 def test_bad_input_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], bayer_dng: Callable[..., Path]
 ) -> None:
