@@ -36,7 +36,8 @@ _COVER = (1.5, 3.0, 6.0)
 """Area of all shapes relative to the picture's; few of the first are hidden."""
 _BLUR = (0.0, 0.0, 0.5, 0.8, 1.2)
 """Deviation in pixels: lenses differ."""
-_FONT = (8.0, 80.0)
+_FONT = (16.0, 160.0)
+"""Least and greatest size of letters, in pixels of the oversampled picture."""
 _LETTERS = string.ascii_letters + string.digits + "   .,-"
 
 Colour = tuple[int, int, int]
@@ -165,7 +166,7 @@ def _polygon(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
 def _lettering(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
     from PIL import Image, ImageFont
 
-    font = ImageFont.load_default(float(np.clip(radius / 2, *(_OVERSAMPLING * size for size in _FONT))))
+    font = ImageFont.load_default(min(max(radius / 2, _FONT[0]), _FONT[1]))
     text = "".join(rng.choice(list(_LETTERS), rng.integers(3, 24)))
     _, _, right, bottom = _brush(picture).textbbox((0, 0), text, font=font)
     label = Image.new("L", (int(right) + 4, int(bottom) + 4), 0)
