@@ -38,6 +38,7 @@ def test_the_recipes_are_all_there() -> None:
     assert {name: kind for name, kind in ALL.items() if kind != "training"} == {
         "ablation": "ablation",
         "denoisers": "denoisers",
+        "learned": "learned",
         "reconstruction": "reconstruction",
         "fivek/reconstruction": "reconstruction",
         "sidd/reconstruction": "reconstruction",

@@ -30,8 +30,8 @@ def header(name: str) -> str:
 
 
 def test_every_kind_has_settings_that_name_it() -> None:
-    assert set(KINDS) == {"training", "reconstruction", "ablation", "denoisers"}
-    for name in ("reconstruction", "ablation", "denoisers"):
+    assert set(KINDS) == {"training", "reconstruction", "ablation", "learned", "denoisers"}
+    for name in ("reconstruction", "ablation", "learned", "denoisers"):
         assert KINDS[name].settings().experiment == KINDS[name].settings().name == name
 
 
