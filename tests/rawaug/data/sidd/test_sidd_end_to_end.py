@@ -88,10 +88,11 @@ SMALL = [
     *("--train.steps", "2", "--train.batch", "2", "--train.crop", "32", "--train.workers", "0", "--train.warmup", "1"),
     *("--train.validate-every", "2", "--train.checkpoint-every", "2", "--train.precision", "32-true"),
     *("--isp.steps", "2", "--isp.curve-steps", "5", "--isp.pixels", "512", "--isp.batch", "128", "--device", "cpu"),
-    *("--denoiser.settings", '{"width": 8, "variance_map": false}', "--data.test-count", "4", "--classical", "[]"),
+    *("--denoiser", '{"name": "UNet", "settings": {"width": 4, "scales": 2, "variance_map": false}}'),
+    *("--data.test-count", "4", "--classical", "[]", "--self-ensemble", "false"),
     *("--arms", '{"dhdn": {"augmented": 0.0}, "ours": {"augmented": 0.75, "sampling": "convex"}}', "--untouched", "[]"),
 ]
-"""The recipe's size; its arms are two of its five."""
+"""Of the recipe's network, steps and five arms; 1,280 blocks, so that the benchmark takes the file: 5 s of CPU."""
 
 
 def test_sidd_full_trains_scores_and_writes_what_the_benchmark_takes(
@@ -106,15 +107,11 @@ def test_sidd_full_trains_scores_and_writes_what_the_benchmark_takes(
     for (scores,) in results.values():
         assert len(scores["plain"]["images"]) == 4 and 15.0 < scores["plain"]["psnr"] < 60.0
         assert "levels_from_clean" not in scores["plain"], "the levels are those of the table"
-        assert abs(scores["plain"]["psnr"] - scores["self_ensemble"]["psnr"]) < 6.0
     weights = run / "seed0" / "ours" / "denoiser.safetensors"
     capsys.readouterr()
-    for name in ("SubmitRaw.csv", "SubmitRaw.mat"):
-        out = tmp_path / name
-        assert main(["submit", f"sidd:{sidd / 'SIDD_Validation'}", str(out), "--denoiser", str(weights)]) == 0
-        assert "1280 blocks, checked" in capsys.readouterr().out
-    written = [check_submission(tmp_path / name, SIDE) for name in ("SubmitRaw.csv", "SubmitRaw.mat")]
-    assert torch.equal(*written)
+    out = tmp_path / "SubmitRaw.csv"
+    assert main(["submit", f"sidd:{sidd / 'SIDD_Validation'}", str(out), "--denoiser", str(weights)]) == 0
+    assert "1280 blocks, checked" in capsys.readouterr().out
     noisy = torch.stack([block.noisy for block in SiddBenchmark(sidd / "SIDD_Validation")])
-    shift = (written[0] - noisy).abs().mean((1, 2, 3))
+    shift = (check_submission(out, SIDE) - noisy).abs().mean((1, 2, 3))
     assert (shift > 0.0).all() and shift.max() < 0.2, "each block is a denoised one of its own"
