@@ -14,8 +14,8 @@ names                                                                what       
 ===================================================================  ===========================  ============
 
 Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives settings:
-``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs no
-name: ``{"pair_psnr": 41.18}``.
+``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
+no name: ``{"pair_psnr": 41.18}``.
 """
 
 from __future__ import annotations
