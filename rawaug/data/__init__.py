@@ -25,6 +25,7 @@ from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.rawir import Rawir
+from rawaug.data.rgb2raw import Rgb2Raw
 from rawaug.data.shapes import Shapes
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
@@ -42,6 +43,7 @@ __all__ = [
     "PictureFolder",
     "RawFolder",
     "Rawir",
+    "Rgb2Raw",
     "Shapes",
     "SiddBenchmark",
     "SiddBlocks",
