@@ -19,10 +19,10 @@ from denoisers.network import Denoiser
 from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
-from rawaug.data import PictureFolder
 from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
 from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
+from rawaug.data.picture_folder import reports
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
@@ -291,9 +291,7 @@ class _Run:
         written = page.write(self.folder / "report.html", asdict(recipe))
         print_table(results, title, classical)
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
-        if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
-            print(self.pictures.report())
-        print("\n".join([*searched, *self.usage(results)]))
+        print("\n".join([*reports(self.pictures), *searched, *self.usage(results)]))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 

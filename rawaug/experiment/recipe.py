@@ -32,7 +32,8 @@ class DataConfig(PairSettings):
         count: number of pairs to use; null for all.
         select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
             folders.
-        pictures: the sRGB pictures to augment with: a folder, ``demo:``, or ``pairs``, those of the chosen pairs.
+        pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
+            ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
@@ -45,7 +46,7 @@ class DataConfig(PairSettings):
     pairs: str | None = "demo:train"
     count: int | None = None
     select: str | list[str] = "first"
-    pictures: str = "demo:"
+    pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     validation: str | None = "demo:validation"
     validation_crop: int | None = None
