@@ -5,10 +5,10 @@
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
 the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
-in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training alone,
-to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks rows. Each
-network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a stopped run
-can be started again.
+in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
+alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
+rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
+stopped run can be started again.
 """
 
 from __future__ import annotations
