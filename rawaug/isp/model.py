@@ -58,11 +58,17 @@ class DictionaryISP(StagedISP):
         atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
         a fitted camera they always have weights of their own.
         """
-        if isinstance(self.colour, CameraDictionary):
-            return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent).sample(batch, generator)
         config, device = self.config, self.colour.matrices.device
+        if (cameras := self.camera_sampler(consistent)) is not None:
+            return cameras.sample(batch, generator, device)
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
+
+    def camera_sampler(self, consistent: bool = True) -> CameraSampler | None:
+        """What draws settings where the atoms are published cameras, as these are now; else None."""
+        if not isinstance(self.colour, CameraDictionary):
+            return None
+        return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""

@@ -105,6 +105,7 @@ class RawAugment(nn.Module):
         if self.pattern is not None and self.noise.by_plane:
             raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
         self.sampling = sampling
+        self.cameras = self.isp.camera_sampler(consistent=sampling == "convex")
         self.strength = strength
         self.seed = seed
         self.exposure = exposure
@@ -155,7 +156,9 @@ class RawAugment(nn.Module):
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
-            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
+            if self.cameras is None:
+                return self.isp.draw_setting(len(srgb), generator)
+            return self.cameras.sample(len(srgb), generator, self.device)
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
