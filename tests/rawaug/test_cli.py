@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -130,11 +129,9 @@ def test_help_is_quick() -> None:
     pytest.fail(f"rawaug --help took {seconds} s of a processor")
 
 
-def test_it_is_a_module_too(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["rawaug", "--version"])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_module("rawaug", run_name="__main__")
-    assert ended.value.code == 0 and capsys.readouterr().out.startswith("rawaug 0.")
+def test_it_is_a_module_too() -> None:
+    done = subprocess.run([sys.executable, "-m", "rawaug", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("rawaug 0.")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

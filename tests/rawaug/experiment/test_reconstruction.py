@@ -36,7 +36,8 @@ class Laboratory:
         self.denoisers: list[Path] = []
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
-        for name in ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d"):
+        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "balanced_rows", "cycle_psnr", "psnr_d")
+        for name in stands_in:
             monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
     def open_pairs(self, spec: str, split: str) -> list[Pair]:
@@ -67,6 +68,9 @@ class Laboratory:
     def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
         return {"rows": {"blind": value, "as-shot": value + 1}, "mpix_s": 2.0 ** int(pair.name[1:])}
+
+    def balanced_rows(self, fitted: Any, pair: Pair) -> dict[str, float]:
+        return {"blind": 30.0 + int(pair.name[1:])}
 
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
@@ -141,18 +145,17 @@ def test_table_and_file_say_the_same(
 
 
 def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
-    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    class Altered(Laboratory):
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+            bright = 0.0 if pair is clean[pair.name] else 7.0
+            return {"rows": {"blind": 40.0 - bright, "as-shot": 50.0 - bright}, "mpix_s": 1.0}
+
+    laboratory = Altered(monkeypatch)
     laboratory.frames = 3
-
-    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        bright = 0.0 if pair is clean[pair.name] else 7.0
-        return {"rows": {"blind": 40.0 - bright, "as-shot": 50.0 - bright}, "mpix_s": 1.0}
-
     pairs = laboratory.pairs = laboratory.open_pairs("", "")
     clean = {pair.name: pair for pair in pairs}
-    monkeypatch.setattr(reconstruction, "score_rows", score)
-    monkeypatch.setattr(reconstruction, "balanced_rows", lambda fitted, pair: {"blind": 30.0 + int(pair.name[1:])})
     rows = compare(settings(tmp_path, balanced=True, altered=["overexposed", "retouched"]))
     bare = ["dictionary", "dictionary, as-shot gains"]
     assert list(rows) == [*bare, *(f"{row}, {kind}" for kind in ("overexposed", "retouched") for row in bare)]
