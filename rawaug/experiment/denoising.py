@@ -262,7 +262,8 @@ class _Run:
         classical: dict[str, Any] = {}
         everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
         runs = [self.folder / f"seed{s}" for s in range(recipe.seed, recipe.seed + recipe.seeds)]
-        searches = chosen(recipe.arms, runs, bool(self.validation))
+        candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
+        searches = chosen(candidates, runs, bool(self.validation))
         everything |= {"chosen": searches} if searches else {}
         searched = [
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())

@@ -12,7 +12,6 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.search import expanded
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -124,6 +123,24 @@ class ArmConfig:
         self.estimator = {"name": name, "settings": settings} if settings else name
         ESTIMATORS.make(self.estimator)
 
+    def candidates(self, label: str) -> dict[str, ArmConfig]:
+        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``.
+
+        Raises:
+            ValueError: if the search has not one key with values, or it is no setting of the estimator.
+        """
+        if self.search is None:
+            return {label: self}
+        name, settings = name_and_settings(self.estimator)
+        ((key, values),) = self.search.items() if len(self.search) == 1 else [("", [])]
+        if not values:
+            raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
+        found = {}
+        for value in values:
+            estimator = {"name": name, "settings": {**settings, key: value}}
+            found[f"{label}_{key}{value:g}"] = replace(self, estimator=estimator, search=None, candidate_of=label)
+        return found
+
     @property
     def sees_clean(self) -> bool:
         """Whether the estimator needs clean frames."""
@@ -181,7 +198,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        self.arms = expanded(self.arms)
+        self.arms = {name: one for label, arm in self.arms.items() for name, one in arm.candidates(label).items()}
         require_between("seed", self.seed, -(2**63), 2**62)
         require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:
