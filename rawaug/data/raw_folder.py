@@ -15,6 +15,7 @@ from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.apart import apart
+from rawaug.io.picture_files import MAX_PIXELS
 
 EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
@@ -38,6 +39,7 @@ class RawFolder(LazyPairs):
         path: where the RAW files are.
         camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
+        max_pixels: of a JPEG; a larger one is an error of its pair.
 
     Raises:
         FileNotFoundError: if a file or the folder does not exist.
@@ -50,7 +52,12 @@ class RawFolder(LazyPairs):
     """
 
     def __init__(
-        self, path: str | Path | Iterable[str | Path], *, camera_jpeg: bool = True, adjust_maximum_thr: float = 0.0
+        self,
+        path: str | Path | Iterable[str | Path],
+        *,
+        camera_jpeg: bool = True,
+        adjust_maximum_thr: float = 0.0,
+        max_pixels: int = MAX_PIXELS,
     ) -> None:
         self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
         missing = [file for file in self.files if not file.is_file()]
@@ -62,7 +69,7 @@ class RawFolder(LazyPairs):
                 "noisy/clean pairs of other formats are read as pairs:PATH"
             )
         self.camera_jpeg = camera_jpeg
-        self.adjust_maximum_thr = adjust_maximum_thr
+        self.adjust_maximum_thr, self.max_pixels = adjust_maximum_thr, max_pixels
         super().__init__(_names(self.files))
 
     def files_of(self, index: int) -> Sequence[Path]:
@@ -74,7 +81,7 @@ class RawFolder(LazyPairs):
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
             frame = apart(read_raw, file)
-            srgb = turn_back(apart(read_picture, jpeg), frame.upright_view)
+            srgb = turn_back(apart(read_picture, jpeg, self.max_pixels), frame.upright_view)
             size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
