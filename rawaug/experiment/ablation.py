@@ -18,6 +18,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.run_folder import claim, require_free
@@ -71,7 +72,7 @@ def smoke_ablation(ablation: Ablation) -> Ablation:
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
     require_free(ablation, overwrite)
-    pairs = list(open_pairs(ablation.data, split="train"))[: ablation.count]
+    pairs = list(each_readable(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)

@@ -34,6 +34,8 @@ class DataConfig(PairSettings):
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
+        max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
+        read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
             and keeps the final weights.
@@ -47,12 +49,18 @@ class DataConfig(PairSettings):
     select: str | list[str] = "first"
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
+    max_pixels: int | None = None
+    read_seconds: float | None = None
     validation: str | None = "demo:validation"
     validation_crop: int | None = None
     test: str = "demo:test"
     test_count: int | None = None
 
     def __post_init__(self) -> None:
+        if self.max_pixels is not None:
+            require_between("data.max_pixels", self.max_pixels, 4, 2**40)
+        if self.read_seconds is not None:
+            require_between("data.read_seconds", self.read_seconds, 0.0, 1e6)
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
         if self.pictures == OWN_PICTURES and self.pairs is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import statistics
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable, each_readable, left_out
 from rawaug.data.select import selected
 from rawaug.evaluation.altered import ALTERED
 from rawaug.evaluation.scores import frozen_sample
@@ -158,7 +160,8 @@ class _Comparison:
     def __init__(self, settings: Comparison) -> None:
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
-        self.pairs = [found[k] for k in selected(found, len(found), settings.count, settings.select)]
+        chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+        self.pairs = list(each_readable(chosen, "data"))
         if settings.test:
             self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
         elif len(self.pairs) < 2:
@@ -178,7 +181,11 @@ class _Comparison:
         self.scored: Sequence[Pair] = self.pairs
         if settings.test:
             test = open_pairs(settings.test, split="test")
-            self.scored = SomePairs(test, range(len(test))[: settings.test_count])
+            tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+            deque(tested, maxlen=0)
+            for line in left_out(tested, "test"):
+                print(line)
+            self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")
         if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
