@@ -20,7 +20,7 @@ from torch import Tensor
 
 from rawaug.isp.cameras import white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
-from rawaug.isp.light import COLDEST, LAMP_SHARE, WARMEST, sample_lights
+from rawaug.isp.light import LightRange, sample_lights
 from rawaug.isp.setting import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
@@ -30,6 +30,7 @@ EXPOSURE = (-1.0, 0.2)
 CAMERAS_MIXED = 2
 TONES_MIXED = 3
 _ROUNDS = 100
+_ALL_LIGHTS = LightRange()
 
 
 class CameraSampler:
@@ -39,8 +40,7 @@ class CameraSampler:
         cameras: the atoms of colour.
         tone_atoms: number of tone curves; 0 where the tone is learned.
         cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
-        kelvin: lowest and highest colour temperature of the light.
-        lamps: share of fluorescent and LED lamps.
+        lights: what the light is drawn from.
         consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
             and gains are drawn one by one.
 
@@ -54,15 +54,14 @@ class CameraSampler:
         tone_atoms: int,
         cameras_mixed: int = CAMERAS_MIXED,
         tones_mixed: int = TONES_MIXED,
-        kelvin: tuple[float, float] = (WARMEST, COLDEST),
-        lamps: float = LAMP_SHARE,
+        lights: LightRange = _ALL_LIGHTS,
         consistent: bool = True,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
             raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
         self.cameras, self.tone_atoms = cameras, tone_atoms
         self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
-        self.kelvin, self.lamps, self.consistent = kelvin, lamps, consistent
+        self.lights, self.consistent = lights, consistent
 
     @torch.no_grad()
     def sample(self, batch: int, generator: torch.Generator) -> ISPParams:
@@ -89,13 +88,13 @@ class CameraSampler:
         for _ in range(_ROUNDS):
             shares = sparse_weights(len(open_), len(known), self.cameras_mixed, generator)
             weights[open_] = shares @ known
-            light = sample_lights(len(open_), generator, self.kelvin, self.lamps)
+            light = sample_lights(len(open_), generator, *self.lights)
             balance[open_] = white_balance(self.cameras.xyz_to_camera(weights[open_].to(device)).cpu(), light)
             open_ = open_[~plausible(balance[open_])]
             if not len(open_):
                 return weights.to(self.cameras.matrices), balance
         raise ValueError(
-            f"no light at {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
+            f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; take other lights"
         )
 
 

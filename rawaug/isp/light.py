@@ -14,8 +14,12 @@ LED lamps are those that the CIE tabulates.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+
+from rawaug.registry import nearest
 
 LAMPS: dict[str, tuple[float, float]] = {
     "FL1": (0.31310, 0.33727), "FL2": (0.37208, 0.37529), "FL3": (0.40910, 0.39430), "FL4": (0.44018, 0.40329),
@@ -30,6 +34,8 @@ LAMPS: dict[str, tuple[float, float]] = {
 LED-V1 is the chromaticity of its tabulated spectrum; the (0.4560, 0.4548) that is widely quoted is not.
 """
 
+_LAMPS = torch.tensor(list(LAMPS.values()), dtype=torch.float64)
+
 D65 = (0.31271, 0.32902)
 
 COLDEST, WARMEST = 10_000.0, 2_000.0
@@ -39,6 +45,44 @@ DAYLIGHT_FROM = 4_000.0
 LAMP_SHARE = 0.1
 DUV_SPREAD = 0.003
 """Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
+
+
+class LightRange(NamedTuple):
+    """What lights are drawn from, as the arguments of :func:`sample_lights`.
+
+    Args:
+        kelvin: lowest and highest colour temperature.
+        lamps: share of electric lamps.
+        among: chromaticities ``(N, 2)`` of these lamps.
+    """
+
+    kelvin: tuple[float, float] = (WARMEST, COLDEST)
+    lamps: float = LAMP_SHARE
+    among: Tensor = _LAMPS
+
+
+def light_range(light: float | str | None) -> LightRange:
+    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default.
+
+    Raises:
+        ValueError: if there is no such lamp, or the temperature is outside 2,000 to 10,000 K.
+
+    Example:
+        >>> light_range(5500).kelvin
+        (5500.0, 5500.0)
+    """
+    if light is None:
+        return LightRange()
+    if isinstance(light, str):
+        if light not in LAMPS:
+            listed = ", ".join(LAMPS)
+            raise ValueError(
+                f"light {light!r} is unknown; use a colour temperature or one of {listed}{nearest(light, LAMPS)}"
+            )
+        return LightRange(lamps=1.0, among=torch.tensor([LAMPS[light]], dtype=torch.float64))
+    if not WARMEST <= light <= COLDEST:
+        raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
+    return LightRange((float(light), float(light)), lamps=0.0)
 
 
 def planckian(kelvin: Tensor) -> Tensor:
@@ -78,18 +122,23 @@ def white_point(xy: Tensor | tuple[float, float]) -> Tensor:
 
 
 def sample_lights(
-    batch: int, generator: torch.Generator, kelvin: tuple[float, float] = (WARMEST, COLDEST), lamps: float = LAMP_SHARE
+    batch: int,
+    generator: torch.Generator,
+    kelvin: tuple[float, float] = (WARMEST, COLDEST),
+    lamps: float = LAMP_SHARE,
+    among: Tensor = _LAMPS,
 ) -> Tensor:
     """White points ``(batch, 3)``, XYZ with Y = 1, float64.
 
     Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
-    :data:`LAMPS` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
+    ``among`` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
 
     Args:
         batch: number of lights.
         generator: on the CPU.
         kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
         lamps: share of fluorescent and LED lamps, in [0, 1].
+        among: chromaticities ``(N, 2)`` of the lamps that are drawn from, each as often as the others.
 
     Raises:
         ValueError: if a limit is outside its range.
@@ -101,7 +150,7 @@ def sample_lights(
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
     by_day = (drawn[:, 1] < 0.5) & (temperature >= DAYLIGHT_FROM)
     xy = torch.where(by_day[:, None], daylight(temperature.clamp_min(DAYLIGHT_FROM)), planckian(temperature))
-    lamp = torch.tensor(list(LAMPS.values()), dtype=torch.float64)[(drawn[:, 3] * len(LAMPS)).long()]
+    lamp = among[(drawn[:, 3] * len(among)).long()]
     return white_point(off_locus(torch.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
 
 

@@ -35,6 +35,7 @@ from rawaug.isp.dictionary import (
 )
 from rawaug.isp.encoder import Encoder, Encoders, thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.light import light_range
 from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.stage import Stage, stage_class
@@ -138,15 +139,21 @@ class DictionaryISP(ReverseISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: torch.Generator, consistent: bool = True) -> ISPParams:
+    def draw_setting(
+        self, batch: int, generator: torch.Generator, consistent: bool = True, light: float | str | None = None
+    ) -> ISPParams:
         """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
 
         A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
         atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
-        a fitted camera they always have weights of their own.
+        a fitted camera they always have weights of their own. ``light`` is a colour temperature in kelvin or the name
+        of a lamp, where the atoms are published cameras.
         """
         if isinstance(self.colour, CameraDictionary):
-            return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent).sample(batch, generator)
+            sampler = CameraSampler(
+                self.colour, self.config.tone_atoms, consistent=consistent, lights=light_range(light)
+            )
+            return sampler.sample(batch, generator)
         config, device = self.config, self.colour.matrices.device
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
