@@ -38,10 +38,22 @@ def test_the_recipes_are_all_there() -> None:
     assert {name: kind for name, kind in ALL.items() if kind != "training"} == {
         "ablation": "ablation",
         "denoisers": "denoisers",
+        "learned": "learned",
         "reconstruction": "reconstruction",
         "fivek/reconstruction": "reconstruction",
+        "rgb2raw": "reconstruction",
         "sidd/reconstruction": "reconstruction",
     }
+
+
+def test_the_papers_rows_name_recipes_and_tests_that_exist() -> None:
+    page = (FOLDER.parent / "docs" / "compare.md").read_text(encoding="utf-8").partition("## The paper's tables")[2]
+    named = set(re.findall(r"rawaug run (\S+?)[`\s]", page))
+    assert named <= set(ALL) and {"sidd/full", "sidd/fewshot", "sidd/unsupervised", "sidd/reconstruction"} <= named
+    assert {"fivek/reconstruction", "sidd/siddplus", "ablation", "learned", "rgb2raw"} <= named
+    tests = {file.name for file in Path(__file__).parent.rglob("test_*.py")}
+    found = set(re.findall(r"`(test_\w+\.py)`", page))
+    assert len(found) > 20 and found <= tests, found - tests
 
 
 def test_it_opens_with_its_commands_and_their_cost(name: str) -> None:

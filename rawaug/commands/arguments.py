@@ -1,7 +1,7 @@
 """A command's arguments from the signature of its function: types, defaults and, from the docstring, help.
 
-Parameters before the ``*`` are positional, a list takes one or more, one with a default may be left out; those after it are options. A ``bool`` that is
-False by default is a flag. The fields of a dataclass are options themselves.
+Parameters before the ``*`` are positional, a list takes one or more, one with a default may be left out; those after
+it are options. A ``bool`` that is False by default is a flag. The fields of a dataclass are options themselves.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
+from rawaug.experiment.search import expanded
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -31,7 +32,8 @@ class DataConfig(PairSettings):
         count: number of pairs to use; null for all.
         select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
             folders.
-        pictures: the sRGB pictures to augment with: a folder, ``demo:``, or ``pairs``, those of the chosen pairs.
+        pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
+            ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
@@ -44,7 +46,7 @@ class DataConfig(PairSettings):
     pairs: str | None = "demo:train"
     count: int | None = None
     select: str | list[str] = "first"
-    pictures: str = "demo:"
+    pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     validation: str | None = "demo:validation"
     validation_crop: int | None = None
@@ -83,6 +85,9 @@ class ArmConfig:
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
+            for each value, and the results name the best.
+        candidate_of: of such an arm: whose it is.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
         steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
@@ -97,6 +102,8 @@ class ArmConfig:
     alpha: float | None = None
     correct: bool | None = None
     gamma: float | None = None
+    search: dict[str, list[float]] | None = None
+    candidate_of: str | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
     steps: int | None = None
@@ -174,6 +181,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
+        self.arms = expanded(self.arms)
         require_between("seed", self.seed, -(2**63), 2**62)
         require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:

@@ -25,6 +25,7 @@ from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
 from rawaug.data.select import selected
+from rawaug.evaluation.altered import ALTERED
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
@@ -33,6 +34,7 @@ from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
     Fitted,
+    balanced_rows,
     cycle_psnr,
     fit_family,
     is_method,
@@ -71,6 +73,10 @@ class Comparison:
         longer: factor of a second, longer budget for them; 0 for none.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
+        balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
+            gamma-compressed RAW.
+        altered: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
+            :mod:`rawaug.evaluation.altered`; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
         downstream: PSNR_d; null skips it.
@@ -94,6 +100,8 @@ class Comparison:
     longer: float = 0.0
     longer_frames: int = 2
     patches: int | None = 8
+    balanced: bool = False
+    altered: list[str] = field(default_factory=list)
     pictures: str = "demo:"
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
@@ -110,6 +118,8 @@ class Comparison:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
+        if unknown := [kind for kind in self.altered if kind not in ALTERED]:
+            raise ValueError(f"altered: {unknown}; choose from {', '.join(ALTERED)}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
@@ -208,8 +218,9 @@ class _Comparison:
         for row in folds[0][2]["rows"]:
             by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
             quarters = [worst_and_best_quarter(values) for values in by_seed]
-            name = family if row == "blind" else f"{family}, {ROWS[row]}"
-            rows[f"{name}, {scale:g} times as long" if longer else name] = {
+            name = _row_name(family, row)
+            name = f"{name}, {scale:g} times as long" if longer else name
+            rows[name] = {
                 "psnr_r": [statistics.fmean(values) for values in by_seed],
                 "frames": {names[k]: [values[k] for values in by_seed] for k in frames},
                 "worst25": [worst for worst, _ in quarters],
@@ -219,6 +230,9 @@ class _Comparison:
                 "parameters": folds[0][2]["parameters"],
                 **(whole if row == "blind" else {}),
             }
+            if row in folds[0][2].get("balanced", {}):
+                by_seed = [[fold["balanced"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+                rows[name]["balanced"] = [statistics.fmean(values) for values in by_seed]
         return rows
 
     def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
@@ -226,7 +240,8 @@ class _Comparison:
         settings, name = self.settings, names_of(self.scored)[frame]
         seconds = settings.seconds * scale
         budget = (seconds, settings.crop, settings.batch)
-        key = fingerprint(family, budget, seed, settings.patches, *self._frames())
+        more = [settings.balanced, settings.altered] if settings.balanced or settings.altered else []
+        key = fingerprint(family, budget, seed, settings.patches, *self._frames(), *more)
         path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
         if (known := _read(path, key)) is not None:
             return known
@@ -239,6 +254,11 @@ class _Comparison:
         else:
             fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
         result = score_rows(fitted, pair, settings.patches)
+        for kind in settings.altered:
+            found = score_rows(fitted, ALTERED[kind](pair), settings.patches)["rows"]
+            result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
+        if settings.balanced:
+            result["balanced"] = balanced_rows(fitted, pair)
         result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
         write_json(result, path)
         return result
@@ -279,6 +299,12 @@ class _Comparison:
         return self.folder / f"{stem.replace('/', '_')}.json"
 
 
+def _row_name(family: str, row: str) -> str:
+    """Of a row of a fold: "as-shot, overexposed" and the like."""
+    setting, _, kind = row.partition(", ")
+    return ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
+
+
 def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
     """The frame with noise keyed by its name, as a noisy capture."""
     cfa = CFA(pair.cfa)
@@ -303,12 +329,23 @@ def _median(values: list[float | None]) -> float | None:
     return statistics.median(known) if known else None
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
+_COLUMNS = {
+    "psnr_r": "PSNR_r",
+    "worst25": "worst 25%",
+    "best25": "best 25%",
+    "balanced": "balanced",
+    "cycle": "cycle",
+    "cycle_without_mosaic": "no mosaic",
+    "psnr_d": "PSNR_d",
+}
+
+
+def _cells(row: dict[str, Any], columns: Sequence[str]) -> list[str]:
     def figures(name: str) -> str:
         value = row.get(name)
         return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
 
-    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "cycle_without_mosaic", "psnr_d")]
+    cells = [figures(name) for name in columns]
     speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
     return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
 
@@ -317,7 +354,8 @@ def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float
     frames = len(next(iter(rows.values()))["frames"])
     protocol = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
     title = f"{settings.name}: {protocol}, {settings.seeds} seed(s), {settings.data}"
-    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
-    print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
+    columns = [name for name in _COLUMNS if name != "balanced" or settings.balanced]
+    heads = [_COLUMNS[name] for name in columns] + ["M par.", "s to fit", "Mpix/s"]
+    print_rows(title, ["method", *heads], [[name, *_cells(row, columns)] for name, row in rows.items()])
     threads = torch.get_num_threads()
     print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

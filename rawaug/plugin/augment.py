@@ -25,7 +25,6 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.camera_sampling import EXPOSURE
 from rawaug.isp.dictionary import perturb
-from rawaug.isp.light import light_range
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
 from rawaug.isp.unbaked import reverse_pass
@@ -124,11 +123,11 @@ class RawAugment(nn.Module):
         if (light, tone) != (None, None) and not (cameras and sampling in ("convex", "independent")):
             whose = f"with sampling {sampling!r}" if cameras else "of a fitted ISP"
             raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
-        light_range(light)
         self.noise = noise_for(self.isp, noise)
         if self.pattern is not None and self.noise.by_plane:
             raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
         self.sampling, self.strength, self.seed, self.exposure = sampling, strength, seed, exposure
+        self.cameras = self.isp.camera_sampler(sampling == "convex", light)
         self.light = light
         self.tone = None if tone is None else tone_weights(self.isp, tone)
         self._calls = 0
@@ -196,8 +195,9 @@ class RawAugment(nn.Module):
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
-            consistent = self.sampling == "convex"
-            return self._toned(self.isp.draw_setting(len(srgb), generator, consistent, self.light))
+            if self.cameras is None:
+                return self.isp.draw_setting(len(srgb), generator)
+            return self._toned(self.cameras.sample(len(srgb), generator, self.device))
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen

@@ -45,11 +45,11 @@ def train_encoders(
     wanted = config.encoders
     isp.use_encoders(False)
     if wanted == "auto" and len(shots) >= FEWEST_FRAMES:
-        gain = _gain_on_frames_left_out(samples, shots, descent, refit)
+        gain = _gain_on_frames_left_out(samples, shots, config, descent, refit)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
-        _train(isp, samples, shots, list(range(len(shots))), descent, "encoders")
+        _train(isp, samples, shots, list(range(len(shots))), config, descent, "encoders")
 
 
 def _train(
@@ -57,6 +57,7 @@ def _train(
     samples: PixelSamples,
     shots: Sequence[Shot],
     frames: Sequence[int],
+    config: FitConfig,
     descent: Descent,
     stage: str,
 ) -> None:
@@ -66,20 +67,27 @@ def _train(
     def loss(generator: torch.Generator) -> Tensor:
         chosen = torch.randint(len(frames), (FRAMES_A_STEP,), generator=generator).tolist()
         pixels = torch.randint(samples.srgb.shape[-1], (PIXELS_A_STEP,), generator=generator)
-        each = [_frame_loss(isp, samples, shots, frames[k], pixels, generator) for k in chosen]
+        consistency = CONSISTENCY * config.consistency
+        each = [_frame_loss(isp, samples, shots, frames[k], pixels, consistency, generator) for k in chosen]
         return torch.stack(each).mean()
 
     descent.run(stage, loss, tensors, STEPS, LEARNING_RATE)
 
 
 def _frame_loss(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, g: torch.Generator
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[Shot],
+    frame: int,
+    pixels: Tensor,
+    consistency: float,
+    g: torch.Generator,
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
     srgb, raw = _same_piece(shots[frame].srgb, shots[frame].raw, g)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     errors = (mean_square(isp, part, ours) + LOG_MSE_EPS).log() + (mean_square(isp, part, theirs) + LOG_MSE_EPS).log()
-    return errors.sum() + CONSISTENCY * apart(ours, theirs)
+    return errors.sum() + consistency * apart(ours, theirs)
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -97,7 +105,9 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
     return pieces[0], pieces[1]
 
 
-def _gain_on_frames_left_out(samples: PixelSamples, shots: Sequence[Shot], descent: Descent, refit: Refit) -> float:
+def _gain_on_frames_left_out(
+    samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent, refit: Refit
+) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
     gain = 0.0
     for fold in range(FOLDS):
@@ -107,6 +117,6 @@ def _gain_on_frames_left_out(samples: PixelSamples, shots: Sequence[Shot], desce
         isp = refit(kept, part)
         isp.use_encoders(False)
         gain -= len(out) * decibels(isp, samples, shots, out)
-        _train(isp, samples, shots, kept, descent, f"encoders{part}")
+        _train(isp, samples, shots, kept, config, descent, f"encoders{part}")
         gain += len(out) * decibels(isp, samples, shots, out)
     return gain / len(shots)

@@ -13,6 +13,7 @@ MOST = 2**31
 """Of steps and pixels."""
 
 _SWITCH = ("auto", "on", "off")
+_LATER = {"curve_steps": None, "intermediate": 0.1, "consistency": 1.0}
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,9 @@ class FitConfig:
         joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; None is 150.
+        intermediate: weight of the loss on the images between the stages, beside 1 of that on sRGB; 0 leaves it out.
+        consistency: factor of the losses between the weights that reverse and forward encoders choose; 0 leaves them
+            out.
         noisy: fit on the captured noisy RAW of the pairs.
         seed: random seed of the drawn pixels and initial networks.
         isp: further keys of :class:`rawaug.isp.setting.ISPConfig`, such as ``encoder_widths``.
@@ -55,6 +59,8 @@ class FitConfig:
     encoders: Literal["auto", "on", "off"] = "auto"
     joint_steps: int | None = None
     curve_steps: int | None = None
+    intermediate: float = 0.1
+    consistency: float = 1.0
     noisy: bool = False
     seed: int = 0
     isp: dict[str, Any] = field(default_factory=dict)
@@ -65,8 +71,8 @@ class FitConfig:
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
     def key(self) -> dict[str, Any]:
-        """What a fit depends on; keys that came later are left out where null: older fits stay what they are."""
-        return {key: value for key, value in asdict(self).items() if key != "curve_steps" or value is not None}
+        """What a fit depends on; keys that came later are left out at their default: older fits stay what they are."""
+        return {key: value for key, value in asdict(self).items() if key not in _LATER or value != _LATER[key]}
 
     def smoke(self) -> FitConfig:
         """In a second."""
@@ -78,7 +84,8 @@ class FitConfig:
                 require_between(key, getattr(self, key), least, MOST)
         require_between("seed", self.seed, -(2**63), 2**63 - 1)
         require_between("reach", self.reach, 1.0, float(MOST))
-        require_between("learning_rate", self.learning_rate, 0.0, float(MOST))
+        for key in ("learning_rate", "intermediate", "consistency"):
+            require_between(key, getattr(self, key), 0.0, float(MOST))
         for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
             if getattr(self, key) not in values:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")

@@ -273,7 +273,7 @@ class _Fit:
             params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
             with torch.no_grad():
                 back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
-            return cycle_error(isp, part, params, back, self.config.noisy)
+            return cycle_error(isp, part, params, back, self.config)
 
         self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 

@@ -147,7 +147,7 @@ def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
 ) -> None:
     monkeypatch.setattr("rawaug.experiment.rehearsal.READ_SECONDS", 1e6)
     command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test]
-    command += ["--data.pictures", data.pictures, "--dry-run", "--out", str(tmp_path / "runs")]
+    command += ["--data.pictures", str(data.pictures), "--dry-run", "--out", str(tmp_path / "runs")]
     assert main([*command, *ONE_ARM, *BARE]) == 0
     said = capsys.readouterr().out
     assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said

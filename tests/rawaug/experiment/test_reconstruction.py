@@ -138,6 +138,32 @@ def test_table_and_file_say_the_same(
     assert f"{stored['mosaic_only_psnr']:.2f} dB (ceiling" in said
 
 
+def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
+    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    laboratory.frames = 3
+
+    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+        bright = 0.0 if pair is clean[pair.name] else 7.0
+        return {"rows": {"blind": 40.0 - bright, "as-shot": 50.0 - bright}, "mpix_s": 1.0}
+
+    pairs = laboratory.pairs = laboratory.open_pairs("", "")
+    clean = {pair.name: pair for pair in pairs}
+    monkeypatch.setattr(reconstruction, "score_rows", score)
+    monkeypatch.setattr(reconstruction, "balanced_rows", lambda fitted, pair: {"blind": 30.0 + int(pair.name[1:])})
+    rows = compare(settings(tmp_path, balanced=True, altered=["overexposed", "retouched"]))
+    bare = ["dictionary", "dictionary, as-shot gains"]
+    assert list(rows) == [*bare, *(f"{row}, {kind}" for kind in ("overexposed", "retouched") for row in bare)]
+    assert rows["dictionary, as-shot gains, overexposed"]["psnr_r"] == [43.0, 43.0]
+    assert rows["dictionary"]["balanced"] == [31.0, 31.0] and "balanced" not in rows["dictionary, retouched"]
+    said = capsys.readouterr().out
+    assert "balanced" in said and "31.00" in said
+    plain = compare(settings(tmp_path, name="plain"))
+    assert list(plain) == bare and "balanced" not in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"altered: \['blurred'\]; choose from overexposed, retouched"):
+        settings(tmp_path, altered=["blurred"])
+
+
 def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_path: Path) -> None:
     rows = compare(settings(tmp_path, methods=list(methods.FAMILIES), seconds=3.0, longer=10.0, longer_frames=3))
     networks = {name for name, method in BASELINES.items() if issubclass(method, CropTrainedISP)}
