@@ -5,10 +5,10 @@
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
 the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
-in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled to the pairs of Conde
-et al., in training alone. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks rows. Each
-network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a stopped run
-can be started again.
+in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
+alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
+rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
+stopped run can be started again.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from rawaug.training.train_config import DenoiserConfig, TrainConfig
 CONFIG = DownstreamConfig(
     denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)
 )
-Rows = dict[str, dict[str, dict[str, list[float]]]]
-"""By row, seed and test set: PSNR in RAW and developed."""
 PAIR_PSNR = 41.18
 """Mean PSNR in dB of the training pairs of Conde et al., AAAI 2022."""
+Rows = dict[str, dict[str, dict[str, list[float]]]]
+"""By row, seed and test set: PSNR in RAW and developed."""
 NARROW = "Canon EOS 5D Mark III"
 """The camera that stands for all where the hull is taken away."""
 
@@ -116,8 +116,10 @@ def main() -> None:
     rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
     for seed in options.seeds:
         for row, crops in sources(pictures, options.older, named(options.real)):
+            if options.rows and row not in options.rows:
+                continue
             scores = rows.setdefault(row, {}).setdefault(str(seed), {})
-            if tests.keys() <= scores.keys() or (options.rows and row not in options.rows):
+            if tests.keys() <= scores.keys():
                 continue
             net = trained_on(crops, CONFIG, options.out / row.replace(" ", "-").replace(",", ""), seed)
             scores |= {

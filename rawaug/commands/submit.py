@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.commands.denoise import frame_denoiser
-from rawaug.commands.frame_denoisers import FrameDenoiser
+from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
 from rawaug.data import (
     Dnd,
     SiddBenchmark,

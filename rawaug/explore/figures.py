@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.explore.look import Drawn
 from rawaug.explore.quick_development import grey_curve
 from rawaug.extras import extra
@@ -57,7 +59,7 @@ def camera(drawn: Drawn) -> np.ndarray:
         colour.scatter(share[:, 0], share[:, 1], s=size, c=_shown(patches), alpha=alpha, edgecolors=edge)
     colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
-    colour.set_title(f"red, green, blue, skin, sky: large by the drawn matrix, small by {count} atoms", fontsize=8)
+    colour.set(title=f"colours by the matrix over {count} atoms")
     return _pixels(figure)
 
 
@@ -68,10 +70,9 @@ def noise(drawn: Drawn) -> np.ndarray:
     ramp = torch.logspace(-4, 0, 100)
     params = {name: value[None] for name, value in pair.params.noise.items()}
     law = drawn.augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
-    measured = [
-        variance_by_signal(clean, noisy)
-        for clean, noisy in zip(_by_colour(drawn, pair.clean), _by_colour(drawn, pair.noisy), strict=True)
-    ]
+    expected = _from_planes(drawn, drawn.augment.noise.variance(_as_planes(drawn, pair.clean), params))
+    sites = (_by_colour(drawn, raw) for raw in (pair.clean, pair.noisy, expected))
+    measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
     highest = max([float(variance.max()) for _, variance in measured if len(variance)], default=float(law[-1]))
     lowest = float(law[0])
     for axis, scale in zip(axes, ("linear", "log"), strict=True):
@@ -87,13 +88,14 @@ def noise(drawn: Drawn) -> np.ndarray:
     return _pixels(figure)
 
 
-def variance_by_signal(clean: Tensor, noisy: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of the signal in logarithmic bins, and the mean squares of the noise there; what may clip is left out.
+def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of the signal in logarithmic bins, and the mean squares of the noise there.
 
     Args:
         clean, noisy: values ``(N,)`` of the same sites.
+        expected: variance of the noise there, ``(N,)``: sites that it may clip, within three deviations, are left out.
     """
-    seen = (clean > 1e-4) & (clean < 0.9)
+    seen = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
     signal, square = clean[seen], (noisy[seen] - clean[seen]).square()
     where = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)
     count = torch.bincount(where, minlength=_BINS)
@@ -108,6 +110,15 @@ def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
     mosaic = drawn.augment.mosaic(raw)[0]
     channels = pattern(drawn.augment.cfa).channels(*mosaic.shape)
     return [mosaic[channels == index] for index in range(3)]
+
+
+def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
+    """RAW as noise models take it, four planes ``(1, 4, h, w)``."""
+    return raw[None] if drawn.augment.pattern is None else bayer.pack(raw[None], CFA.RGGB)
+
+
+def _from_planes(drawn: Drawn, planes: Tensor) -> Tensor:
+    return planes[0] if drawn.augment.pattern is None else bayer.unpack(planes[0], CFA.RGGB)
 
 
 def _shown(linear: Tensor) -> np.ndarray:
@@ -127,6 +138,7 @@ def _figure(columns: int) -> tuple[Any, Any]:
     for axis in axes:
         axis.grid(color="0.92")
         axis.set_axisbelow(True)
+        axis.title.set_fontsize(10)
     return figure, axes
 
 

@@ -33,7 +33,7 @@ def look_of(values: Mapping[str, Any]) -> Look:
     Raises:
         ValueError: if no picture is chosen.
     """
-    picture = values["upload"] or values["picture"]
+    picture = values["picture"]
     if not picture:
         raise ValueError("choose a picture")
     light = values["light"]
@@ -110,7 +110,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
     isps, usual = shipped_isps(), Drawing()
     with gr.Group():
         picture = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", elem_id="picture")
-        upload = gr.File(label="or open your own", height=90, elem_id="upload")
+        upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
     with gr.Group():
         isp = gr.Dropdown(isps, value=usual.isp, label="ISP", elem_id="isp")
         camera = gr.Dropdown([ANY, *published_cameras().names], value=ANY, label="Camera", elem_id="camera")
@@ -120,12 +120,18 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
         exposure = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False, elem_id="exposure")
     with gr.Group():
         noise = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", elem_id="noise")
-        iso = gr.Number(None, label="ISO", info=_about_iso(usual.noise), interactive=False, elem_id="iso")
+        iso = gr.Number(0, label="ISO", info=_about_iso(usual.noise), interactive=False, elem_id="iso")
         cfa = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA", elem_id="cfa")
         seed = gr.Number(0, label="Seed", precision=0, minimum=0, elem_id="seed")
     made = locals()
-    names = ("picture", "upload", "isp", "camera", "light", "tone", "draw_exposure", "exposure", "noise", "iso", "cfa")
-    return {name: made[name] for name in (*names, "seed")}
+    names = ("picture", "isp", "camera", "light", "tone", "draw_exposure", "exposure", "noise", "iso", "cfa", "seed")
+    upload.upload(partial(_added, gr, choices), upload, picture, show_progress="hidden", api_visibility="private")
+    return {name: made[name] for name in names}
+
+
+def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
+    """The uploaded picture in the list, and chosen."""
+    return gr.update(choices=[*choices, (Path(uploaded).name, uploaded)], value=uploaded)
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
@@ -182,7 +188,7 @@ def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
 
 def _about_iso(noise: str) -> str:
     measured = iso_range(noise)
-    return f"empty: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise has none"
+    return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise has none"
 
 
 def serve(page: Any, host: str, port: int) -> str:

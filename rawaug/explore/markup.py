@@ -13,15 +13,15 @@ from rawaug.explore.views import Panel
 from rawaug.extras import extra
 
 STYLE = """
-.panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 300px), 1fr)); gap: 12px}
+.panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); gap: 12px}
 .panels figure {margin: 0; min-width: 0}
 .panels img {width: 100%; height: auto; display: block; border-radius: 4px}
 .panels figcaption {font-size: 13px; line-height: 1.4; padding: 4px 0; overflow-wrap: anywhere}
 .message {border: 1px solid #c0392b; border-radius: 4px; padding: 8px 12px; overflow-wrap: anywhere}
 #controls {max-width: 420px}
 @media (max-width: 768px) {
-  #layout {flex-direction: column-reverse}
-  #controls {max-width: none}
+  #layout {flex-direction: column-reverse; align-items: stretch}
+  #controls {max-width: none; width: 100%}
 }
 """
 

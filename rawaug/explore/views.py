@@ -100,7 +100,7 @@ def raw(look: Look) -> list[Panel]:
 def camera(look: Look) -> list[Panel]:
     """Tone curve and colour matrix of the draw over those of the ISP."""
     made = drawn(look)
-    return [Panel(f"the camera that was drawn: {_setting(made)}", figures.camera(made))]
+    return [Panel(f"{_setting(made)}; large: red, green, blue, skin and sky by the drawn matrix", figures.camera(made))]
 
 
 def noise(look: Look) -> list[Panel]:

@@ -31,6 +31,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "in").mkdir()
     for k, name in enumerate(("a.png", "b.png")):
         write_picture(folder / "in" / name, demo_pictures(2)[k][:, 100:164, 120:216])
+    write_picture(folder / "own.png", demo_pictures(1)[0][:, :32, :48])
     (folder / "broken.png").write_bytes(b"no picture")
     return folder
 
@@ -85,6 +86,12 @@ def entered(browser: Any, control: str, number: str) -> None:
     field.fill(number)
     field.press("Enter")
     field.blur()
+
+
+def uploaded(browser: Any, file: Path) -> None:
+    with browser.expect_file_chooser() as chooser:
+        browser.locator("#upload").click()
+    chooser.value.set_files(str(file))
 
 
 def code(browser: Any, language: str = "command") -> str:
@@ -174,22 +181,21 @@ def test_every_control_changes_the_picture_and_the_code(browser: Any) -> None:
 
 def test_what_cannot_be_is_said_on_the_page(browser: Any, pictures: Path) -> None:
     alert = browser.locator("[role=alert]")
-    browser.locator("#upload input[type=file]").set_input_files(str(pictures / "broken.png"))
+    uploaded(browser, pictures / "broken.png")
     alert.wait_for()
     assert "broken.png" in alert.inner_text() and browser.locator("#view-pair img").count() == 0
-    browser.locator("#upload").get_by_label("Clear").or_(
-        browser.locator("#upload").get_by_label("Remove")
-    ).first.click()
+    uploaded(browser, pictures / "own.png")
     browser.wait_for_selector("#view-pair img")
+    open_tab(browser, "Code")
+    browser.wait_for_function("document.querySelector('#command .cm-content').innerText.includes('own.png')")
+    open_tab(browser, "Pair")
+    picked(browser, "noise", "Google Pixel")
     entered(browser, "iso", "1000000")
     alert.wait_for()
     assert "outside the measured range of Google Pixel" in alert.inner_text()
     entered(browser, "iso", "800")
     browser.wait_for_selector("#view-pair img")
     assert alert.count() == 0
-    browser.locator("#upload input[type=file]").set_input_files(str(pictures / "in" / "a.png"))
-    open_tab(browser, "Code")
-    browser.wait_for_function("document.querySelector('#command .cm-content').innerText.includes('a.png')")
 
 
 def test_nothing_is_asked_of_another_machine(browser: Any, served: str) -> None:
