@@ -95,13 +95,12 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
         with gr.Row(elem_id="layout"):
             with gr.Column(scale=1, min_width=300, elem_id="controls"):
                 controls = _controls(gr, choices)
-            with gr.Column(scale=3, min_width=300), gr.Tabs():
+            with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs():
                 tabs = {name: _tab(gr, name, outputs) for name in (*VIEWS, DENOISE)}
                 with gr.Tab("Code"):
-                    outputs["python"] = gr.Code(label="Python", language="python", elem_id="python", interactive=False)
-                    outputs["command"] = gr.Code(
-                        label="Command", language="shell", elem_id="command", interactive=False
-                    )
+                    form = {"interactive": False, "wrap_lines": True, "show_line_numbers": False, "buttons": ["copy"]}
+                    outputs["python"] = gr.Code(label="Python", language="python", elem_id="python", **form)
+                    outputs["command"] = gr.Code(label="Command", language="shell", elem_id="command", **form)
         _connect(gr, page, controls, outputs, tabs)
     return page
 

@@ -19,9 +19,10 @@ STYLE = """
 .panels figcaption {font-size: 13px; line-height: 1.4; padding: 4px 0; overflow-wrap: anywhere}
 .message {border: 1px solid #c0392b; border-radius: 4px; padding: 8px 12px; overflow-wrap: anywhere}
 #controls {max-width: 420px}
+#views {min-width: 0 !important}
 @media (max-width: 768px) {
   #layout {flex-direction: column-reverse; align-items: stretch}
-  #controls {max-width: none; width: 100%}
+  #controls, #views {max-width: none; width: 100%; flex: none}
 }
 """
 
