@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from rawaug.data.demo.demo_pairs import demo_files
 from rawaug.data.picture_folder import EXTENSIONS
-from rawaug.explore.gradio_page import build, serve
+from rawaug.explore.gradio_page import address, build, listening, server_of
 from rawaug.registry import COMMANDS
 
 
@@ -20,9 +21,9 @@ def run(pictures: str | None = None, *, host: str = "127.0.0.1", port: int = 786
         port: of the page.
     """
     page = build(*choices(pictures))
-    address = serve(page, host, port)
-    print(f"{address} (Ctrl-C stops it)", flush=True)
-    page.block_thread()
+    with listening(host, port) as open_, suppress(KeyboardInterrupt):
+        print(f"{address(open_)} (Ctrl-C stops it)", flush=True)
+        server_of(page).run(sockets=[open_])
 
 
 def choices(pictures: str | None) -> tuple[list[Path], list[str]]:

@@ -6,6 +6,7 @@ Nothing is loaded from elsewhere and nothing is sent: system fonts, no analytics
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -89,7 +90,8 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
         import gradio as gr
 
     choices = [(name, str(file)) for name, file in zip(names or [p.name for p in pictures], pictures, strict=True)]
-    with gr.Blocks(title="rawaug explore", analytics_enabled=False, fill_width=True) as page:
+    private = {"analytics_enabled": False, "delete_cache": (3600, 86400)}  # uploads go when the page stops
+    with gr.Blocks(title="rawaug explore", fill_width=True, **private) as page:
         gr.HTML("<h1>Your pictures as RAW</h1>")
         outputs: dict[str, Any] = {"message": gr.HTML(elem_id="message")}
         with gr.Row(elem_id="layout"):
@@ -190,25 +192,31 @@ def _about_iso(noise: str) -> str:
     return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise has none"
 
 
-def serve(page: Any, host: str, port: int) -> str:
-    """Start the page and return its address; it runs until ``page.close()``.
+def server_of(page: Any) -> Any:
+    """A server of uvicorn for the page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
+    with extra("explore"):
+        import fastapi
+        import gradio as gr
+        import uvicorn
+
+    theme = gr.themes.Base(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
+    app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", footer_links=[], ssr_mode=False, theme=theme, css=STYLE)
+    return uvicorn.Server(uvicorn.Config(app, log_level="error"))
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket for :func:`server_of`; port 0 takes any that is free.
 
     Raises:
-        OSError: if the port is taken.
+        OSError: if the address or the port cannot be used.
     """
-    with extra("explore"):
-        import gradio as gr
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise OSError(f"port {port} of {host} cannot be used ({error.strerror}); choose another --port") from None
 
-    fonts = {"font": ["system-ui", "sans-serif"], "font_mono": ["ui-monospace", "monospace"]}
-    _, address, _ = page.launch(
-        server_name=host,
-        server_port=port,
-        prevent_thread_lock=True,
-        quiet=True,
-        share=False,
-        ssr_mode=False,
-        footer_links=[],
-        theme=gr.themes.Base(**fonts),
-        css=STYLE,
-    )
-    return str(address)
+
+def address(open_: socket.socket) -> str:
+    """What a browser opens."""
+    host, port = open_.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import shutil
-import socket
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ import torch
 from rawaug.commands.explore import choices
 from rawaug.data import demo_pictures
 from rawaug.explore import look as looks
+from rawaug.explore.gradio_page import address, build, listening, server_of
+from rawaug.explore.views import pair as view
 from rawaug.io import write_picture
 from rawaug.plugin.drawing import Drawing
 
@@ -40,14 +43,15 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def served(pictures: Path) -> Iterator[str]:
     """The address of a running page."""
     pytest.importorskip("gradio", reason="pip install 'rawaug[explore]'")
-    from rawaug.explore.gradio_page import build, serve
-
-    page = build(*choices(str(pictures / "in")))
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    yield serve(page, "127.0.0.1", port)
-    page.close()
+    server = server_of(build(*choices(str(pictures / "in"))))
+    with listening("127.0.0.1", 0) as open_:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [open_]}, daemon=True)
+        thread.start()
+        while not server.started and thread.is_alive():
+            time.sleep(0.05)
+        yield address(open_)
+        server.should_exit = True
+        thread.join(60)
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +131,6 @@ def test_the_first_view_is_the_pair_that_the_code_makes(browser: Any, pictures: 
     noisy, clean = images(browser, "pair")
     assert noisy.shape == clean.shape == (64, 96, 3)
     pair = looks.drawn(looks.Look(str(pictures / "in" / "a.png"), Drawing())).pair
-    from rawaug.explore.views import pair as view
-
     expected = view(looks.Look(str(pictures / "in" / "a.png"), Drawing()))[1].image
     assert np.abs(clean.astype(int) - expected.astype(int)).mean() < 3, "a JPEG of the same picture"
     open_tab(browser, "Code")
@@ -207,3 +209,21 @@ def test_nothing_is_asked_of_another_machine(browser: Any, served: str) -> None:
         browser.set_viewport_size({"width": width, "height": 900})
         browser.wait_for_timeout(100)
         assert browser.evaluate(fits), f"the page is wider than {width} pixels"
+
+
+def test_a_port_in_use_is_one_line() -> None:
+    with listening("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=rf"port {port} of 127\.0\.0\.1 cannot be used .*; choose another --port"):
+            listening("127.0.0.1", port)
+
+
+def test_what_can_be_chosen(pictures: Path) -> None:
+    assert choices(str(pictures / "in"))[1] == ["a.png", "b.png"]
+    assert choices(str(pictures / "in" / "a.png")) == ([pictures / "in" / "a.png"], ["a.png"])
+    assert "chelsea (built in)" in choices(None)[1]
+    with pytest.raises(FileNotFoundError, match="gone: no such picture"):
+        choices(str(pictures / "gone"))
+    (pictures / "empty").mkdir()
+    with pytest.raises(ValueError, match="contains no picture"):
+        choices(str(pictures / "empty"))
