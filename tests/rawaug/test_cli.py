@@ -50,7 +50,8 @@ def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "picture.png"
     write_picture(picture, demo_pictures(3)[2])
-    assert main(["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2"]) == 0
+    command = ["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2", "--cfa", "XTRANS"]
+    assert main(command) == 0
     for name in ("stages.png", "stages-atoms.png"):
         assert (tmp_path / name).stat().st_size > 10_000
     assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
