@@ -117,7 +117,8 @@ class FitConfig:
 
     def smoke(self) -> FitConfig:
         """In a second."""
-        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128)
+        few = replace(self.encoder_training, steps=4)
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
 
     def __post_init__(self) -> None:
         for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():
