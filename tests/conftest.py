@@ -23,7 +23,7 @@ from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pair import Pair
 
 torch.set_num_threads(1)
-settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("rawaug", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
