@@ -32,6 +32,9 @@ class FitConfig:
         learning_rate: initial learning rate of Adam, with cosine decay to 0.
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
+        tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
+            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
+            as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
             and keeps them if they beat the constants on held-out frames.
@@ -51,6 +54,7 @@ class FitConfig:
     batch: int = 4096
     learning_rate: float = 2e-3
     shading: Literal["auto", "on", "off"] = "auto"
+    tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
     joint_steps: int | None = None
@@ -65,8 +69,9 @@ class FitConfig:
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
     def key(self) -> dict[str, Any]:
-        """What a fit depends on; keys that came later are left out where null: older fits stay what they are."""
-        return {key: value for key, value in asdict(self).items() if key != "curve_steps" or value is not None}
+        """What a fit depends on; keys that came later are left out at their default: older fits keep theirs."""
+        later: dict[str, Any] = {"curve_steps": None, "tone": "learned"}
+        return {key: value for key, value in asdict(self).items() if key not in later or value != later[key]}
 
     def smoke(self) -> FitConfig:
         """In a second."""
