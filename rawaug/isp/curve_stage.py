@@ -91,7 +91,8 @@ class ToneCurve(Stage):
 
     def _curves(self, batch: int, params: ISPParams | None) -> Tensor:
         """One curve a picture; the typical one where none is chosen."""
-        unknown = params is None or not params.tone_weights.shape[1]
-        weights = self.dictionary.typical[None] if unknown else params.tone_weights.to(self.dictionary.typical)
+        weights = self.dictionary.typical[None]
+        if params is not None and params.tone_weights.shape[1]:
+            weights = params.tone_weights.to(weights)
         weights = weights.expand(batch, -1)
         return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bent()
