@@ -5,9 +5,10 @@
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
 the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
-in another light. ``without the wide hull``: one camera's matrix. ``real``: trained on crops of
-real RAW frames in place of pictures. Each network is scored on every test set. What is finished, for the same settings,
-is taken from OUT, so that a stopped run can be started again.
+in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
+alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
+rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
+stopped run can be started again.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ from rawaug.training.train_config import DenoiserConfig, TrainConfig
 CONFIG = DownstreamConfig(
     denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)
 )
+PAIR_PSNR = 41.18
+"""Mean PSNR in dB of the training pairs of Conde et al., AAAI 2022."""
 Rows = dict[str, dict[str, dict[str, list[float]]]]
 """By row, seed and test set: PSNR in RAW and developed."""
 NARROW = "Canon EOS 5D Mark III"
@@ -71,6 +74,8 @@ def sources(pictures: Sequence[Tensor], older: Path | None, real: dict[str, list
         yield "universal, older", made(DictionaryISP.from_pretrained(older), exposure=CONFIG.exposure)
     yield "without tone", made(without_tone(universal()))
     yield "without consistent gains", made(universal(), sampling="independent")
+    calibrated = RawAugment(universal(), noise_model({"pair_psnr": PAIR_PSNR}))
+    yield f"pairs of {PAIR_PSNR} dB", PictureCrops(RawPairs(pictures, calibrated, crop))
     yield "without the wide hull", made(of_cameras(universal(), NARROW))
     for name, specs in real.items():
         pairs = [pair for spec in specs for pair in open_pairs(spec)]
@@ -100,6 +105,7 @@ def main() -> None:
     parser.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
     parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
     parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
+    parser.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
     options = parser.parse_args()
@@ -110,6 +116,8 @@ def main() -> None:
     rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
     for seed in options.seeds:
         for row, crops in sources(pictures, options.older, named(options.real)):
+            if options.rows and row not in options.rows:
+                continue
             scores = rows.setdefault(row, {}).setdefault(str(seed), {})
             if tests.keys() <= scores.keys():
                 continue

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
@@ -21,7 +21,9 @@ import denoisers
 from denoisers.pretrained import DEFAULT, find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
+from rawaug.data.lazy import SomePairs
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.data.sample import Sample
 from rawaug.devices import find_device
 from rawaug.evaluation.page import write_figure_page
@@ -100,7 +102,7 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     require_free(settings, overwrite)
     noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
     makers = _makers(settings)
-    frames = [_clean(pair, settings.crop) for spec in settings.data for pair in _opened(spec, settings.count)]
+    frames = [_clean(pair, settings.crop) for spec in settings.data for pair in _each(spec, settings.count)]
     claim(settings, overwrite)
     rows: dict[str, Any] = {}
     for name, make in makers.items():
@@ -114,9 +116,9 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     return result
 
 
-def _opened(spec: str, count: int | None) -> Sequence[Pair]:
+def _each(spec: str, count: int | None) -> Iterator[Pair]:
     pairs = open_pairs(spec, split="test")
-    return pairs if count is None else pairs[:count]
+    return each_readable(SomePairs(pairs, range(len(pairs))[:count]), spec)
 
 
 def _clean(pair: Pair, crop: int | None) -> Pair:

@@ -6,6 +6,7 @@ training on the run's device and in its precision, and its network is validated 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -18,6 +19,7 @@ from torch.utils.data import default_collate
 from denoisers.network import Denoiser
 from rawaug.commands.fit import fit
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable, left_out
 from rawaug.evaluation.scores import classical_method, installed_classical, network_method, score_method
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
@@ -50,7 +52,7 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
         for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage"):
             import_module(name)
     parts = {"train": plan.pairs, "validate": plan.validation, "test": plan.test}
-    pairs, validation, test = (_read(frames) for frames in parts.values())
+    pairs, validation, test = (_read(what, frames) for what, frames in parts.items())
     read = (
         f"{what} {len(found)} of {len(parts[what])}"
         for what, found in zip(parts, (pairs, validation, test), strict=True)
@@ -72,14 +74,16 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
     print(f"tried: every arm for one step; frames read: {', '.join(read)}")
 
 
-def _read(frames: Sequence[Pair]) -> list[Pair]:
-    """The first frames, at least one if there are any, as many as can be read in time."""
-    found = [frames[0]] if frames else []  # the first one also waits for the libraries
-    start = time.perf_counter()
-    for index in range(1, len(frames)):
+def _read(what: str, frames: Sequence[Pair]) -> list[Pair]:
+    """The first frames, at least one if there are any, as many as can be read in time; damaged ones are printed."""
+    readable, found, start = Readable(frames), list[Pair](), math.inf
+    for pair in readable:
+        found.append(pair)
+        start = min(start, time.perf_counter())  # the first one also waits for the libraries
         if time.perf_counter() - start > READ_SECONDS:
             break
-        found.append(frames[index])
+    for line in left_out(readable, f"the frames to {what}"):
+        print(line)
     return found
 
 
