@@ -43,6 +43,7 @@ class EncoderTraining:
 
 _LATER = {
     "curve_steps": None,
+    "tone": "learned",
     "intermediate": 0.1,
     "consistency": 1.0,
     "prior_steps": 400,
@@ -68,6 +69,9 @@ class FitConfig:
         learning_rate: initial learning rate of Adam, with cosine decay to 0.
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
+        tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
+            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
+            as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
             and keeps them if they beat the constants on held-out frames.
@@ -93,6 +97,7 @@ class FitConfig:
     batch: int = 4096
     learning_rate: float = 2e-3
     shading: Literal["auto", "on", "off"] = "auto"
+    tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
     encoder_training: EncoderTraining = field(default_factory=EncoderTraining)
