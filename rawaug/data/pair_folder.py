@@ -31,22 +31,31 @@ _WILD = re.compile(r"[*?]")
 
 
 @dataclass
-class PairSettings:
+class MosaicSettings:
+    """How the mosaics of ``pairs:PATH`` are read where their files do not say it.
+
+    Args:
+        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, for files that do not state it.
+        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
+        white: of pairs:PATH: white level of files that do not state it.
+    """
+
+    cfa: str | None = None
+    black: float | tuple[float, float, float, float] | None = None
+    white: float | None = None
+
+
+@dataclass
+class PairSettings(MosaicSettings):
     """How noisy/clean pairs are found and read, where ``pairs:PATH`` alone does not say it.
 
     Args:
         noisy: of pairs:PATH: pattern of the noisy files' names, such as "*_noisy.*", the naming of rawaug synth.
         clean: of pairs:PATH: pattern of the clean files' names; null replaces the word noisy in ``noisy`` by clean.
-        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, of files that do not state it.
-        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
-        white: of pairs:PATH: white level of files that do not state it.
     """
 
     noisy: str | None = None
     clean: str | None = None
-    cfa: str | None = None
-    black: float | tuple[float, float, float, float] | None = None
-    white: float | None = None
 
 
 class PairFiles(NamedTuple):
