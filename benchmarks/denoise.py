@@ -25,7 +25,8 @@ from benchmarks.augment import machine, memory_used
 from benchmarks.loader import fastest
 from denoisers.pretrained import DEFAULT
 from rawaug import bayer
-from rawaug.commands.denoise import denoise_file, frame_denoiser
+from rawaug.commands.denoise import denoise_file
+from rawaug.commands.frame_denoisers import frame_denoiser
 from rawaug.io import RawFrame, write_dng
 
 

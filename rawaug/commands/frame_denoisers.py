@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.network import Denoiser
-from denoisers.pretrained import find
+from denoisers.pretrained import DEFAULT, find
 from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -128,3 +128,18 @@ class ClassicalDenoiser:
             return denoised
         shot_var, read_var = (torch.tensor([level]) for level in levels)
         return Stabilised(self.filter, anscombe)(noisy, shot_var=shot_var, read_var=read_var)
+
+
+def frame_denoiser(
+    denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
+) -> FrameDenoiser:
+    """What denoises: the network, the classical filter, or the network that is taken where neither is named.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is none such, or both are named.
+    """
+    if classical is None:
+        return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
+    if denoiser is not None or self_ensemble:
+        raise ValueError("classical: a filter takes neither --denoiser nor --self-ensemble; give one or the other")
+    return ClassicalDenoiser(classical)

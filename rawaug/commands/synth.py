@@ -7,7 +7,6 @@ made once.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
@@ -23,12 +22,13 @@ from pathlib import Path
 import torch
 
 from rawaug.commands import pair_shards
+from rawaug.commands.folder_settings import require_same_settings
 from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import find_weights, sha256, write_json
+from rawaug.files import find_weights, sha256
 from rawaug.io.apart import prepare
 from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.lock import NAME, locked
@@ -126,14 +126,9 @@ def synth(
         OSError: if a worker dies, or the output folder is removed meanwhile.
     """
     start = time.perf_counter()
-    weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
-    levels = noise if isinstance(noise, str) else list(noise)
-    settings = Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
-    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
-        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
-        raise ValueError(f"{wanted}, got {format} and {per_image}")
+    settings = _settings(format, per_image, isp, noise, sampling, seed)
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
@@ -173,6 +168,17 @@ def part_of(shard: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
+def _settings(
+    format: Format, per_image: int, isp: str, noise: str | Sequence[float], sampling: Sampling, seed: int
+) -> Settings:
+    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
+        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
+        raise ValueError(f"{wanted}, got {format} and {per_image}")
+    weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
+    levels = noise if isinstance(noise, str) else list(noise)
+    return Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
+
+
 def _portable(settings: Settings) -> dict[str, object]:
     """The settings of shards, which machines that have the ISP's file in different places share."""
     return {**vars(settings), "isp": Path(settings.isp).name}
@@ -203,25 +209,6 @@ def _pictures(source: Path, out: Path) -> list[Path]:
     if not pictures:
         raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
     return pictures
-
-
-def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``.
-
-    Raises:
-        ValueError: if the existing files were made with other settings.
-    """
-    if path.is_file() and not overwrite:
-        try:
-            known = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
-        for key in known | settings:
-            value, asked = known.get(key), settings.get(key)
-            if asked != value:
-                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
-        return
-    write_json(settings, path)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.commands.camera_noise import measure_camera_noise
-from rawaug.commands.denoise import levels_of, stored_noise
 from rawaug.commands.fit import fit
+from rawaug.commands.frame_noise import levels_of, stored_noise
 from rawaug.data.pair import Pair
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model

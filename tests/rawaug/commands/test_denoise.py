@@ -15,8 +15,9 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder, levels_of
+from rawaug.commands.denoise import denoise_file, denoise_folder
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
+from rawaug.commands.frame_noise import levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
