@@ -161,12 +161,10 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
-    if not dry:
-        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
-    elif experiment.dry_run is None:
-        raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
-    else:
+    if dry:
         experiment.dry_run(recipe, overwrite)
+    else:
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
 
 
 def _one_line(error: Exception) -> str:
