@@ -61,7 +61,7 @@ def _dispatch(argv: list[str]) -> int:
         from rawaug.experiment.recipe import recipe_list
 
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
-        print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
+        print("rawaug run RECIPE --help explains its keys; --dry-run rehearses it on your data.")
         return 0
     kind, recipe = "training", None
     if argv[:2] == ["run", "--recipe"]:
@@ -134,7 +134,7 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
             else:
                 add_arguments(leaf, command(name))
         if "--quiet" not in leaf._option_string_actions:  # a command may have its own
-            leaf.add_argument("--quiet", action="store_true", help="print no progress")
+            leaf.add_argument("--quiet", action="store_true", help="do not print progress")
         spell_with_hyphens(leaf)
     return parser, leaves
 
@@ -144,7 +144,7 @@ def _add_run_arguments(run: Any, kind: str) -> None:
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
+    run.add_argument("--dry-run", action="store_true", help="show which data would be used and rehearse the run in seconds, without writing")
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
 

@@ -42,7 +42,7 @@ def run(
         out: output PNG; the atoms are written to NAME-atoms.png.
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
-        seed: of these.
+        seed: random seed of these.
         max_pixels: a larger picture is refused before it is decoded.
     """
     for path in preview(picture, isp, out, count, seed, max_pixels):
@@ -64,7 +64,7 @@ def preview(
         weights: an ISP, shipped or a path.
         out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
         count: number of augmented RAWs to plot.
-        seed: of these.
+        seed: random seed of these.
         max_pixels: a larger picture is refused before it is decoded.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A folder of noisy/clean RAW pairs of one's own, or as ``rawaug synth`` writes them: ``pairs:PATH``.
+"""A folder of noisy/clean RAW pairs, yours or written by ``rawaug synth``: ``pairs:PATH``.
 
 The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files of other names hold both.
 Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand at the same places in ``clean``.
@@ -222,7 +222,7 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
     cleans = (file for file in files if _regex(clean).fullmatch(file.relative_to(top).as_posix()))
     single = next((file for file in cleans if file not in paired), None)
     if single is not None:
-        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or move this one away")
+        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or remove this one")
     return found
 
 
@@ -231,7 +231,7 @@ def _clean_pattern(noisy: str) -> str:
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
     if not count:
-        raise ValueError(f"the pattern {noisy} does not say noisy; give the pattern of the clean files too")
+        raise ValueError(f"the pattern {noisy} does not contain the word noisy; give the pattern of the clean files too")
     return clean
 
 

@@ -55,9 +55,9 @@ class Plan:
         camera = (
             f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
             if recipe.camera is None
-            else f"{recipe.camera}, as it is"
+            else f"{recipe.camera}, unchanged"
         )
-        watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
+        watched = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         found = {
             "train": used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
             "validate": used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,

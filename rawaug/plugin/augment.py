@@ -103,7 +103,7 @@ class RawAugment(nn.Module):
         self.register_load_state_dict_pre_hook(_drop_isp)
         self.noise = noise_for(isp, noise)
         if self.pattern is not None and self.noise.by_plane:
-            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
+            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self.sampling = sampling
         self.strength = strength
         self.seed = seed

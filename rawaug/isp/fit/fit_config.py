@@ -33,9 +33,9 @@ class FitConfig:
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
         attention: fit the attention mask as well.
-        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
+        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
-        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; None is 150.
         noisy: fit on the captured noisy RAW of the pairs.
