@@ -73,4 +73,4 @@ $(VENV)/.uv: | $(BIN)/python
 
 $(WHEEL): setup.cfg $(VENV)/.uv
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/resolve .
-	echo "rawaug[test,docs,export] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@
+	echo "rawaug[test,docs,export,explore] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@

@@ -14,9 +14,11 @@ so that :meth:`Pattern.turn_keeping` brings them back by cropping.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
@@ -69,6 +71,17 @@ class Pattern:
         index = self.channels(*rgb.shape[-2:]).to(rgb.device)
         return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
 
+    def demosaic(self, raw: Tensor) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``, for the eye: what a site measured stays, the rest are means.
+
+        The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
+        convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
+        """
+        height, width = raw.shape[-2:]
+        planes = self.planes(height, width).to(raw)
+        means = _tent(raw * planes, self.period) / _tent_of(self.name, height, width).to(raw)
+        return torch.where(planes > 0, raw, means)
+
     def crop(self, raw: X, top: int, left: int, height: int, width: int) -> Tensor:
         """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size.
 
@@ -114,6 +127,22 @@ class Pattern:
         if height < 1 or width < 1:
             raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
         return turned[..., rows : rows + height, columns : columns + width]
+
+
+def _tent(image: Tensor, period: int) -> Tensor:
+    """``(B, C, H, W)`` through a separable tent that reaches half a cell to each side; 0 beyond the edges."""
+    reach = period // 2
+    tent = (1.0 + reach - torch.arange(-reach, reach + 1).abs()).to(image)
+    channels = image.shape[1]
+    rows = F.conv2d(image, tent.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(reach, 0), groups=channels)
+    return F.conv2d(rows, tent.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, reach), groups=channels)
+
+
+@lru_cache(maxsize=4)
+def _tent_of(name: str, height: int, width: int) -> Tensor:
+    """The sum of the tent's weights on the sites of each colour, ``(1, 3, H, W)``."""
+    known = pattern(name)
+    return _tent(known.planes(height, width)[None], known.period)
 
 
 def _quad(cfa: CFA) -> Pattern:

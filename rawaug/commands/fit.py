@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 from rawaug.commands.camera_noise import CameraNoise, measure_camera_noise
@@ -12,12 +13,14 @@ from rawaug.data import RawFolder, open_pairs
 from rawaug.data.identity import shared_frame
 from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import MosaicSettings
+from rawaug.data.readable import Readable, left_out
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.files import require_writable
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.lock import locked
 from rawaug.noise import MeasuredLevels, camera_law, plot_noise
+from rawaug.printable import printable
 from rawaug.registry import COMMANDS
 
 WATCHED_PATCHES = 4
@@ -67,6 +70,8 @@ def run(
         )
         isp.info["data"] = data
         isp.save(out)
+    for line in isp.info.get("unreadable", []):
+        print(printable(line))
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
     for score in isp.info.get("held_out", [])[-1:]:
         print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")
@@ -110,8 +115,12 @@ def fit(
         cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
+    Frames that cannot be read, of those fitted and those held out, are left out; ``isp.info["unreadable"]`` has a line
+    for each.
+
     Raises:
-        FileNotFoundError, ValueError: if a file is missing or not a Bayer RAW file, or a held-out frame is also fitted.
+        FileNotFoundError, ValueError: if a file is missing, none can be read as a Bayer RAW file, or a held-out frame
+            is also fitted.
 
     Example:
         >>> isp = fit("demo:train", steps=2, pixels=512, progress=False)
@@ -127,11 +136,14 @@ def fit(
     if held_out is not None:
         own = mosaics if str(held_out).startswith("pairs:") else {}
         watch = _Watch(_unseen(_pairs(held_out, camera_jpeg, own), pairs))
-    estimate = _measured_noise(pairs, noise, dark)  # before the fit: what fails here fails early
-    isp = fit_isp(pairs, FitConfig(**settings), progress, state, watch)
+    frames = Readable(pairs)
+    estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
+    isp = fit_isp(frames, FitConfig(**settings), progress, state, watch)
     if watch is not None:
         watch(isp)
         isp.info["held_out"] = watch.scores
+    if lines := [*left_out(frames, "the fit"), *left_out(watch.pairs if watch else Readable([]), "held-out frames")]:
+        isp.info["unreadable"] = lines
     if isinstance(estimate, str):
         isp.info["noise_not_measured"] = estimate
     elif estimate is not None:
@@ -179,15 +191,12 @@ class _Watch:
     """PSNR_r of held-out frames, on a few patches of each."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
-        self.pairs = pairs
+        self.pairs = Readable(pairs)
         self.scores: list[dict[str, float]] = []
 
     def __call__(self, isp: DictionaryISP) -> str:
-        blind, given = (
-            sum(psnr_r(isp, self.pairs[k], white_balance, WATCHED_PATCHES) for k in range(len(self.pairs)))
-            / len(self.pairs)
-            for white_balance in (False, True)
-        )
+        scores = [[psnr_r(isp, pair, known, WATCHED_PATCHES) for known in (False, True)] for pair in self.pairs]
+        blind, given = (fmean(of_frames) for of_frames in zip(*scores, strict=True))
         self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
         return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
 

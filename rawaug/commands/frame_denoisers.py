@@ -24,12 +24,23 @@ from rawaug.data.sample import Sample
 from rawaug.devices import find_device
 from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
-from rawaug.io import RawFrame
 from rawaug.noise import anscombe
 from rawaug.registry import FILTERS, Spec
 
 FILTER_TILE, FILTER_OVERLAP = 512, 32
 """Packed pixels; the filters look 8 pixels around, and BM3D 20."""
+
+
+class Frame(Protocol):
+    """What is denoised: a RAW file's frame, or a block of one."""
+
+    @property
+    def mosaic(self) -> Tensor:
+        """float32 ``(1, H, W)``."""
+
+    @property
+    def cfa(self) -> CFA:
+        """Its pattern."""
 
 
 class FrameDenoiser(Protocol):
@@ -43,7 +54,7 @@ class FrameDenoiser(Protocol):
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the frame and its levels, as JSON."""
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black."""
 
 
@@ -71,13 +82,13 @@ class NetworkDenoiser:
         """Whether the network has a noise map or a variance-stabilising transform."""
         return self.model.reads_variance
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """See :class:`FrameDenoiser`."""
         return denoise_mosaic(self.model, self.cfa, frame, levels, self.self_ensemble)
 
 
 def denoise_mosaic(
-    model: Denoiser, cfa: CFA, frame: RawFrame, levels: tuple[float, float], self_ensemble: bool = False
+    model: Denoiser, cfa: CFA, frame: Frame, levels: tuple[float, float], self_ensemble: bool = False
 ) -> Tensor:
     """The frame's mosaic denoised, float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black.
 
@@ -115,7 +126,7 @@ class ClassicalDenoiser:
         self.filter = FILTERS.make(spec)
         self.settings: dict[str, Any] = {"classical": spec}
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """See :class:`FrameDenoiser`."""
         packed = bayer.pack(frame.mosaic[None], frame.cfa)
         run = partial(self._tile, levels=levels)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch.utils.data import ConcatDataset
 
 from rawaug.data.check import DataReport, check
 from rawaug.data.demo.camera import DemoCamera
@@ -25,10 +25,13 @@ from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.rawir import Rawir
+from rawaug.data.rgb2raw import Rgb2Raw
+from rawaug.data.shapes import Shapes
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.data.sidd.submission import check_submission, write_submission
 from rawaug.data.zurich import Zurich
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
@@ -41,6 +44,8 @@ __all__ = [
     "PictureFolder",
     "RawFolder",
     "Rawir",
+    "Rgb2Raw",
+    "Shapes",
     "SiddBenchmark",
     "SiddBlocks",
     "SiddFrames",
@@ -64,7 +69,11 @@ _SPLITS = ("train", "validation", "test")
 
 
 def open_pairs(
-    spec: str | Path | Sequence[Pair], split: str = "test", as_clean: bool = True, **settings: Any
+    spec: str | Path | Sequence[Pair],
+    split: str = "test",
+    as_clean: bool = True,
+    max_pixels: int | None = None,
+    **settings: Any,
 ) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
 
@@ -75,6 +84,8 @@ def open_pairs(
         split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
+        max_pixels: of a JPEG beside a RAW file of a bare folder; None for
+            :data:`rawaug.io.picture_files.MAX_PIXELS`.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -91,7 +102,7 @@ def open_pairs(
     kind, path = _kind_and_path(str(spec))
     if kind is None:
         _require_none(settings, spec)
-        folder = RawFolder(path)
+        folder = RawFolder(path, max_pixels=max_pixels or MAX_PIXELS)
         require_no_pairs(folder, str(spec), as_clean)
         return folder
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
@@ -117,21 +128,27 @@ def _require_none(settings: Mapping[str, Any], spec: object) -> None:
         raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
 
 
-def open_pictures(spec: str, min_side: int = 2) -> Sequence[Tensor] | PictureFolder:
-    """Open sRGB pictures, uint8 ``(3, H, W)``: a folder, or ``"demo:"``.
+def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int | None = None) -> Any:
+    """Open sRGB pictures, a map-style dataset of uint8 ``(3, H, W)``: a folder, ``"demo:"``, ``"shapes:100"``.
 
     Args:
-        spec: ``"demo:"`` or the path of a folder.
+        spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
+        max_pixels: larger ones likewise; None for :data:`rawaug.io.picture_files.MAX_PIXELS`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
+
+    Example:
+        >>> len(open_pictures(["demo:", "shapes:10"]))
+        42
     """
+    if not isinstance(spec, str):
+        return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
     kind, path = _kind_and_path(spec)
     if kind is None:
-        return PictureFolder(path, min_side)
-    pictures: Sequence[Tensor] = _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
-    return pictures
+        return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)
+    return _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
 
 
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -77,20 +76,6 @@ class SomePairs(LazyPairs):
 
     def stamp(self, index: int) -> str:
         return self.pairs.stamp(self.indices[index]) if isinstance(self.pairs, LazyPairs) else super().stamp(index)
-
-
-def read_within(seconds: float, pairs: Sequence[Pair], least: int = 1) -> list[Pair]:
-    """The first pairs, as many as can be read in that time, and at least ``least`` of them if there are so many.
-
-    Time counts from the first pair on, which also waits for the libraries.
-    """
-    found = [pairs[0]] if pairs else []
-    start = time.perf_counter()
-    for index in range(1, len(pairs)):
-        if index >= least and time.perf_counter() - start > seconds:
-            break
-        found.append(pairs[index])
-    return found
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:

@@ -231,7 +231,9 @@ def _clean_pattern(noisy: str) -> str:
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
     if not count:
-        raise ValueError(f"the pattern {noisy} does not contain the word noisy; give the pattern of the clean files too")
+        raise ValueError(
+            f"the pattern {noisy} does not contain the word noisy; give the pattern of the clean files too"
+        )
     return clean
 
 

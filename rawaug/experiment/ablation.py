@@ -18,6 +18,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data import open_pairs
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.run_folder import claim, require_free
@@ -48,6 +49,7 @@ class Ablation:
         experiment: "ablation".
         name: of the folder in ``out`` that it writes.
         data: the pairs; every frame is measured by a fit on the others.
+        count: only the first so many of them.
         fit: of the ISP.
         seed: of the fits.
         out: folder of all runs.
@@ -56,6 +58,7 @@ class Ablation:
     experiment: str = "ablation"
     name: str = "ablation"
     data: str = "demo:train"
+    count: int | None = None
     fit: FitConfig = field(default_factory=FitConfig)
     seed: int = 0
     out: str = "runs"
@@ -63,13 +66,13 @@ class Ablation:
 
 def smoke_ablation(ablation: Ablation) -> Ablation:
     """The ablation in seconds, on the demo camera."""
-    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", fit=ablation.fit.smoke())
+    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", count=2, fit=ablation.fit.smoke())
 
 
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
     require_free(ablation, overwrite)
-    pairs = list(open_pairs(ablation.data, split="train"))
+    pairs = list(each_readable(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)

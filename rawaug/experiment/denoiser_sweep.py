@@ -23,6 +23,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.lazy import SomePairs
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.data.sample import Sample
 from rawaug.devices import find_device
 from rawaug.evaluation.page import write_figure_page
@@ -99,7 +100,7 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
         overwrite: replace another of its name.
     """
     noises, makers, data = prepared_sweep(settings, overwrite)
-    frames = [clean_middle(pair, settings.crop) for pairs in data.values() for pair in pairs]
+    frames = [clean_middle(pair, settings.crop) for spec, pairs in data.items() for pair in each_readable(pairs, spec)]
     claim(settings, overwrite)
     rows: dict[str, Any] = {}
     for name, make in makers.items():
@@ -123,13 +124,11 @@ def prepared_sweep(
     """
     require_free(settings, overwrite)
     noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
-    makers = _makers(settings)
-    opened = {spec: open_pairs(spec, split="test") for spec in settings.data}
-    return (
-        noises,
-        makers,
-        {spec: SomePairs(pairs, range(len(pairs))[: settings.count]) for spec, pairs in opened.items()},
-    )
+    makers, opened = _makers(settings), dict[str, Sequence[Pair]]()
+    for spec in settings.data:
+        pairs = open_pairs(spec, split="test")
+        opened[spec] = SomePairs(pairs, range(len(pairs))[: settings.count])
+    return noises, makers, opened
 
 
 def clean_middle(pair: Pair, crop: int | None) -> Pair:

@@ -20,6 +20,8 @@ from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
+from rawaug.data.lazy import SomePairs
+from rawaug.data.readable import each_readable
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import Score, score_denoiser
 from rawaug.isp.model import DictionaryISP
@@ -105,7 +107,9 @@ def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) 
 
 def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamScore:
     """Mean scores on the test frames; their noise is frozen with seed 0."""
-    pairs = (pair for spec in config.test for pair in open_pairs(spec, split="test")[: config.test_count])
+    opened = ((open_pairs(spec, split="test"), spec) for spec in config.test)
+    chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
+    pairs = (pair for frames, spec in chosen for pair in each_readable(frames, spec))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
     scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
     return mean_of(scores)

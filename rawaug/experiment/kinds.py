@@ -9,10 +9,16 @@ from typing import Any, NamedTuple
 from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
 from rawaug.experiment.denoising import dry_run, run
+from rawaug.experiment.learned_parts import LearnedParts, smoke_learned, weigh_parts
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import Recipe, smoke
 from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
-from rawaug.experiment.tables_rehearsed import rehearse_ablation, rehearse_comparison, rehearse_sweep
+from rawaug.experiment.tables_rehearsed import (
+    rehearse_ablation,
+    rehearse_comparison,
+    rehearse_learned,
+    rehearse_sweep,
+)
 
 
 class Kind(NamedTuple):
@@ -35,6 +41,7 @@ KINDS = {
     "training": Kind(Recipe, run, smoke, dry_run),
     "reconstruction": Kind(Comparison, compare, smoke_comparison, rehearse_comparison),
     "ablation": Kind(Ablation, ablate, smoke_ablation, rehearse_ablation),
+    "learned": Kind(LearnedParts, weigh_parts, smoke_learned, rehearse_learned),
     "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep, rehearse_sweep),
 }
 

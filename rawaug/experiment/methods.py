@@ -19,11 +19,13 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
+from rawaug.evaluation.balanced_psnr import balanced_psnr
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.files import find_weights
 from rawaug.isp import conditioning
-from rawaug.isp.baselines import BASELINES, fit_baseline
+from rawaug.isp.baselines import BASELINES, InvISP, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
+from rawaug.isp.baselines.upi import SmoothstepISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
@@ -110,10 +112,26 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
 
 
+def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
+    """InvISP's PSNR (:func:`rawaug.evaluation.balanced_psnr.balanced_psnr`) of every row that the family fills."""
+    found = settings(fitted.model, pair)
+    return {row: balanced_psnr(_maker(fitted.model, setting), pair) for row, setting in found.items()}
+
+
 @singledispatch
 def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
     """Row to the camera setting that it is made with; a method that knows nothing of settings has one row."""
     return {"blind": None}
+
+
+@settings.register
+def _(model: SmoothstepISP, pair: Pair) -> dict[str, Any]:
+    return {"blind": None} | ({"as-shot": model.balanced(pair.white_balance)} if pair.balance_known else {})
+
+
+@settings.register
+def _(model: InvISP, pair: Pair) -> dict[str, Any]:
+    return {"blind": None} | ({"as-shot": pair.white_balance} if pair.balance_known else {})
 
 
 @singledispatch
@@ -126,7 +144,8 @@ def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
 
 @_block_rows.register
 def _(model: DictionaryISP, pair: Pair) -> dict[str, float]:
-    return {"blind": psnr_r(model, pair), "as-shot": psnr_r(model, pair, white_balance=True)}
+    rows = {"blind": psnr_r(model, pair)}
+    return rows | ({"as-shot": psnr_r(model, pair, white_balance=True)} if pair.balance_known else {})
 
 
 def _maker(model: ReverseISP, setting: Any) -> Maker:
@@ -138,9 +157,10 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     """The camera settings of the dictionary's rows for a frame."""
     with torch.no_grad():
         blind = isp.choose(pair.srgb[None])
+        as_shot = conditioning.with_white_balance(isp, blind, pair.white_balance, None)
         return {
             "blind": blind,
-            "as-shot": conditioning.with_white_balance(isp, blind, pair.white_balance, None),
+            **({"as-shot": as_shot} if pair.balance_known else {}),
             "samples": _from_samples(isp, pair, blind),
             "oracle": _oracle(isp, pair),
         }

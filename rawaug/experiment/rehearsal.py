@@ -16,8 +16,8 @@ from torch.utils.data import default_collate
 
 from denoisers.network import Denoiser
 from rawaug.commands.fit import fit
-from rawaug.data.lazy import read_within
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.evaluation.scores import classical_method, installed_classical, network_method, score_method
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
@@ -50,7 +50,9 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
         for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage"):
             import_module(name)
     parts = {"train": plan.pairs, "validate": plan.validation, "test": plan.test}
-    pairs, validation, test = (read_within(READ_SECONDS, frames) for frames in parts.values())
+    pairs, validation, test = (
+        list(each_readable(frames, f"the frames to {what}", READ_SECONDS)) for what, frames in parts.items()
+    )
     read = (
         f"{what} {len(found)} of {len(parts[what])}"
         for what, found in zip(parts, (pairs, validation, test), strict=True)

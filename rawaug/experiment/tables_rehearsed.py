@@ -1,4 +1,4 @@
-"""Comparisons, ablations and sweeps rehearsed on their own data in seconds, for ``--dry-run``.
+"""Experiments that end in a table, rehearsed on their own data in seconds, for ``--dry-run``.
 
 Frames are read as long as :data:`rawaug.experiment.rehearsal.READ_SECONDS` allow; every method is fitted in its
 shortest form to the middle of the first ones, and scored. Nothing is written to the run's folder.
@@ -14,17 +14,20 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data import open_pairs
-from rawaug.data.lazy import read_within
+from rawaug.data import open_pairs, open_pictures
+from rawaug.data.demo.demo_pairs import FRAME
 from rawaug.data.pair import Pair
+from rawaug.data.readable import each_readable
 from rawaug.experiment import rehearsal
 from rawaug.experiment.ablation import Ablation, measure
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, clean_middle, prepared_sweep, scored
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
+from rawaug.experiment.learned_parts import LearnedParts, photographs, variant_scores
 from rawaug.experiment.methods import Fitted, cycle_psnr, fit_family, score_rows
 from rawaug.experiment.plan import used
 from rawaug.experiment.reconstruction import Comparison, PreparedComparison
 from rawaug.experiment.run_folder import require_free, run_folder
+from rawaug.experiment.varied_frames import varied_frames
 
 FITTED = 2
 """Frames that the methods are fitted to."""
@@ -81,11 +84,32 @@ def rehearse_ablation(ablation: Ablation, overwrite: bool = False) -> None:
     _say({"data": used(frames, len(frames), ablation.data)})
     if len(frames) < 2:
         raise ValueError(f"data: {ablation.data} has {len(frames)} frame; leave-one-out needs two or more")
-    pairs = read_within(rehearsal.READ_SECONDS, frames, least=2)
+    pairs = list(each_readable(frames, "data", rehearsal.READ_SECONDS, least=2))
     left_out, *others = (_small(pair) for pair in pairs[: 1 + FITTED])
     measure(others, left_out, replace(ablation.fit.smoke(), seed=ablation.seed))
     print(f"tried: every stage left out once; frames read: {len(pairs)} of {len(frames)}")
     _nothing_written(ablation)
+
+
+def rehearse_learned(learned: LearnedParts, overwrite: bool = False) -> None:
+    """Try every variant on a few frames of the first seed; all its photographs are read.
+
+    Raises:
+        OSError, ValueError: for the first thing that would fail.
+    """
+    require_free(learned, overwrite)
+    pictures = open_pictures(learned.pictures, min_side=min(FRAME))
+    chosen = photographs(pictures, learned, learned.seed)
+    used_now = f"{len(chosen)} of {len(pictures)} of {learned.pictures}, for each of {learned.seeds} seeds"
+    _say({"pictures": used_now, "cameras": ", ".join(learned.cameras), "variants": ", ".join(learned.variants)})
+    frames = varied_frames(chosen[:FITTED], learned.cameras, learned.seed, "train")
+    left_out = varied_frames(chosen[learned.frames :][:1], learned.cameras, learned.seed, "left-out")
+    with TemporaryDirectory() as folder:
+        for k, changes in enumerate(learned.variants.values()):
+            config = replace(replace(learned.fit, **changes).smoke(), joint_steps=0, seed=learned.seed)
+            variant_scores(Path(folder) / f"{k}.json", config, frames, left_out)
+    print(f"tried: every variant on {len(frames)} frames")
+    _nothing_written(learned)
 
 
 def rehearse_sweep(settings: DenoiserSweep, overwrite: bool = False) -> None:

@@ -11,16 +11,14 @@ solved for in turn.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA
-from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, ToneDictionary
+from rawaug.isp.dictionary import CameraDictionary, ToneDictionary
 from rawaug.isp.hull import nearest_in_hull
 from rawaug.isp.setting import ISPParams
+from rawaug.isp.staged import StagedISP
 from rawaug.kernels.raw_torch import through_curves
 
 CLIPPED = 0.98
@@ -31,22 +29,8 @@ PULL = 1e-4
 """Of the typical weights, against the readings' mean square."""
 
 
-class Camera(Protocol):
-    """What is used of an ISP: its pattern, its colour atoms and its reverse pass."""
-
-    colour: ColourDictionary
-
-    @property
-    def tone(self) -> ToneDictionary | None: ...
-
-    @property
-    def cfa(self) -> CFA: ...
-
-    def reverse_pixels(self, x: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor: ...
-
-
 def with_white_balance(
-    isp: Camera,
+    isp: StagedISP,
     params: ISPParams,
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
@@ -85,14 +69,14 @@ def _require_factor(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
 
 
-def _in_light(isp: Camera, params: ISPParams, balance: Tensor) -> ISPParams:
+def _in_light(isp: StagedISP, params: ISPParams, balance: Tensor) -> ISPParams:
     weights = isp.colour.weights_for(balance)
     return params._replace(
         colour_weights=weights, matrix=isp.colour.combine(weights), gains=isp.colour.gains_for(balance, weights)
     )
 
 
-def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
+def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
     """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
 
     Readings at or above 0.98 are left out (clipped); a channel without any reading keeps its gain.
@@ -168,7 +152,7 @@ def _require_places(raw_samples: Tensor, x: Tensor) -> None:
         raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
-def _solve(isp: Camera, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
+def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
     unit = params._replace(gains=torch.ones_like(params.gains))
     x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
     y = value[:, None].expand_as(x5)

@@ -126,8 +126,8 @@ def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gain
     """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``."""
     generator = keyed_generator(key)
     camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (LIGHTS,), generator=generator)]
-    balance = white_balance(camera, sample_lights(LIGHTS, generator))
-    balance = balance[plausible(balance)]
+    balance = white_balance(camera, torch.from_numpy(sample_lights(LIGHTS, generator)))
+    balance = balance[torch.from_numpy(plausible(balance.numpy()))]
     return balance.amin(dim=1, keepdim=True) / balance
 
 

@@ -38,7 +38,7 @@ class TrainConfig:
         crop: side of the mosaic crops in pixels.
         learning_rate: peak learning rate of Adam.
         warmup: steps of linear warm-up.
-        schedule: of the learning rate after the warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
+        schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
         halve_every: steps between halvings.
         loss: l1, l2 or charbonnier, or {name, settings}.
         weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.

@@ -30,7 +30,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import SMALL, ISPConfig
 from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
 from rawaug.isp.fit.colour_fit import FrameColour, Tie, fall_off, least_squares
-from rawaug.isp.fit.descent import Descent
+from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent
 from rawaug.isp.fit.encoders import train_encoders
 from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.joint import train_jointly
@@ -59,6 +59,8 @@ def fit_isp(
     progress: bool = True,
     state: str | Path | None = None,
     report: Callable[[DictionaryISP], str] | None = None,
+    report_steps: int = REPORT_STEPS,
+    save_seconds: float = SAVE_SECONDS,
 ) -> DictionaryISP:
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
@@ -67,7 +69,10 @@ def fit_isp(
         config: settings; see :class:`FitConfig`.
         progress: show progress bars.
         state: file with the state of the fit, to resume it; removed at the end.
-        report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
+        report: called with the ISP as it would be now, every ``report_steps`` steps of stage 2; its text goes to the
+            progress bar.
+        report_steps: of every stage.
+        save_seconds: between two writes of ``state``.
 
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
@@ -75,7 +80,9 @@ def fit_isp(
     config = config or FitConfig()
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
-    fit = _Fit(samples, shots, config, Descent(_path(state), _key(config, samples, shots), config.seed, progress))
+    key = _key(config, samples, shots)
+    descent = Descent(_path(state), key, config.seed, progress, report_steps, save_seconds)
+    fit = _Fit(samples, shots, config, descent)
 
     def refit(frames: Sequence[int], part: str) -> DictionaryISP:
         index = torch.tensor(frames)
@@ -251,7 +258,7 @@ class _Fit:
         """Stage 3."""
         set_knee(isp, self.colour, self.samples)
         set_atoms(isp, self.colour, self.shots, self.config)
-        set_priors(isp, self.samples)
+        set_priors(isp, self.samples, self.config)
 
     def snapshot(self) -> DictionaryISP:
         """The ISP as it would be if stage 2 ended now."""
@@ -273,7 +280,7 @@ class _Fit:
             params, back = self.colour.pick(frames).params(), dict[str, Tensor]()
             with torch.no_grad():
                 back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
-            return cycle_error(isp, part, params, back, self.config.noisy)
+            return cycle_error(isp, part, params, back, self.config)
 
         self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 

@@ -202,3 +202,26 @@ def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
     assert "cfa" in line and "demo:" in line
     with pytest.raises(ValueError, match="cfa can only be given for pairs:PATH; each Pair has its own"):
         rawaug.fit(rawaug.data.demo_pairs("train", count=1), cfa="GRBG")
+
+
+def test_frames_that_cannot_be_read_are_named_and_the_rest_is_fitted(
+    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shoot("shots/a.dng"), shoot("shots/c.dng"), shoot("seen/d.dng")
+    (tmp_path / "shots" / "b.dng").write_bytes((tmp_path / "shots" / "a.dng").read_bytes()[:400])
+    (tmp_path / "seen" / "e.dng").write_bytes(b"damaged")
+    isp = fit(tmp_path / "x.safetensors", tmp_path / "shots", "--held-out", tmp_path / "seen")
+    assert isp.info["frames"] == ["a", "c"] and len(isp.info["held_out"]) >= 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "left out of the fit: 1 of 3 frames, unreadable" and "b.dng" in said[1]
+    assert said[2] == "left out of held-out frames: 1 of 2 frames, unreadable" and "e.dng" in said[3]
+    assert said[4].startswith("fitted 2 frames")
+    whole = fit(tmp_path / "y.safetensors", tmp_path / "shots" / "a.dng", tmp_path / "shots" / "c.dng")
+    assert same(isp, whole) and "unreadable" not in whole.info
+
+
+@pytest.mark.parametrize("noise", ["off", "on"])
+def test_a_fit_needs_one_frame_that_can_be_read(noise: str, tmp_path: Path, shoot: Shoot) -> None:
+    shoot("shots/a.dng").write_bytes(b"damaged")
+    with pytest.raises(ValueError, match=r"none of .*1 frames can be read; .*a\.dng"):
+        rawaug.fit(tmp_path / "shots", progress=False, noise=noise, **SETTINGS)  # type: ignore[arg-type]

@@ -141,5 +141,5 @@ def test_one_frame_leaves_none_to_fit(given: list[Pair], frame_of: FrameOf) -> N
 
 def test_the_smoke_form_keeps_what_is_fitted() -> None:
     quick = smoke_ablation(Ablation(name="a", fit=FitConfig(atoms=3, shading="on"), seed=7))
-    assert (quick.name, quick.data, quick.seed) == ("a-smoke", "demo:validation", 7)
+    assert (quick.name, quick.data, quick.count, quick.seed) == ("a-smoke", "demo:validation", 2, 7)
     assert quick.fit == FitConfig(atoms=3, shading="on", steps=2, curve_steps=10, pixels=512, batch=128)
