@@ -43,6 +43,7 @@ class EncoderTraining:
 
 _LATER = {
     "curve_steps": None,
+    "tone": "learned",
     "intermediate": 0.1,
     "consistency": 1.0,
     "prior_steps": 400,
@@ -68,11 +69,14 @@ class FitConfig:
         learning_rate: initial learning rate of Adam, with cosine decay to 0.
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
+        tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
+            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
+            as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
-        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
+        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
         encoder_training: how that is done.
-        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; None is 150.
         prior_steps: steps of the descent on the constant weights.
@@ -93,6 +97,7 @@ class FitConfig:
     batch: int = 4096
     learning_rate: float = 2e-3
     shading: Literal["auto", "on", "off"] = "auto"
+    tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
     encoder_training: EncoderTraining = field(default_factory=EncoderTraining)

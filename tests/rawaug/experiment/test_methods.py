@@ -14,7 +14,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
-from rawaug.experiment import methods
+from rawaug.experiment import methods, oracle
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -61,7 +61,7 @@ def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, flo
 @pytest.fixture
 def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(oracle, "STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
