@@ -62,7 +62,7 @@ def _dispatch(argv: list[str]) -> int:
         from rawaug.experiment.recipe import recipe_list
 
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
-        print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
+        print("rawaug run RECIPE --help explains its keys; --dry-run rehearses it on your data.")
         return 0
     argv, kind, recipe = _recipe_of(argv)
     names = [*OWN, *listed()]
@@ -148,7 +148,7 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
             else:
                 add_arguments(leaf, command(name))
         if "--quiet" not in leaf._option_string_actions:  # a command may have its own
-            leaf.add_argument("--quiet", action="store_true", help="print no progress")
+            leaf.add_argument("--quiet", action="store_true", help="do not print progress")
         spell_with_hyphens(leaf)
     return parser, leaves
 
@@ -158,7 +158,11 @@ def _add_run_arguments(run: Any, kind: str) -> None:
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
+    run.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="show which data would be used and rehearse the run in seconds, without writing",
+    )
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
 
@@ -175,12 +179,10 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
-    if not dry:
-        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
-    elif experiment.dry_run is None:
-        raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
-    else:
+    if dry:
         experiment.dry_run(recipe, overwrite)
+    else:
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
 
 
 def _one_line(error: Exception) -> str:

@@ -79,15 +79,11 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
     for left_out in progress(pairs, label="ablation", unit="frame"):
-        others = [pair for pair in pairs if pair is not left_out]
-        isp = fit_isp(others, config, progress=False)
-        for given, curves in stagewise.items():
-            curves.append(stage_psnr(isp, left_out, given != "blind"))
-        without["none"].append(psnr_r(isp, left_out, white_balance=True))
-        for stage in LEFT_OUT:
-            kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
-            lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
-            without[stage].append(psnr_r(lacking, left_out, white_balance=stage != "gains"))
+        curves, values = measure([pair for pair in pairs if pair is not left_out], left_out, config)
+        for given, curve in curves.items():
+            stagewise[given].append(curve)
+        for stage, value in values.items():
+            without[stage].append(value)
     means = {given: torch.tensor(curves).mean(0).tolist() for given, curves in stagewise.items()}
     result = {"settings": asdict(ablation), "stages": means, "without": {k: _mean(v) for k, v in without.items()}}
     write_json(result, folder / "ablation.json")
@@ -97,6 +93,20 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     _print(result)
     print(f"picture: {picture}")
     return result
+
+
+def measure(
+    others: Sequence[Pair], left_out: Pair, config: FitConfig
+) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
+    """One frame, by fits on the others: PSNR after each stage, and PSNR_r without a stage."""
+    isp = fit_isp(others, config, progress=False)
+    curves = {given: stage_psnr(isp, left_out, given != "blind") for given in ("blind", "as-shot gains")}
+    without = {"none": psnr_r(isp, left_out, white_balance=True)}
+    for stage in LEFT_OUT:
+        kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
+        lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
+        without[stage] = psnr_r(lacking, left_out, white_balance=stage != "gains")
+    return curves, without
 
 
 @torch.no_grad()

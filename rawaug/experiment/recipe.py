@@ -91,7 +91,7 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        alpha, correct, gamma: settings of the estimator, deprecated; older recipes set them here.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
             for each value, and the results name the best.
         candidate_of: of such an arm: whose it is.
@@ -164,7 +164,7 @@ class Recipe:
         name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
+        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
         noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -174,7 +174,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
         views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        untouched: trained denoisers to compare with, unchanged: names of shipped ones, or files.
         self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.

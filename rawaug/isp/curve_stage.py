@@ -36,7 +36,7 @@ class ToneCurve(Stage):
         super().__init__(config)
         if config.tone_atoms < 1 or {"tone", "gamma"} & set(config.stages):
             raise ValueError(
-                f"stages: 'curve' takes tone_atoms, at least 1, and stands in place of tone and gamma; got "
+                f"stages: 'curve' takes tone_atoms, at least 1, and replaces tone and gamma; got "
                 f"{config.tone_atoms} and {' '.join(config.stages)}"
             )
         self.dictionary = ToneDictionary(config.tone_atoms)

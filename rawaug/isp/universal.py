@@ -101,7 +101,7 @@ def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
         1
     """
     if not isinstance(isp.colour, CameraDictionary):
-        raise ValueError("a camera is taken by name for an ISP of published cameras, such as universal")
+        raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
     listed = published_cameras()
     known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
     narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))

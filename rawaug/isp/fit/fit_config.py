@@ -73,10 +73,10 @@ class FitConfig:
             G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
             as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
-        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them from a dozen frames upwards
+        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
         encoder_training: how that is done.
-        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 from 50 frames upwards,
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; None is 150.
         prior_steps: steps of the descent on the constant weights.
@@ -122,7 +122,8 @@ class FitConfig:
 
     def smoke(self) -> FitConfig:
         """In a second."""
-        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128)
+        few = replace(self.encoder_training, steps=4)
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
 
     def __post_init__(self) -> None:
         for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():

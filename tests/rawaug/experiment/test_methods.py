@@ -38,7 +38,7 @@ DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 
 def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
-    frame = frame_of("one")
+    frame = frame_of("one", size=(64, 96))
     universal = DictionaryISP.from_pretrained("universal-small")
     universal.save(tmp_path / "own.safetensors")
     for name in ("universal-small", str(tmp_path / "own.safetensors")):
@@ -100,7 +100,7 @@ def made(model: Any, pair: Pair, light: tuple[float, float, float]) -> torch.Ten
 def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
     known_camera: DictionaryISP, frame_of: FrameOf
 ) -> None:
-    rows = rows_of(known_camera, frame_of("lamps", LAMPS))
+    rows = rows_of(known_camera, frame_of("lamps", LAMPS, size=(64, 96)))
     assert rows["blind"] < 32.0
     assert rows["as-shot"] > 75.0 and rows["samples"] > 60.0  # what was given is exact, or 64 readings of 12 bits
     assert rows["oracle"] > rows["blind"] + 20.0  # the light is one of the atoms

@@ -118,7 +118,7 @@ def test_a_single_pair_is_trained_on_and_nothing_is_held_out(data: DataConfig) -
     recipe = Recipe(arms=ARMS, data=data)
     plan = plan_of(recipe, pairs=demo_pairs("train", count=1))
     assert len(plan.pairs) == 1 and not plan.validation
-    assert "last weights are kept" in plan.lines(recipe)[1]
+    assert "final weights are kept" in plan.lines(recipe)[1]
 
 
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
