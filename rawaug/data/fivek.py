@@ -68,12 +68,12 @@ def fivek_pairs(
     return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
-AS_INVISP = {"adjust_maximum_thr": 0.75, "jpeg_quality": 90}
-"""How InvISP's published script makes the pictures."""
+_as_invisp = partial(fivek_pairs, adjust_maximum_thr=0.75, jpeg_quality=90)
+"""As its published script makes the pictures."""
 
 for _camera in CAMERAS:
     DATASETS.register(f"fivek_{_camera}")(partial(fivek_pairs, cameras=[_camera]))
-    DATASETS.register(f"invisp_{_camera}")(partial(fivek_pairs, cameras=[_camera], **AS_INVISP))
+    DATASETS.register(f"invisp_{_camera}")(partial(_as_invisp, cameras=[_camera]))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:

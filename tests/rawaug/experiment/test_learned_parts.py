@@ -56,7 +56,13 @@ def folder(tmp_path: Path) -> Path:
 
 
 def settings(folder: Path, **changes: Any) -> LearnedParts:
-    given = {"pictures": str(folder / "pictures"), "frames": 4, "left_out": 2, "fit": TINY, "variants": VARIANTS}
+    given: dict[str, Any] = {
+        "pictures": str(folder / "pictures"),
+        "frames": 4,
+        "left_out": 2,
+        "fit": TINY,
+        "variants": VARIANTS,
+    }
     return LearnedParts(**{**given, "seeds": 2, "out": str(folder), **changes})
 
 
