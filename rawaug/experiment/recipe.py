@@ -34,6 +34,8 @@ class DataConfig(PairSettings):
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
+        max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
+        read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
             and keeps the final weights.
@@ -47,12 +49,18 @@ class DataConfig(PairSettings):
     select: str | list[str] = "first"
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
+    max_pixels: int | None = None
+    read_seconds: float | None = None
     validation: str | None = "demo:validation"
     validation_crop: int | None = None
     test: str = "demo:test"
     test_count: int | None = None
 
     def __post_init__(self) -> None:
+        if self.max_pixels is not None:
+            require_between("data.max_pixels", self.max_pixels, 4, 2**40)
+        if self.read_seconds is not None:
+            require_between("data.read_seconds", self.read_seconds, 0.0, 1e6)
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
         if self.pictures == OWN_PICTURES and self.pairs is None:
@@ -83,7 +91,7 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        alpha, correct, gamma: settings of the estimator, deprecated; older recipes set them here.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
             for each value, and the results name the best.
         candidate_of: of such an arm: whose it is.
@@ -156,7 +164,7 @@ class Recipe:
         name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
+        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
         noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -166,7 +174,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
         views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        untouched: trained denoisers to compare with, unchanged: names of shipped ones, or files.
         self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.

@@ -9,7 +9,9 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 from __future__ import annotations
 
 import json
+import math
 import statistics
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable, each_readable
 from rawaug.data.select import selected
 from rawaug.evaluation.altered import ALTERED
 from rawaug.evaluation.scores import frozen_sample
@@ -146,23 +149,33 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
-    require_free(comparison, overwrite)
-    if comparison.downstream is not None:
-        require_precision(comparison.downstream.train.precision)
-    comparing = _Comparison(comparison)
+    prepared = PreparedComparison(comparison, overwrite)
     claim(comparison, overwrite)
-    return comparing.table()
+    return prepared.table()
 
 
-class _Comparison:
-    def __init__(self, settings: Comparison) -> None:
+class PreparedComparison:
+    """A comparison whose data are open and checked; nothing is written yet.
+
+    Args:
+        settings: of the comparison.
+        overwrite: it may replace another of its name.
+        seconds: for reading the frames that are fitted; what then remains unread is left out.
+    """
+
+    def __init__(self, settings: Comparison, overwrite: bool = False, seconds: float = math.inf) -> None:
+        require_free(settings, overwrite)
+        if settings.downstream is not None:
+            require_precision(settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
-        self.pairs = [found[k] for k in selected(found, len(found), settings.count, settings.select)]
+        self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+        self.available = len(found)
+        self.pairs = list(each_readable(self.chosen, "data", seconds, least=2))
+        if len(self.pairs) < 2 and not settings.test:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         if settings.test:
             self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
-        elif len(self.pairs) < 2:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
@@ -172,13 +185,15 @@ class _Comparison:
             noise = noise_model(settings.noise)
             self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        names = [pair.name for pair in self.pairs]
+        names = names_of(self.chosen)
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
         self.scored: Sequence[Pair] = self.pairs
         if settings.test:
             test = open_pairs(settings.test, split="test")
-            self.scored = SomePairs(test, range(len(test))[: settings.test_count])
+            tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+            deque(each_readable(tested, "test", seconds), maxlen=0)
+            self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")
         if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from rawaug.isp.cameras import XYZ_TO_SRGB
 from rawaug.isp.dictionary import CameraDictionary, sparse_shares, sparse_weights
-from rawaug.isp.light import COLDEST, LAMP_SHARE, WARMEST, Array, sample_lights
+from rawaug.isp.light import Array, LightRange, sample_lights
 from rawaug.isp.setting import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
@@ -31,6 +31,7 @@ EXPOSURE = (-1.0, 0.2)
 CAMERAS_MIXED = 2
 TONES_MIXED = 3
 _ROUNDS = 100
+_ALL_LIGHTS = LightRange()
 
 
 class CameraSampler:
@@ -40,8 +41,7 @@ class CameraSampler:
         cameras: the atoms of colour.
         tone_atoms: number of tone curves; 0 where the tone is learned.
         cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
-        kelvin: lowest and highest colour temperature of the light.
-        lamps: share of fluorescent and LED lamps.
+        lights: what the light is drawn from.
         consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
             and gains are drawn one by one.
 
@@ -55,8 +55,7 @@ class CameraSampler:
         tone_atoms: int,
         cameras_mixed: int = CAMERAS_MIXED,
         tones_mixed: int = TONES_MIXED,
-        kelvin: tuple[float, float] = (WARMEST, COLDEST),
-        lamps: float = LAMP_SHARE,
+        lights: LightRange = _ALL_LIGHTS,
         consistent: bool = True,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
@@ -66,7 +65,7 @@ class CameraSampler:
             for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
         )
         self.tone_atoms, self.cameras_mixed, self.tones_mixed = tone_atoms, cameras_mixed, tones_mixed
-        self.kelvin, self.lamps, self.consistent = kelvin, lamps, consistent
+        self.lights, self.consistent = lights, consistent
 
     def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
         """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light.
@@ -94,13 +93,13 @@ class CameraSampler:
         for _ in range(_ROUNDS):
             chosen, shares = sparse_shares(len(open_), len(self.known), self.cameras_mixed, generator)
             drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
-            light = sample_lights(len(open_), generator, self.kelvin, self.lamps)
+            light = sample_lights(len(open_), generator, *self.lights)
             weights[open_], balance[open_] = drawn, self.balance(drawn, light)
             open_ = open_[~plausible(balance[open_])]
             if not len(open_):
                 return weights, balance
         raise ValueError(
-            f"no light at {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
+            f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; take other lights"
         )
 
     def balance(self, weights: Array, light: Array) -> Array:

@@ -16,10 +16,14 @@ All of this is for a few numbers a batch, on the CPU: in NumPy, whose calls cost
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from rawaug.registry import nearest
 
 Array = NDArray[np.float64]
 
@@ -36,6 +40,8 @@ LAMPS: dict[str, tuple[float, float]] = {
 LED-V1 is the chromaticity of its tabulated spectrum; the (0.4560, 0.4548) that is widely quoted is not.
 """
 
+_LAMPS = np.array(list(LAMPS.values()))
+
 D65 = (0.31271, 0.32902)
 
 COLDEST, WARMEST = 10_000.0, 2_000.0
@@ -45,6 +51,42 @@ DAYLIGHT_FROM = 4_000.0
 LAMP_SHARE = 0.1
 DUV_SPREAD = 0.003
 """Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
+
+
+class LightRange(NamedTuple):
+    """What lights are drawn from, as the arguments of :func:`sample_lights`.
+
+    Args:
+        kelvin: lowest and highest colour temperature.
+        lamps: share of electric lamps.
+        among: chromaticities ``(N, 2)`` of these lamps.
+    """
+
+    kelvin: tuple[float, float] = (WARMEST, COLDEST)
+    lamps: float = LAMP_SHARE
+    among: Array = _LAMPS
+
+
+def light_range(light: float | str | None) -> LightRange:
+    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default.
+
+    Raises:
+        ValueError: if there is no such lamp, or the temperature is outside 2,000 to 10,000 K.
+
+    Example:
+        >>> light_range(5500).kelvin
+        (5500.0, 5500.0)
+    """
+    if light is None:
+        return LightRange()
+    if isinstance(light, str):
+        if light not in LAMPS:
+            listed, near = ", ".join(LAMPS), nearest(light, LAMPS)
+            raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
+        return LightRange(lamps=1.0, among=np.array([LAMPS[light]]))
+    if not WARMEST <= light <= COLDEST:
+        raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
+    return LightRange((float(light), float(light)), lamps=0.0)
 
 
 def planckian(kelvin: Array) -> Array:
@@ -79,18 +121,23 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
 
 
 def sample_lights(
-    batch: int, generator: torch.Generator, kelvin: tuple[float, float] = (WARMEST, COLDEST), lamps: float = LAMP_SHARE
+    batch: int,
+    generator: torch.Generator,
+    kelvin: tuple[float, float] = (WARMEST, COLDEST),
+    lamps: float = LAMP_SHARE,
+    among: Array = _LAMPS,
 ) -> Array:
     """White points ``(batch, 3)``, XYZ with Y = 1.
 
     Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
-    :data:`LAMPS` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
+    ``among`` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
 
     Args:
         batch: number of lights.
         generator: on the CPU.
         kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
         lamps: share of fluorescent and LED lamps, in [0, 1].
+        among: chromaticities ``(N, 2)`` of the lamps that are drawn from, each as often as the others.
 
     Raises:
         ValueError: if a limit is outside its range.
@@ -102,7 +149,7 @@ def sample_lights(
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
     by_day = (drawn[:, 1] < 0.5) & (temperature >= DAYLIGHT_FROM)
     xy = np.where(by_day[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
-    lamp = _LAMPS[(drawn[:, 3] * len(LAMPS)).astype(np.int64)]
+    lamp = among[(drawn[:, 3] * len(among)).astype(np.int64)]
     return _white_point(off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
 
 
@@ -138,4 +185,3 @@ _PLANCKIAN = np.array(
 """Coefficients of 1, T and T^2: numerators of u and v, then their denominators."""
 _DAYLIGHT = np.array([[0.244063, 0.237040], [0.09911, 0.24748], [2.9678, 1.9018], [-4.6070, -2.0064]])
 """Coefficients of the powers of 1000 / T in x: up to 7,000 K, and above."""
-_LAMPS = np.array(list(LAMPS.values()))

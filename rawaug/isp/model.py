@@ -20,6 +20,7 @@ from rawaug.isp.camera_sampling import CameraSampler
 from rawaug.isp.dictionary import CameraDictionary, convex_weights
 from rawaug.isp.encoder import thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.light import light_range
 from rawaug.isp.setting import ISPParams, ISPResult
 from rawaug.isp.staged import StagedISP
 
@@ -64,11 +65,16 @@ class DictionaryISP(StagedISP):
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
 
-    def camera_sampler(self, consistent: bool = True) -> CameraSampler | None:
-        """What draws settings where the atoms are published cameras, as these are now; else None."""
+    def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
+        """What draws settings where the atoms are published cameras, as these are now; else None.
+
+        ``light`` is a colour temperature in kelvin or the name of a lamp (:data:`rawaug.isp.light.LAMPS`); any light by
+        default.
+        """
         if not isinstance(self.colour, CameraDictionary):
             return None
-        return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent)
+        lights = light_range(light)
+        return CameraSampler(self.colour, self.config.tone_atoms, lights=lights, consistent=consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
