@@ -21,6 +21,8 @@ COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
 _ATOMS = 60
 """As many colour atoms are drawn, at most."""
 _BINS = 24
+_MOST = 2**17
+"""Values of a colour."""
 _FEWEST = 50
 """Values in a bin of the signal, for its variance to mean something."""
 
@@ -110,10 +112,11 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 
 def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
-    """Values of red, green and blue sites, each ``(N,)``."""
+    """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
     mosaic = drawn.augment.mosaic(raw)[0]
-    channels = pattern(drawn.augment.cfa).channels(*mosaic.shape)
-    return [mosaic[channels == index] for index in range(3)]
+    planes = pattern(drawn.augment.cfa).planes(*mosaic.shape) > 0
+    values = (mosaic[plane] for plane in planes)
+    return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
 
 
 def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
