@@ -1,4 +1,7 @@
-"""What a worker of benchmarks/fuzz.py does: read a file by every reader of its kind, and say what became of it."""
+"""What a worker of benchmarks/fuzz.py does: read a file by every reader of its kind, and say what became of it.
+
+On request the commands (benchmarks/commands.py) read it too.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,11 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
+
+from benchmarks.commands import run_all
 
 
 def readers(kind: str, path: Path) -> list[Callable[[], object]]:
@@ -62,13 +69,12 @@ def _set_up(path: Path) -> None:
     import torch
     from jsonargparse import ArgumentError
 
-    from rawaug.cli import _parser
     from rawaug.experiment.kinds import KINDS, kind_of
     from rawaug.experiment.recipe import Recipe
     from rawaug.training.start import first_network
 
     try:
-        kind, parser = KINDS[kind_of(path)], _parser(kind_of(path), ["run"])[0]
+        kind, parser = KINDS[kind_of(path)], _run_parser(kind_of(path))
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
         recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
         if isinstance(recipe, Recipe):
@@ -77,6 +83,14 @@ def _set_up(path: Path) -> None:
                     first_network(recipe.network_of(arm), seed=0)
     except (ArgumentError, ValueError) as error:  # the command line has named the file already
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+@cache
+def _run_parser(kind: str) -> Any:
+    """Built once: it takes longer than to read a recipe."""
+    from rawaug.cli import _parser
+
+    return _parser(kind, ["run"])[0]
 
 
 def attempt(kind: str, path: Path) -> tuple[str, str]:
@@ -111,8 +125,11 @@ def work() -> None:
         attempt(kind, Path("none"))
     print("[]", file=answers, flush=True)
     for line in sys.stdin:
-        kind, name = json.loads(line)
+        kind, name, by_commands = json.loads(line)
         outcome, why = attempt(kind, Path(name))
+        if by_commands and outcome != "fault":
+            said = run_all(kind, Path(name))
+            outcome, why = said if said[0] == "fault" or outcome == "read" else (outcome, why)
         print(json.dumps([outcome, why]), file=answers, flush=True)
 
 

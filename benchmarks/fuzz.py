@@ -1,15 +1,17 @@
 """How the readers handle damaged files: each must be read, or refused in one line that names it.
 
-    python -m benchmarks.fuzz [--cases 5000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
+    python -m benchmarks.fuzz [--cases 10000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER]
+                              [--journal FILE] [--json FILE]
 
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
 repository, has them. Half of the mutations know the structure of the file (benchmarks/mutations.py); the others flip
 bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmarks/damage.py); all are keyed by (seed,
-kind, number). A worker process reads one after the other, and is restarted when a decoder takes it down. Counted are
-files that were read; that were refused as documented (ValueError or OSError of one line with the file's name); that
-crashed a decoder, by its name, which the package contains (:mod:`rawaug.io.apart`); and what must not be: other
-exceptions and numbers that are not finite, more than 10 s of a processor, more than 2 GiB. ``--keep`` keeps all files
-but those of the first two columns. Exit status 1 if there is any of the last three.
+kind, number). A worker process reads one after the other, every eighth by the commands too (benchmarks/commands.py),
+and is restarted when a decoder takes it down. Counted are files that were read; that were refused as documented
+(ValueError or OSError of one line with the file's name); that crashed a decoder, by its name, which the package
+contains (:mod:`rawaug.io.apart`); and what must not be: other exceptions and numbers that are not finite, more than
+10 s of a processor (60 with commands), more than 2 GiB. Exit status 1 if there is any of the last three. ``--keep``
+keeps all files but those of the first two columns; a run with ``--journal`` that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,7 +28,7 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,6 +52,9 @@ DECODERS = {
 }
 """What reads each kind for us."""
 
+BY_COMMANDS, COMMANDS_COST = 8, 6
+"""Of so many files one is read by the commands as well, and then has so many times the seconds."""
+
 OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]
 
@@ -60,14 +66,15 @@ class Worker:
         self.log, self.seconds = folder / "stderr.txt", seconds
         self.process: subprocess.Popen[str] | None = None
 
-    def read(self, kind: str, path: Path) -> tuple[str, str]:
-        """What became of a file: one of OUTCOMES, and why."""
+    def read(self, kind: str, path: Path, by_commands: bool = False) -> tuple[str, str]:
+        """What became of a file, read by readers alone or by commands too: one of OUTCOMES, and why."""
         process = self.process or self._start()
         assert process.stdin is not None and process.stdout is not None
         _forget_peak(process.pid)
-        process.stdin.write(json.dumps([kind, str(path)]) + "\n")
+        process.stdin.write(json.dumps([kind, str(path), by_commands]) + "\n")
         process.stdin.flush()
-        end, busy = time.monotonic() + self.seconds, _processor_seconds(process.pid) + SECONDS
+        allowed = SECONDS * (COMMANDS_COST if by_commands else 1)
+        end, busy = time.monotonic() + self.seconds, _processor_seconds(process.pid) + allowed
         answered = False
         while not answered and time.monotonic() < end and _processor_seconds(process.pid) < busy:
             if _peak_mebibytes(process.pid) >= MEBIBYTES:
@@ -82,7 +89,7 @@ class Worker:
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
-            return "hung", f"more than {SECONDS:g} s of a processor, or {self.seconds:g} s in all"
+            return "hung", f"more than {allowed:g} s of a processor, or {self.seconds:g} s in all"
         name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
@@ -153,7 +160,35 @@ def _innermost(log: Path) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str, Any]:
+class Case(NamedTuple):
+    """One mutated file and what became of it."""
+
+    seed: int
+    kind: str
+    number: int
+    outcome: str
+    why: str
+    seconds: float
+
+
+class Journal:
+    """The cases that were read so far, in a file with one line of JSON each, so that a stopped run goes on."""
+
+    def __init__(self, path: Path | None) -> None:
+        lines = path.read_text(encoding="utf-8").splitlines() if path is not None and path.is_file() else []
+        self.path, self.cases = path, [Case(*json.loads(line)) for line in lines]
+        self.known = {case[:3] for case in self.cases}
+
+    def add(self, case: Case) -> None:
+        """Add a case, in the file too."""
+        self.cases.append(case)
+        self.known.add(case[:3])
+        if self.path is not None:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(case) + "\n")
+
+
+def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None, journal: Journal) -> dict[str, Any]:
     """By kind: how often each outcome, the slowest file in seconds, and why, of all but the first two outcomes."""
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -163,7 +198,11 @@ def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str
         shares = np.diff(np.linspace(0, count, len(wanted) + 1).round().astype(int)).tolist()
         try:
             for kind, share in zip(wanted, shares, strict=True):
-                row = results[kind] = _fuzz_kind(kind, originals[kind], share, seed, worker, folder / kind, keep)
+                todo = [number for number in range(share) if (seed, kind, number) not in journal.known]
+                if todo:
+                    _fuzz_kind(kind, originals[kind], todo, seed, worker, folder / kind, keep, journal)
+                cases = [c for c in journal.cases if c[:2] == (seed, kind) and c.number < share]
+                row = results[kind] = _row(cases)
                 print(f"{kind}: {sum(row[outcome] for outcome in FORBIDDEN)} failures", file=sys.stderr, flush=True)
         finally:
             worker.stop()
@@ -171,36 +210,53 @@ def fuzz(kinds: list[str], count: int, seed: int, keep: Path | None) -> dict[str
 
 
 def _fuzz_kind(
-    kind: str, originals: list[Path], count: int, seed: int, worker: Worker, folder: Path, keep: Path | None
-) -> dict[str, Any]:
+    kind: str,
+    originals: list[Path],
+    numbers: list[int],
+    seed: int,
+    worker: Worker,
+    folder: Path,
+    keep: Path | None,
+    journal: Journal,
+) -> None:
     folder.mkdir()
     for original in originals:
-        copy = folder / f"{original.stem.split('.')[0]}-whole{original.suffix}"
-        copy.write_bytes(original.read_bytes())
-        if kind == "npy":
-            copy.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
-        if (result := worker.read(kind, copy))[0] != "read":
+        copy = _placed(original, folder, "whole", original.read_bytes())
+        if (result := worker.read(kind, copy, by_commands=True))[0] != "read":
             raise ValueError(f"{original}: intact, but was {result[0]} ({result[1]})")
-    outcomes, reasons, slowest = Counter[str](), [], 0.0
-    for number in range(count):
+        _empty(folder)
+    for number in numbers:
         rng = np.random.default_rng(derived_seed(seed, kind, number))
         original = originals[number % len(originals)]
-        path = folder / f"{original.stem.split('.')[0]}-{number}{original.suffix}"
-        path.write_bytes(_damaged(original, rng))
-        if kind == "npy":
-            path.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
+        path = _placed(original, folder, str(number), _damaged(original, rng))
         start = time.perf_counter()
-        outcome, why = worker.read(kind, path)
-        slowest = max(slowest, time.perf_counter() - start)
-        outcomes[outcome] += 1
-        if outcome not in ("read", "refused"):
-            reasons.append(f"{path.name}: {outcome}: {why}")
-            if keep is not None:
-                keep.mkdir(parents=True, exist_ok=True)
-                path.replace(keep / f"{kind}-{path.name}")
-        for file in folder.iterdir():
-            file.unlink()
-    return {"mutated": count, **{o: outcomes[o] for o in OUTCOMES}, "slowest_s": round(slowest, 2), "reasons": reasons}
+        outcome, why = worker.read(kind, path, by_commands=number % BY_COMMANDS == 0)
+        if outcome not in ("read", "refused") and keep is not None:
+            keep.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, keep / f"{kind}-{path.name}")
+        journal.add(Case(seed, kind, number, outcome, why, time.perf_counter() - start))
+        _empty(folder)
+
+
+def _placed(original: Path, folder: Path, label: str, content: bytes) -> Path:
+    """A file like the original with this content, beside its picture where it needs one."""
+    path = folder / f"{original.stem.split('.')[0]}-{label}{original.suffix}"
+    path.write_bytes(content)
+    if original.suffix == ".npy":
+        path.with_suffix(".png").write_bytes(original.with_suffix(".png").read_bytes())
+    return path
+
+
+def _empty(folder: Path) -> None:
+    for entry in folder.iterdir():
+        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+
+def _row(cases: list[Case]) -> dict[str, Any]:
+    outcomes = Counter(case.outcome for case in cases)
+    reasons = [f"{case.number}: {case.outcome}: {case.why}" for case in cases if case.outcome not in OUTCOMES[:2]]
+    slowest = round(max(case.seconds for case in cases), 2)
+    return {"mutated": len(cases), **{o: outcomes[o] for o in OUTCOMES}, "slowest_s": slowest, "reasons": reasons}
 
 
 def _damaged(original: Path, rng: np.random.Generator) -> bytes:
@@ -222,15 +278,16 @@ def print_table(results: dict[str, Any]) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=5000, help="files of all kinds together")
+    parser.add_argument("--cases", type=int, default=10_000, help="files of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=DECODERS, default=list(DECODERS))
     parser.add_argument("--quick", action="store_true", help="100 files")
     parser.add_argument("--keep", type=Path, help="folder to keep the files that failed in")
+    parser.add_argument("--journal", type=Path, help="file to go on from: what it lists is not read again")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args(arguments)
     start = time.perf_counter()
-    results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
+    results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep, Journal(args.journal))
     print_table(results)
     absent = [kind for kind in args.kinds if kind not in results]
     print(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from rawaug.bayer import CFA, aligned
 from rawaug.data import RawFolder
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable
 from rawaug.io import read_raw
 from rawaug.io.apart import apart
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_noise, from_dark_frames
@@ -54,7 +56,8 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
     """(shot_var, read_var) of one camera at each ISO of its files, with the measured points.
 
     Args:
-        pairs: frames of one camera; at most :data:`MOST_FRAMES` are used, evenly spaced.
+        pairs: frames of one camera; at most :data:`MOST_FRAMES` are used, evenly spaced. Of
+            :class:`rawaug.data.readable.Readable` those that cannot be read are left out.
         dark: folder of dark frames of the same ISO values to measure the read variance.
 
     Raises:
@@ -78,7 +81,7 @@ def _measured(
     if dark is not None:
         matching = dark.get(iso) or dark.get(None)
         if matching is None:
-            raise ValueError(f"dark: has no frame{where}; give dark frames of every ISO that is measured")
+            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
         read_var = from_dark_frames(*_aligned(matching)).read_var
     try:
         estimate = estimate_noise(*_aligned(frames), read_var=read_var)
@@ -98,22 +101,31 @@ def _by_iso(frames: Sequence[Frame]) -> dict[float | None, list[Frame]]:
     cameras = dict.fromkeys(frame.camera for frame in frames if frame.camera != _UNKNOWN)
     if len(cameras) > 1:
         counted = ", ".join(f"{name} ({sum(f.camera == name for f in frames)})" for name in cameras)
-        raise ValueError(f"noise: the frames are of {len(cameras)} cameras, {counted}; measure each camera by itself")
+        raise ValueError(
+            f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each camera separately"
+        )
     by_iso: dict[float | None, list[Frame]] = defaultdict(list)
     for frame in frames:
         by_iso[frame.iso].append(frame)
     if None in by_iso and len(by_iso) > 1:
         raise ValueError(
-            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; leave them out, or measure them alone"
+            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; omit them, or measure them separately"
         )
     return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
 
 
 def _frames(pairs: Sequence[Pair]) -> list[Frame]:
-    """Frames spread over ``pairs``. RAW files are not developed."""
+    """Frames spread over ``pairs``; of :class:`Readable` ones those that can be read. RAW files are not developed."""
     last = len(pairs) - 1
     spread = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
-    return [_frame(pairs, index) for index in (range(len(pairs)) if last < MOST_FRAMES else spread)]
+    indices = range(len(pairs)) if last < MOST_FRAMES else spread
+    if not isinstance(pairs, Readable):
+        return [_frame(pairs, index) for index in indices]
+    found = (pairs.attempt(index, partial(_frame, pairs.pairs)) for index in indices)
+    frames = [frame for frame in found if frame is not None]
+    if pairs.broken and not frames:
+        raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
+    return frames
 
 
 def _frame(pairs: Sequence[Pair], index: int) -> Frame:

@@ -138,7 +138,6 @@ def evaluate(
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
         result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
-        _require_some(pairs)
     else:
         scoring = _Scoring(weights, pairs, noise, seed, where)
         result = scoring.plain()
@@ -149,17 +148,13 @@ def evaluate(
             result = scoring.with_views(ensemble, result)
         if classical:
             result["classical"] = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
-        _require_some(pairs)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
-            methods = {label_of(spec): classical_method(spec, scoring.levels, seed) for spec in classical}
-            methods["denoised"] = scoring.method()
-            for pair in shown_on_page(pairs.kept()):  # type: ignore[arg-type]
-                page.add_frame(row_of(methods, pair, scoring.levels, scoring.cfa, seed), scoring.cfa)
+            scoring.add_frames(page, classical)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
-        result["broken"] = [pairs.broken[index] for index in sorted(pairs.broken)]
+        result["broken"] = pairs.reasons()
     return {**about[0], **result, **about[1]}
 
 
@@ -189,11 +184,13 @@ class _Scoring:
         """The denoiser, as what scores and pictures call."""
         return network_method(self.model, self.cfa, views=views, at_test=self.at_test)
 
+    def add_frames(self, page: Page, classical: Sequence[Spec]) -> None:
+        """Pictures of some frames: noisy, denoised by each filter and by the denoiser, clean."""
+        methods = {label_of(spec): classical_method(spec, self.levels, self.seed) for spec in classical}
+        methods["denoised"] = self.method()
+        for pair in shown_on_page(self.pairs.kept()):
+            page.add_frame(row_of(methods, pair, self.levels, self.cfa, self.seed), self.cfa)
+
     def _summary(self, views: int, label: str) -> dict[str, Any]:
         scored = score_method(self.method(views), self.pairs, self.levels, self.cfa, self.seed, label)
         return summary([score for score, *_ in scored])
-
-
-def _require_some(pairs: Readable) -> None:
-    if len(pairs.broken) == len(pairs):
-        raise ValueError(f"none of the {len(pairs)} frames can be read; {pairs.broken[0]}")

@@ -31,6 +31,7 @@ from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.data.sidd.submission import check_submission, write_submission
 from rawaug.data.zurich import Zurich
+from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
@@ -68,7 +69,11 @@ _SPLITS = ("train", "validation", "test")
 
 
 def open_pairs(
-    spec: str | Path | Sequence[Pair], split: str = "test", as_clean: bool = True, **settings: Any
+    spec: str | Path | Sequence[Pair],
+    split: str = "test",
+    as_clean: bool = True,
+    max_pixels: int | None = None,
+    **settings: Any,
 ) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
 
@@ -79,6 +84,8 @@ def open_pairs(
         split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
+        max_pixels: of a JPEG beside a RAW file of a bare folder; None for
+            :data:`rawaug.io.picture_files.MAX_PIXELS`.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -95,7 +102,7 @@ def open_pairs(
     kind, path = _kind_and_path(str(spec))
     if kind is None:
         _require_none(settings, spec)
-        folder = RawFolder(path)
+        folder = RawFolder(path, max_pixels=max_pixels or MAX_PIXELS)
         require_no_pairs(folder, str(spec), as_clean)
         return folder
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
@@ -121,12 +128,13 @@ def _require_none(settings: Mapping[str, Any], spec: object) -> None:
         raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
 
 
-def open_pictures(spec: str | Sequence[str], min_side: int = 2) -> Any:
+def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int | None = None) -> Any:
     """Open sRGB pictures, a map-style dataset of uint8 ``(3, H, W)``: a folder, ``"demo:"``, ``"shapes:100"``.
 
     Args:
         spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
+        max_pixels: larger ones likewise; None for :data:`rawaug.io.picture_files.MAX_PIXELS`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
@@ -136,10 +144,10 @@ def open_pictures(spec: str | Sequence[str], min_side: int = 2) -> Any:
         42
     """
     if not isinstance(spec, str):
-        return ConcatDataset([open_pictures(one, min_side) for one in spec])
+        return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
     kind, path = _kind_and_path(spec)
     if kind is None:
-        return PictureFolder(path, min_side)
+        return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)
     return _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
 
 

@@ -118,7 +118,8 @@ def _npz(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such NPZ file")
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        # opened here, since NumPy leaves the files of damaged archives open
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
             names = list(arrays.files)
             name = _name_of(file, names, which, alone)
             stated = [known for known in names if known in KINDS]

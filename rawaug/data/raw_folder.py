@@ -16,6 +16,7 @@ from rawaug.data.pair import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.apart import apart
 from rawaug.io.jpeg import through_jpeg
+from rawaug.io.picture_files import MAX_PIXELS
 
 EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
@@ -40,6 +41,7 @@ class RawFolder(LazyPairs):
         camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
         jpeg_quality: LibRaw's rendering as a JPEG of this quality gives it back; None leaves it as it is.
+        max_pixels: of a JPEG; a larger one is an error of its pair.
 
     Raises:
         FileNotFoundError: if a file or the folder does not exist.
@@ -58,6 +60,7 @@ class RawFolder(LazyPairs):
         camera_jpeg: bool = True,
         adjust_maximum_thr: float = 0.0,
         jpeg_quality: int | None = None,
+        max_pixels: int = MAX_PIXELS,
     ) -> None:
         self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
         missing = [file for file in self.files if not file.is_file()]
@@ -69,7 +72,7 @@ class RawFolder(LazyPairs):
                 "noisy/clean pairs of other formats are read as pairs:PATH"
             )
         self.camera_jpeg = camera_jpeg
-        self.adjust_maximum_thr, self.jpeg_quality = adjust_maximum_thr, jpeg_quality
+        self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
         super().__init__(_names(self.files))
 
     def files_of(self, index: int) -> Sequence[Path]:
@@ -81,7 +84,7 @@ class RawFolder(LazyPairs):
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
             frame = apart(read_raw, file)
-            srgb = turn_back(apart(read_picture, jpeg), frame.upright_view)
+            srgb = turn_back(apart(read_picture, jpeg, self.max_pixels), frame.upright_view)
             size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):

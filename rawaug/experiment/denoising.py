@@ -46,6 +46,7 @@ from rawaug.experiment.run_folder import claim, run_folder
 from rawaug.experiment.search import chosen
 from rawaug.extras import extra
 from rawaug.files import find_weights, fingerprint, replacing, sha256, write_json
+from rawaug.io.apart import reading_within
 from rawaug.isp.model import DictionaryISP
 from rawaug.lock import one_at_a_time
 from rawaug.noise import NoiseModel, camera_law, noise_model
@@ -85,7 +86,8 @@ def run(
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
     given_frames = {key: frames for key, frames in given.items() if frames is not None}
-    return _Run(recipe, overwrite, given_frames).all_stages()
+    with reading_within(recipe.data.read_seconds):
+        return _Run(recipe, overwrite, given_frames).all_stages()
 
 
 def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
@@ -98,9 +100,10 @@ def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     Raises:
         OSError, ValueError: for the first thing found wrong.
     """
-    prepared = _Run(recipe, overwrite)
-    print("\n".join(prepared.plan.lines(recipe)))
-    rehearse(recipe, prepared.plan)
+    with reading_within(recipe.data.read_seconds):
+        prepared = _Run(recipe, overwrite)
+        print("\n".join(prepared.plan.lines(recipe)))
+        rehearse(recipe, prepared.plan)
     print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
 
 
@@ -124,12 +127,16 @@ class _Run:
         self.plan = plan = planned(recipe, given)
         self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
         self.pairs: list[Pair] = []
+        self.unreadable: list[str] = []
 
     def read(self) -> None:
-        """The frames into memory; what they lack is found before anything is fitted."""
+        """The training frames into memory; what frames lack, or cannot be read, is found before anything is fitted."""
         if _leads():
             print("\n".join(self.plan.lines(self.recipe)))
-        self.pairs = list(self.plan.pairs)
+        read, self.unreadable = self.plan.read()
+        self.pairs, self.validation, self.test = list(read.pairs), read.validation, read.test
+        if _leads() and self.unreadable:
+            print("\n".join(self.unreadable))
         if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
         if self.data.pictures == OWN_PICTURES:
@@ -214,7 +221,7 @@ class _Run:
     def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
         """What the weights of an arm depend on."""
         recipe, data, start = self.recipe, self.data, self.starts[arm]
-        pictures = (data.pictures, len(self.pictures))
+        pictures = (data.pictures, len(self.pictures), *([] if data.max_pixels is None else [data.max_pixels]))
         settings = _settings(recipe.arms[arm])
         samples = [isp.info["key"], recipe.noise, settings, data.pairs, stamps(self.pairs), pictures]
         samples += [] if start is None else [start.sha256]
@@ -260,10 +267,12 @@ class _Run:
         recipe, cfa = self.recipe, isp.cfa
         others = self.untrained(noise, cfa)
         classical: dict[str, Any] = {}
-        everything = {"recipe": asdict(recipe), "results": results, "classical": classical}
+        everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
         runs = [self.folder / f"seed{s}" for s in range(recipe.seed, recipe.seed + recipe.seeds)]
-        searches = chosen(recipe.arms, runs, bool(self.validation))
+        candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
+        searches = chosen(candidates, runs, bool(self.validation))
         everything |= {"chosen": searches} if searches else {}
+        everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         searched = [
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
             for arm, found in searches.items()
@@ -291,7 +300,7 @@ class _Run:
         written = page.write(self.folder / "report.html", asdict(recipe))
         print_table(results, title, classical)
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
-        print("\n".join([*reports(self.pictures), *searched, *self.usage(results)]))
+        print("\n".join([*reports(self.pictures), *self.unreadable, *searched, *self.usage(results)]))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 

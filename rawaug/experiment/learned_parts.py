@@ -111,20 +111,20 @@ def weigh_parts(learned: LearnedParts, overwrite: bool = False) -> dict[str, dic
     folder = claim(learned, overwrite)
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in learned.variants}
     for seed in range(learned.seed, learned.seed + learned.seeds):
-        chosen = _photographs(pictures, learned, seed)
+        chosen = photographs(pictures, learned, seed)
         frames = varied_frames(chosen[: learned.frames], learned.cameras, seed, "train")
         left_out = varied_frames(chosen[learned.frames :], learned.cameras, seed, "left-out")
         for name, changes in progress(learned.variants.items(), label=f"seed {seed}", unit="fit"):
             config = replace(learned.fit, **changes, seed=seed)
             place = folder / f"seed{seed}" / f"{name.replace(' ', '-').replace('/', '_')}.json"
-            found[name].append(_scored(place, config, frames, left_out))
+            found[name].append(variant_scores(place, config, frames, left_out))
     rows = {name: _row(runs) for name, runs in found.items()}
     write_json({"settings": asdict(learned), "rows": rows}, folder / "table.json")
     _print(rows, learned)
     return rows
 
 
-def _photographs(pictures: Sequence[Tensor] | PictureFolder, learned: LearnedParts, seed: int) -> list[Tensor]:
+def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: LearnedParts, seed: int) -> list[Tensor]:
     """As many as are needed, in a random order, of those that hold a frame.
 
     Raises:
@@ -141,7 +141,7 @@ def _photographs(pictures: Sequence[Tensor] | PictureFolder, learned: LearnedPar
     return chosen
 
 
-def _scored(place: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
+def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
     """The scores of one fit, from its file where it is there."""
     sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
     key = fingerprint("learned", config.key(), sums)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
 from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
+from rawaug.data.readable import Readable, left_out
 from rawaug.data.remembered import Remembered
 from rawaug.data.select import selected
 from rawaug.experiment.plain_yaml import read_yaml
@@ -55,17 +57,32 @@ class Plan:
         camera = (
             f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
             if recipe.camera is None
-            else f"{recipe.camera}, as it is"
+            else f"{recipe.camera}, unchanged"
         )
-        watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
+        watched = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         found = {
-            "train": _used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
-            "validate": _used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
-            "test": _used(self.test, test, data.test),
+            "train": used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
+            "validate": used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
+            "test": used(self.test, test, data.test),
             "pictures": f"{len(self.pictures)} of {data.pictures}",
             "ISP": camera,
         }
         return [f"{what:<10}{used}" for what, used in found.items()]
+
+    def read(self) -> tuple[Plan, list[str]]:
+        """The plan without the frames that cannot be read, those of ``pairs`` in memory; and lines that name them.
+
+        All frames are read once: a damaged one is better found now than after the training.
+
+        Raises:
+            ValueError: if of ``pairs``, ``validation`` or ``test`` none can be read.
+        """
+        parts = {key: Readable(getattr(self, key)) for key in ("pairs", "validation", "test")}
+        found = list(parts["pairs"])
+        for key in ("validation", "test"):
+            deque(parts[key], maxlen=0)
+        lines = [line for key, part in parts.items() for line in left_out(part, f"data.{key}")]
+        return replace(self, pairs=found, validation=parts["validation"].kept(), test=parts["test"].kept()), lines
 
 
 def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> Recipe:
@@ -124,7 +141,7 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     chosen = SomePairs(pairs, selected(pairs, kept, data.count, data.select))
     pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
     if pictures is None:
-        pictures = open_pictures(data.pictures, min_side=recipe.train.crop + 6)
+        pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
     return Plan(
         pairs=chosen,
         validation=validation,
@@ -138,10 +155,11 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
 def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
     if spec is None:
         return []
-    return open_pairs(spec, split, clean, **data.settings_of(spec))
+    return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 
-def _used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+    """So many of so many frames of a source, and the names of the first ones."""
     names = names_of(frames)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"

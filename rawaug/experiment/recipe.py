@@ -12,7 +12,6 @@ from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.search import expanded
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
@@ -35,6 +34,8 @@ class DataConfig(PairSettings):
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
+        max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
+        read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
             and keeps the final weights.
@@ -48,12 +49,18 @@ class DataConfig(PairSettings):
     select: str | list[str] = "first"
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
+    max_pixels: int | None = None
+    read_seconds: float | None = None
     validation: str | None = "demo:validation"
     validation_crop: int | None = None
     test: str = "demo:test"
     test_count: int | None = None
 
     def __post_init__(self) -> None:
+        if self.max_pixels is not None:
+            require_between("data.max_pixels", self.max_pixels, 4, 2**40)
+        if self.read_seconds is not None:
+            require_between("data.read_seconds", self.read_seconds, 0.0, 1e6)
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
         if self.pictures == OWN_PICTURES and self.pairs is None:
@@ -84,7 +91,7 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        alpha, correct, gamma: settings of the estimator, deprecated; older recipes set them here.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
             for each value, and the results name the best.
         candidate_of: of such an arm: whose it is.
@@ -124,6 +131,24 @@ class ArmConfig:
         self.estimator = {"name": name, "settings": settings} if settings else name
         ESTIMATORS.make(self.estimator)
 
+    def candidates(self, label: str) -> dict[str, ArmConfig]:
+        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``.
+
+        Raises:
+            ValueError: if the search has not one key with values, or it is no setting of the estimator.
+        """
+        if self.search is None:
+            return {label: self}
+        name, settings = name_and_settings(self.estimator)
+        ((key, values),) = self.search.items() if len(self.search) == 1 else [("", [])]
+        if not values:
+            raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
+        found = {}
+        for value in values:
+            estimator = {"name": name, "settings": {**settings, key: value}}
+            found[f"{label}_{key}{value:g}"] = replace(self, estimator=estimator, search=None, candidate_of=label)
+        return found
+
     @property
     def sees_clean(self) -> bool:
         """Whether the estimator needs clean frames."""
@@ -139,7 +164,7 @@ class Recipe:
         name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
+        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
         noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -149,7 +174,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
         views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        untouched: trained denoisers to compare with, unchanged: names of shipped ones, or files.
         self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
@@ -181,7 +206,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
-        self.arms = expanded(self.arms)
+        self.arms = {name: one for label, arm in self.arms.items() for name, one in arm.candidates(label).items()}
         require_between("seed", self.seed, -(2**63), 2**62)
         require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:

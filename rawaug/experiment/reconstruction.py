@@ -9,13 +9,14 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 from __future__ import annotations
 
 import json
+import math
 import statistics
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from rawaug import bayer
@@ -24,15 +25,15 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
+from rawaug.data.readable import Readable, each_readable
 from rawaug.data.select import selected
 from rawaug.evaluation.altered import ALTERED
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.early_checks import require_precision
+from rawaug.experiment.method_table import print_methods, row_name
 from rawaug.experiment.methods import (
     FAMILIES,
-    ROWS,
     Fitted,
     balanced_rows,
     cycle_psnr,
@@ -148,23 +149,33 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
-    require_free(comparison, overwrite)
-    if comparison.downstream is not None:
-        require_precision(comparison.downstream.train.precision)
-    comparing = _Comparison(comparison)
+    prepared = PreparedComparison(comparison, overwrite)
     claim(comparison, overwrite)
-    return comparing.table()
+    return prepared.table()
 
 
-class _Comparison:
-    def __init__(self, settings: Comparison) -> None:
+class PreparedComparison:
+    """A comparison whose data are open and checked; nothing is written yet.
+
+    Args:
+        settings: of the comparison.
+        overwrite: it may replace another of its name.
+        seconds: for reading the frames that are fitted; what then remains unread is left out.
+    """
+
+    def __init__(self, settings: Comparison, overwrite: bool = False, seconds: float = math.inf) -> None:
+        require_free(settings, overwrite)
+        if settings.downstream is not None:
+            require_precision(settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
-        self.pairs = [found[k] for k in selected(found, len(found), settings.count, settings.select)]
+        self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+        self.available = len(found)
+        self.pairs = list(each_readable(self.chosen, "data", seconds, least=2))
+        if len(self.pairs) < 2 and not settings.test:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         if settings.test:
             self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
-        elif len(self.pairs) < 2:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
@@ -174,13 +185,15 @@ class _Comparison:
             noise = noise_model(settings.noise)
             self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        names = [pair.name for pair in self.pairs]
+        names = names_of(self.chosen)
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
         self.scored: Sequence[Pair] = self.pairs
         if settings.test:
             test = open_pairs(settings.test, split="test")
-            self.scored = SomePairs(test, range(len(test))[: settings.test_count])
+            tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+            deque(each_readable(tested, "test", seconds), maxlen=0)
+            self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")
         if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
@@ -197,7 +210,10 @@ class _Comparison:
             rows |= self._rows(family, scale)
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
-        _print(rows, self.settings, ceiling)
+        frames, settings = len(next(iter(rows.values()))["frames"]), self.settings
+        on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
+        title = f"{settings.name}: {on}, {settings.seeds} seed(s), {settings.data}"
+        print_methods(title, rows, settings.balanced, ceiling)
         return rows
 
     def _families(self) -> Iterator[tuple[str, float]]:
@@ -218,7 +234,7 @@ class _Comparison:
         for row in folds[0][2]["rows"]:
             by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
             quarters = [worst_and_best_quarter(values) for values in by_seed]
-            name = _row_name(family, row)
+            name = row_name(family, row)
             name = f"{name}, {scale:g} times as long" if longer else name
             rows[name] = {
                 "psnr_r": [statistics.fmean(values) for values in by_seed],
@@ -299,12 +315,6 @@ class _Comparison:
         return self.folder / f"{stem.replace('/', '_')}.json"
 
 
-def _row_name(family: str, row: str) -> str:
-    """Of a row of a fold: "as-shot, overexposed" and the like."""
-    setting, _, kind = row.partition(", ")
-    return ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
-
-
 def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
     """The frame with noise keyed by its name, as a noisy capture."""
     cfa = CFA(pair.cfa)
@@ -327,35 +337,3 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
 def _median(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return statistics.median(known) if known else None
-
-
-_COLUMNS = {
-    "psnr_r": "PSNR_r",
-    "worst25": "worst 25%",
-    "best25": "best 25%",
-    "balanced": "balanced",
-    "cycle": "cycle",
-    "cycle_without_mosaic": "no mosaic",
-    "psnr_d": "PSNR_d",
-}
-
-
-def _cells(row: dict[str, Any], columns: Sequence[str]) -> list[str]:
-    def figures(name: str) -> str:
-        value = row.get(name)
-        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
-
-    cells = [figures(name) for name in columns]
-    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
-    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
-
-
-def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
-    frames = len(next(iter(rows.values()))["frames"])
-    protocol = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
-    title = f"{settings.name}: {protocol}, {settings.seeds} seed(s), {settings.data}"
-    columns = [name for name in _COLUMNS if name != "balanced" or settings.balanced]
-    heads = [_COLUMNS[name] for name in columns] + ["M par.", "s to fit", "Mpix/s"]
-    print_rows(title, ["method", *heads], [[name, *_cells(row, columns)] for name, row in rows.items()])
-    threads = torch.get_num_threads()
-    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

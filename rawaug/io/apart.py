@@ -28,8 +28,8 @@ import tempfile
 import threading
 import warnings
 import weakref
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,7 +44,7 @@ PATIENCE = 10
 START_SECONDS = 300.0
 """For the first helper, which waits until the libraries are imported."""
 
-_ADDRESS = "RAWAUG_READERS"
+_ADDRESS, _LIMIT = "RAWAUG_READERS", "RAWAUG_READ_SECONDS"
 _SERVE = "import sys, json; sys.path[:] = json.loads(sys.argv[1]); from rawaug.io.reading_process import serve; serve()"
 
 
@@ -98,7 +98,7 @@ def _helper() -> _Helper | None:
             found = _of_this_thread.helper = _Helper(_connected())
         except (OSError, RuntimeError) as error:
             _unavailable = True
-            warnings.warn(f"files are read in this process, which a damaged one may end: {error}", stacklevel=4)
+            warnings.warn(f"files are read in this process, so a damaged one may crash it: {error}", stacklevel=4)
     return found
 
 
@@ -108,14 +108,34 @@ def time_limit() -> float:
     Raises:
         ValueError: if ``RAWAUG_READ_SECONDS`` is no number of seconds.
     """
-    text = os.environ.get("RAWAUG_READ_SECONDS", str(SECONDS))
+    text = os.environ.get(_LIMIT, str(SECONDS))
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
     if not 0 <= seconds < float("inf"):
-        raise ValueError(f"RAWAUG_READ_SECONDS={text}: must be a number of seconds, or 0 to read in the same process")
+        raise ValueError(f"{_LIMIT}={text}: must be a number of seconds, or 0 to read in the same process")
     return seconds if hasattr(os, "fork") and hasattr(socket, "AF_UNIX") else 0.0
+
+
+@contextmanager
+def reading_within(seconds: float | None) -> Iterator[None]:
+    """Another time limit inside a ``with`` block, for this process and those that it starts; None changes nothing.
+
+    Example:
+        >>> with reading_within(5.0):
+        ...     time_limit()
+        5.0
+    """
+    before = os.environ.get(_LIMIT)
+    if seconds is not None:
+        os.environ[_LIMIT] = str(seconds)
+    try:
+        yield
+    finally:
+        if seconds is not None:
+            os.environ.pop(_LIMIT)
+            os.environ.update({} if before is None else {_LIMIT: before})
 
 
 def prepare() -> None:
@@ -155,9 +175,7 @@ class _Helper:
             self.connection.send_bytes(pickle.dumps(request))
             if not self._answers(seconds):
                 self.kill()
-                raise _Lost(
-                    f"cannot be read within {seconds:g} s (RAWAUG_READ_SECONDS); leave it out, or copy it again"
-                )
+                raise _Lost(f"cannot be read within {seconds:g} s ({_LIMIT}); leave it out, or copy it again")
             kind, content, sizes = pickle.loads(self.connection.recv_bytes())
         except (EOFError, ConnectionError):
             kind, content, sizes = "died", 0, ()

@@ -125,7 +125,9 @@ class RawAugment(nn.Module):
             raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
         self.noise = noise_for(self.isp, noise)
         if self.pattern is not None and self.noise.by_plane:
-            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
+            raise ValueError(
+                f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} does not have"
+            )
         self.sampling, self.strength, self.seed, self.exposure = sampling, strength, seed, exposure
         self.cameras = self.isp.camera_sampler(sampling == "convex", light)
         self.light = light

@@ -279,7 +279,7 @@ def _patterns(file: Path) -> list[CFA]:
             raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
         return [CFA(name) for name in names]
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{file}: is no list of patterns, one for each frame ({error}); copy it again") from None
+        raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
 
 
 def _blocks_of_scenes(file: Path) -> Tensor:

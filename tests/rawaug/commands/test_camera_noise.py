@@ -131,7 +131,9 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
 
 def test_two_cameras_are_not_pooled(noisy_pair: Pair) -> None:
     pairs = [at_iso(noisy_pair, 100, 2e-4), at_iso(noisy_pair, 100, 2e-4, "Other 2")]
-    with pytest.raises(ValueError, match=r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera by itself"):
+    with pytest.raises(
+        ValueError, match=r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera separately"
+    ):
         measure_camera_noise(pairs)
 
 

@@ -82,6 +82,33 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
     assert test.endswith("test: a, b") and "2 of " in pictures and isp.endswith("fitted to 6 frames")
 
 
+def test_damaged_frames_are_named_and_the_rest_is_used(own: Path, data: DataConfig, tmp_path: Path) -> None:
+    recipe = Recipe(arms=ARMS, data=replace(data, pairs=f"pairs:{own}", count=None, validation="auto"))
+    whole, none = plan_of(recipe).read()
+    assert none == [] and names_of(whole.pairs) == [f"shot{k}" for k in range(6)]
+    assert stamps(whole.test) == stamps(plan_of(recipe).test)
+    (own / "shot1.npz").write_bytes(b"damaged")
+    (tmp_path / "test" / "b.npz").write_bytes((tmp_path / "test" / "b.npz").read_bytes()[:300])
+    read, lines = plan_of(recipe).read()
+    assert names_of(read.pairs) == ["shot0", "shot2", "shot3", "shot4", "shot5"] and names_of(read.test) == ["a"]
+    assert lines[0] == "left out of data.pairs: 1 of 6 frames, unreadable" and "shot1.npz" in lines[1]
+    assert lines[2] == "left out of data.test: 1 of 2 frames, unreadable" and "b.npz" in lines[3] and len(lines) == 4
+    (own / "shot6.npz").write_bytes(b"damaged")  # all that is held out
+    with pytest.raises(ValueError, match=r"none of the 1 frames can be read; .*shot6\.npz"):
+        plan_of(recipe).read()
+
+
+def test_limits_of_reading_are_keys_of_data(data: DataConfig, tmp_path: Path) -> None:
+    assert len(plan_of(Recipe(arms=ARMS, data=data, train=TrainConfig(crop=16))).pictures[0]) == 3
+    small = Recipe(arms=ARMS, data=replace(data, max_pixels=1000), train=TrainConfig(crop=16))
+    with pytest.raises(ValueError, match="48 x 48 pixels, above the limit of 1000"):
+        plan_of(small).pictures[0]
+    with pytest.raises(ValueError, match=r"data\.max_pixels must be a whole number"):
+        DataConfig(max_pixels=0)
+    with pytest.raises(ValueError, match=r"data\.read_seconds must be a number"):
+        DataConfig(read_seconds=-1.0)
+
+
 def test_the_same_kind_of_data_elsewhere_keeps_its_regime() -> None:
     recipe = Recipe(arms=ARMS, data=DataConfig(pairs="sidd:/elsewhere", count=56, validation=None))
     assert with_own_pairs(recipe, find_recipe("sidd/fewshot"), {"data.pairs"}) == recipe
@@ -91,7 +118,7 @@ def test_a_single_pair_is_trained_on_and_nothing_is_held_out(data: DataConfig) -
     recipe = Recipe(arms=ARMS, data=data)
     plan = plan_of(recipe, pairs=demo_pairs("train", count=1))
     assert len(plan.pairs) == 1 and not plan.validation
-    assert "last weights are kept" in plan.lines(recipe)[1]
+    assert "final weights are kept" in plan.lines(recipe)[1]
 
 
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
