@@ -15,12 +15,13 @@ from rawaug.explore.quick_development import grey_curve
 from rawaug.extras import extra
 from rawaug.io import encode_srgb
 from rawaug.isp.tone_curves import STEPS
-from rawaug.patterns import pattern
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
 _ATOMS = 60
 """As many colour atoms are drawn, at most."""
 _BINS = 24
+_MOST = 2**16
+"""Values of a colour."""
 _FEWEST = 50
 """Values in a bin of the signal, for its variance to mean something."""
 
@@ -38,7 +39,7 @@ def histograms(drawn: Drawn) -> np.ndarray:
     axis.set(
         yscale="log", ylim=(1e-6, 1), xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0)
     )
-    axis.minorticks_off()
+    _plain_numbers(axis, axis.yaxis)
     axis.legend(title="line: clean, area: noisy", fontsize=8, title_fontsize=8, ncols=3)
     return _pixels(figure)
 
@@ -87,7 +88,7 @@ def noise(drawn: Drawn) -> np.ndarray:
             axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
             axis.legend(fontsize=8)
         else:
-            axis.minorticks_off()
+            _plain_numbers(axis, axis.xaxis, axis.yaxis)
             axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
     return _pixels(figure)
 
@@ -110,10 +111,13 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 
 def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
-    """Values of red, green and blue sites, each ``(N,)``."""
-    mosaic = drawn.augment.mosaic(raw)[0]
-    channels = pattern(drawn.augment.cfa).channels(*mosaic.shape)
-    return [mosaic[channels == index] for index in range(3)]
+    """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
+    if drawn.augment.pattern is None:
+        values = [raw[0].flatten(), raw[1:3].flatten(), raw[3].flatten()]
+    else:
+        planes = drawn.augment.pattern.planes(*raw.shape[-2:]) > 0
+        values = [raw[0][plane] for plane in planes]
+    return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
 
 
 def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
@@ -144,6 +148,13 @@ def _figure(columns: int) -> tuple[Any, Any]:
         axis.set_axisbelow(True)
         axis.title.set_fontsize(10)
     return figure, axes
+
+
+def _plain_numbers(axis: Any, *scales: Any) -> None:
+    """Powers of ten as 0.01, without ticks between them: typeset ones take longer than the rest of the figure."""
+    axis.minorticks_off()
+    for scale in scales:
+        scale.set_major_formatter("{x:g}")
 
 
 def _pixels(figure: Any) -> np.ndarray:
