@@ -11,7 +11,7 @@ PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  
 WHEEL := build/resolve/requirements.in
 LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
 
-BENCHMARKS := augment denoise faults folder fuzz loader networks noise shards synth
+BENCHMARKS := augment denoise explore faults folder fuzz loader networks noise shards synth
 
 .PHONY: demo test lint docs bench dist lock resolve clean
 
@@ -73,4 +73,4 @@ $(VENV)/.uv: | $(BIN)/python
 
 $(WHEEL): setup.cfg $(VENV)/.uv
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/resolve .
-	echo "rawaug[test,docs,export] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@
+	echo "rawaug[test,docs,export,explore] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@

@@ -23,23 +23,23 @@ def pinned(text: str) -> list[tuple[str, str]]:
     return re.findall(r"^([A-Za-z0-9._-]+)==([^\s;]+)", text, flags=re.MULTILINE)
 
 
-def advisories(packages: list[tuple[str, str]]) -> dict[str, list[str]]:
+def advisories(packages: list[tuple[str, str]], url: str = URL) -> dict[str, list[str]]:
     """By package, the identifiers of its advisories; OSError if the database cannot be reached."""
     queries = [{"package": {"name": name, "ecosystem": "PyPI"}, "version": version} for name, version in packages]
     body = json.dumps({"queries": queries}).encode()
-    request = urllib.request.Request(URL, body, {"Content-Type": "application/json"})
+    request = urllib.request.Request(url, body, {"Content-Type": "application/json"})
     with urllib.request.urlopen(request, timeout=SECONDS) as answer:
         results: list[dict[str, Any]] = json.load(answer)["results"]
     found = ([entry["id"] for entry in result.get("vulns", [])] for result in results)
     return {f"{name} {version}": ids for (name, version), ids in zip(packages, found, strict=True) if ids}
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str], url: str = URL) -> int:
     packages = pinned(Path(arguments[0] if arguments else "constraints.txt").read_text(encoding="utf-8"))
     try:
-        found = advisories(packages)
+        found = advisories(packages, url)
     except (OSError, ValueError, KeyError) as error:
-        print(f"advisories: not checked, {URL} cannot be reached ({type(error).__name__})")
+        print(f"advisories: not checked, {url} cannot be reached ({type(error).__name__})")
         return 0
     for package, ids in found.items():
         print(f"{package}: {', '.join(ids)}")

@@ -25,7 +25,8 @@ from benchmarks.augment import machine, memory_used
 from benchmarks.loader import fastest
 from denoisers.pretrained import DEFAULT
 from rawaug import bayer
-from rawaug.commands.denoise import denoise_file, frame_denoiser
+from rawaug.commands.denoise import denoise_file
+from rawaug.commands.frame_denoisers import frame_denoiser
 from rawaug.io import RawFrame, write_dng
 
 
@@ -87,7 +88,7 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
     return {"seconds": min(runs[1:]), "Mpix/s": noisy.numel() / min(runs[1:]) / 1e6}
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--denoiser", default=DEFAULT, help="name of a shipped denoiser, or its file")
@@ -95,7 +96,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--quick", action="store_true", help="one repeat of 0.25 Mpix")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     if args.quick:
         args.megapixels, args.repeats = [0.25], 1
     model = denoisers.from_pretrained(args.denoiser)

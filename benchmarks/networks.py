@@ -53,14 +53,14 @@ GPU_SIZES: dict[str, dict[str, Any]] = {
 """The networks in their published sizes, the U-Net's included."""
 
 SIDE = 512
-"""Packed pixels on the side of the picture that inference is timed on: a mosaic megapixel."""
+"""Packed pixels on the side of the picture that inference is timed on, a mosaic megapixel; and of validation frames."""
 
 
 def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str, float]:
     """GMAC and seconds a mosaic megapixel; on a CPU on one and on two threads."""
-    noisy = torch.rand(1, 4, SIDE, SIDE, device=args.device)
+    noisy = torch.rand(1, 4, args.side, args.side, device=args.device)
     inputs = [x.contiguous(memory_format=torch.channels_last) for x in (noisy, 1e-3 * noisy + 1e-5)]
-    megapixels, figures = 4 * SIDE**2 / 1e6, dict[str, float]()
+    megapixels, figures = 4 * args.side**2 / 1e6, dict[str, float]()
     with torch.inference_mode():
         with FlopCounterMode(display=False) as counter:
             network(*inputs)
@@ -185,13 +185,13 @@ def ensemble(network: denoisers.Denoiser, args: argparse.Namespace) -> float:
     return seconds["eight"] / seconds["one"]
 
 
-def measure(name: str, args: argparse.Namespace) -> dict[str, float]:
-    """Of one network."""
+def measure(name: str, args: argparse.Namespace, size: dict[str, Any] | None = None) -> dict[str, float]:
+    """Of one network, in the size of the table if none is given."""
     torch.set_num_threads(args.threads)
     if args.minutes:
         return trained(name, args)
-    sizes = GPU_SIZES if args.device.type == "cuda" else SIZES
-    network = denoisers.build(name, **sizes[name] | ({"width": args.width} if args.width else {}))
+    size = (GPU_SIZES if args.device.type == "cuda" else SIZES)[name] if size is None else size
+    network = denoisers.build(name, **size | ({"width": args.width} if args.width else {}))
     network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     costs = inference(network.eval(), args)
     steps = training(network.train(), args)
@@ -211,6 +211,7 @@ def main() -> None:
     parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--crop", type=int, default=128, help="side of the sRGB crops")
+    parser.add_argument("--side", type=int, default=SIDE, help="of the packed picture that inference is timed on")
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--repeats", type=int, default=5)

@@ -1,17 +1,20 @@
 """What each part of the universal ISP is worth: PSNR_d of denoisers trained on RAW made without it.
 
     python benchmarks/psnr_d.py --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
-        [--older universal.safetensors] [--seeds 3] [--out runs/psnr_d]
+        [--older universal.safetensors] [--seeds 0 1 2] [--out runs/psnr_d]
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
 the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
-in another light. ``without the wide hull``: one camera's matrix. ``real``: trained on crops of
-real RAW frames in place of pictures. Each network is scored on every test set; finished trainings are not run again.
+in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
+alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
+rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
+stopped run can be started again.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +41,10 @@ from rawaug.training.train_config import DenoiserConfig, TrainConfig
 CONFIG = DownstreamConfig(
     denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)
 )
+PAIR_PSNR = 41.18
+"""Mean PSNR in dB of the training pairs of Conde et al., AAAI 2022."""
+Rows = dict[str, dict[str, dict[str, list[float]]]]
+"""By row, seed and test set: PSNR in RAW and developed."""
 NARROW = "Canon EOS 5D Mark III"
 """The camera that stands for all where the hull is taken away."""
 
@@ -67,6 +74,8 @@ def sources(pictures: Sequence[Tensor], older: Path | None, real: dict[str, list
         yield "universal, older", made(DictionaryISP.from_pretrained(older), exposure=CONFIG.exposure)
     yield "without tone", made(without_tone(universal()))
     yield "without consistent gains", made(universal(), sampling="independent")
+    calibrated = RawAugment(universal(), noise_model({"pair_psnr": PAIR_PSNR}))
+    yield f"pairs of {PAIR_PSNR} dB", PictureCrops(RawPairs(pictures, calibrated, crop))
     yield "without the wide hull", made(of_cameras(universal(), NARROW))
     for name, specs in real.items():
         pairs = [pair for spec in specs for pair in open_pairs(spec)]
@@ -96,28 +105,34 @@ def main() -> None:
     parser.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
     parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
     parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
     options = parser.parse_args()
     torch.set_num_threads(1)
     folders = [open_pictures(folder, min_side=CONFIG.train.crop) for folder in options.pictures]
     pictures = [even_sided(folder[k]) for folder in folders for k in range(len(folder))]
-    tests = named(options.test)
-    rows: dict[str, dict[str, list[DownstreamScore]]] = {}
-    for seed in range(options.seeds):
+    tests, known = named(options.test), options.out / "scores.json"
+    rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
+    for seed in options.seeds:
         for row, crops in sources(pictures, options.older, named(options.real)):
+            if options.rows and row not in options.rows:
+                continue
+            scores = rows.setdefault(row, {}).setdefault(str(seed), {})
+            if tests.keys() <= scores.keys():
+                continue
             net = trained_on(crops, CONFIG, options.out / row.replace(" ", "-").replace(",", ""), seed)
-            for test, specs in tests.items():
-                score = score_on(net, replace(CONFIG, test=specs), CFA.RGGB)
-                rows.setdefault(row, {}).setdefault(test, []).append(score)
-            write_json(rows, options.out / "scores.json")
-    rows["NonLocalMeans"] = {test: [filtered(specs)] for test, specs in tests.items()}
+            scores |= {
+                test: list(score_on(net, replace(CONFIG, test=specs), CFA.RGGB)) for test, specs in tests.items()
+            }
+            write_json(rows, known)
+    rows["NonLocalMeans"] = {"": {test: list(filtered(specs)) for test, specs in tests.items()}}
     heads = [f"{test}, {domain}" for test in tests for domain in ("RAW", "sRGB")]
     cells = [
-        [row, *(mean_and_spread([s[k] for s in scores[test]], 2) for test in tests for k in (0, 1))]
+        [row, *(mean_and_spread([s[test][k] for s in scores.values()], 2) for test in tests for k in (0, 1))]
         for row, scores in rows.items()
     ]
-    print_rows(f"PSNR_d in dB, {len(pictures)} pictures, {options.seeds} seeds", ["RAW of", *heads], cells)
+    print_rows(f"PSNR_d in dB, {len(pictures)} pictures, seeds {options.seeds}", ["RAW of", *heads], cells)
 
 
 if __name__ == "__main__":

@@ -39,8 +39,8 @@ ONLINE_CROP = 256
 
 
 def generate(folder: Path, count: int, height: int, width: int) -> None:
-    """``count`` crops at random places, enlarged where a built-in picture is too small."""
-    sources = [picture[None].float() for picture in demo_pictures()]
+    """``count`` crops at random places of up to 32 built-in pictures, enlarged where one is too small."""
+    sources = [picture[None].float() for picture in demo_pictures(min(count, 32))]
     for k in range(count):
         generator, source = keyed_generator("shards", k), sources[k % len(sources)]
         scale = max(1.0, (height + 2) / source.shape[2], (width + 2) / source.shape[3])

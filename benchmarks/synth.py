@@ -31,6 +31,7 @@ from rawaug.commands.pair_shards import shard_tasks
 from rawaug.data import demo_pictures
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture, write_picture
+from rawaug.plugin.drawing import Drawing
 
 COPIES = 8
 """Of the built-in pictures, so that a run takes seconds."""
@@ -72,7 +73,7 @@ def measure(folder: Path, formats: list[str], workers: int, repeats: int) -> dic
     for name in [*best] * repeats:
         with tempfile.TemporaryDirectory() as out:
             form: Any = "npz" if name == "decode" else name
-            settings = Settings(form, "universal", weights, "cycleisp_sidd", "convex", 0)
+            settings = Settings(form, Drawing(), weights, 0)
             tasks, warm = (planned(form, pictures, folder, Path(out) / part) for part in ("timed", "warm"))
             work: tuple[Any, Any, Any] = (synth._make, tasks, warm[: 4 * workers])
             if name == "decode":

@@ -10,6 +10,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rawaug._version import __version__
@@ -54,26 +55,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
     from rawaug.commands.listing import command, listed
-    from rawaug.commands.spelling import given_keys, require_known_keys, require_known_options
+    from rawaug.commands.spelling import given_keys, require_known_options
     from rawaug.progress import quiet
 
     if argv == ["run"]:
         from rawaug.experiment.recipe import recipe_list
 
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")
-        print("rawaug run RECIPE --help explains its keys; --dry-run tries it on your data.")
+        print("rawaug run RECIPE --help explains its keys; --dry-run rehearses it on your data.")
         return 0
-    kind, recipe = "training", None
-    if argv[:2] == ["run", "--recipe"]:
-        argv = ["run", *argv[2:]]
-    if argv[:1] == ["run"] and len(argv) > 1 and not argv[1].startswith("-"):
-        from rawaug.experiment.kinds import KINDS, kind_of
-        from rawaug.experiment.plain_yaml import read_yaml
-        from rawaug.experiment.recipe import defaults_of, find_recipe
-
-        recipe = find_recipe(argv[1])
-        kind = kind_of(recipe)
-        argv = ["run", "--recipe", str(recipe), *argv[2:]]
+    argv, kind, recipe = _recipe_of(argv)
     names = [*OWN, *listed()]
     chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
     parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
@@ -83,9 +74,7 @@ def _dispatch(argv: list[str]) -> int:
     if chosen is not None:
         require_known_options(chosen, leaves[chosen], argv)
     if recipe is not None:
-        require_known_keys(recipe, read_yaml(recipe), leaves["run"])
-        if {"-h", "--help"} & set(argv):
-            leaves["run"].set_defaults(defaults_of(recipe, KINDS[kind].settings))
+        _require_known_keys(recipe, kind, leaves["run"], helps=bool({"-h", "--help"} & set(argv)))
     parsed = parser.parse_args(argv)
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
@@ -97,6 +86,31 @@ def _dispatch(argv: list[str]) -> int:
         else:
             call(command(str(chosen)), values)
     return 0
+
+
+def _recipe_of(argv: list[str]) -> tuple[list[str], str, Path | None]:
+    """The arguments with the recipe's path in place of its name, its kind and its path; of ``run`` alone."""
+    if argv[:2] == ["run", "--recipe"]:
+        argv = ["run", *argv[2:]]
+    if argv[:1] != ["run"] or len(argv) < 2 or argv[1].startswith("-"):
+        return argv, "training", None
+    from rawaug.experiment.kinds import kind_of
+    from rawaug.experiment.recipe import find_recipe
+
+    recipe = find_recipe(argv[1])
+    return ["run", "--recipe", str(recipe), *argv[2:]], kind_of(recipe), recipe
+
+
+def _require_known_keys(recipe: Path, kind: str, run: Any, helps: bool) -> None:
+    """Refuse a recipe with a key that its kind does not have; the help shows the values of the recipe."""
+    from rawaug.commands.spelling import require_known_keys
+    from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.plain_yaml import read_yaml
+    from rawaug.experiment.recipe import defaults_of
+
+    require_known_keys(recipe, read_yaml(recipe), run)
+    if helps:
+        run.set_defaults(defaults_of(recipe, KINDS[kind].settings))
 
 
 def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
@@ -134,7 +148,7 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
             else:
                 add_arguments(leaf, command(name))
         if "--quiet" not in leaf._option_string_actions:  # a command may have its own
-            leaf.add_argument("--quiet", action="store_true", help="print no progress")
+            leaf.add_argument("--quiet", action="store_true", help="do not print progress")
         spell_with_hyphens(leaf)
     return parser, leaves
 
@@ -144,7 +158,11 @@ def _add_run_arguments(run: Any, kind: str) -> None:
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument("--dry-run", action="store_true", help="only say what is used of what, and try it in seconds")
+    run.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="show which data would be used and rehearse the run in seconds, without writing",
+    )
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
     run.add_class_arguments(KINDS[kind].settings)
 
@@ -161,12 +179,10 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
     recipe = experiment.smoke(recipe) if quick else recipe
-    if not dry:
-        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
-    elif experiment.dry_run is None:
-        raise ValueError(f"--dry-run: an experiment of the kind {kind} has none; use --smoke")
-    else:
+    if dry:
         experiment.dry_run(recipe, overwrite)
+    else:
+        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
 
 
 def _one_line(error: Exception) -> str:

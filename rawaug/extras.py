@@ -1,4 +1,4 @@
-"""Libraries of the extras ``[raw]``, ``[train]`` and ``[data]``: what is not installed is named with its extra."""
+"""Libraries of the extras, as ``[raw]`` and ``[train]``: what is not installed is named with its extra."""
 
 from __future__ import annotations
 

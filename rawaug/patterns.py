@@ -14,9 +14,11 @@ so that :meth:`Pattern.turn_keeping` brings them back by cropping.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
@@ -69,6 +71,15 @@ class Pattern:
         index = self.channels(*rgb.shape[-2:]).to(rgb.device)
         return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
 
+    def demosaic(self, raw: Tensor) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``, for the eye: what a site measured stays, the rest are means.
+
+        The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
+        convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
+        """
+        planes, inverse = (kept.to(raw) for kept in _sites(self.name, *raw.shape[-2:]))
+        return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
+
     def crop(self, raw: X, top: int, left: int, height: int, width: int) -> Tensor:
         """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size.
 
@@ -114,6 +125,27 @@ class Pattern:
         if height < 1 or width < 1:
             raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
         return turned[..., rows : rows + height, columns : columns + width]
+
+
+def _tent(image: Tensor, period: int) -> Tensor:
+    """``(B, C, H, W)`` through a separable tent that reaches half a cell to each side; 0 beyond the edges."""
+    reach = period // 2
+    for axis in (-2, -1):
+        side = image.shape[axis]
+        padded = F.pad(image, (0, 0, reach, reach) if axis == -2 else (reach, reach))
+        image = padded.narrow(axis, reach, side) * (reach + 1.0)
+        for step in range(1, reach + 1):
+            for start in (reach - step, reach + step):
+                image.add_(padded.narrow(axis, start, side), alpha=reach + 1.0 - step)
+    return image
+
+
+@lru_cache(maxsize=4)
+def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """The planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
+    known = pattern(name)
+    planes = known.planes(height, width)[None]
+    return planes, 1.0 / _tent(planes, known.period)
 
 
 def _quad(cfa: CFA) -> Pattern:

@@ -17,7 +17,7 @@ _WAYS_OUT = (
     ),
     (r"out of memory|can't allocate memory", _MEMORY),
     (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
-    (r"no space left on device|pytorchstreamwriter", "the disk is full; make room"),
+    (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
 )
 """By what the error says, in lower case, first match."""
 

@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from rawaug import registry
+from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pair import Pair
 
 torch.set_num_threads(1)
@@ -49,6 +50,37 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
     for kind in kinds:
         monkeypatch.setattr(kind, "_things", {name: kind[name] for name in kind})
     return kinds
+
+
+@pytest.fixture
+def tiny(registries: list[registry.Registry]) -> None:
+    """``tiny:SPLIT``: the middle of two shots by the demo camera; ``tiny:``: four of its pictures."""
+
+    @registry.DATASETS.register("tiny")
+    def pairs(path: str = "", split: str = "test") -> list[Pair]:
+        return [pair.middle(96) for pair in demo_pairs(path or split, count=2)]
+
+    @registry.PICTURES.register("tiny")
+    def pictures(path: str = "", min_side: int = 2) -> list[torch.Tensor]:
+        return demo_pictures(4)
+
+
+@pytest.fixture
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine has no GPU, whatever it has."""
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+
+
+@pytest.fixture
+def unread(registries: list[registry.Registry]) -> str:
+    """The name of a dataset that must not be opened."""
+
+    @registry.DATASETS.register("unread")
+    def opened(path: str = "", split: str = "") -> list[Pair]:
+        pytest.fail("data was read")
+
+    return "unread:"
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -39,12 +38,19 @@ def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch:
         return network
 
     monkeypatch.setattr(torch, "compile", compiled)
-    monkeypatch.setattr(networks, "SIDE", 16)
     args = argparse.Namespace(
-        device=CPU, threads=1, minutes=0.0, width=None, batch=2, crop=32, repeats=1, workers=0, compile=["default"]
+        device=CPU,
+        threads=1,
+        minutes=0.0,
+        width=4,
+        side=16,
+        batch=2,
+        crop=32,
+        repeats=1,
+        workers=0,
+        compile=["default"],
     )
-    monkeypatch.setattr(networks, "SIZES", {"DnCNN": {"width": 4, "depth": 3}})
-    figures = networks.measure("DnCNN", args)
+    figures = networks.measure("DnCNN", args, {"depth": 3})
     assert modes == ["default"] and all(f"images/s, augmented{label}" in figures for label in ("", ", default"))
     assert figures["share of augmentation"] == pytest.approx(1 - figures["images/s, augmented"] / figures["images/s"])
     srgb = torch.zeros(2, 3, 32, 32, dtype=torch.uint8)
@@ -59,12 +65,9 @@ def test_published_sizes_can_be_built() -> None:
     assert built.keys() == networks.SIZES.keys()
 
 
-def test_denoising_is_timed_whole_and_in_tiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_denoising_is_timed_whole_and_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
-    monkeypatch.setattr(sys, "argv", ["denoise", "--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
-    denoise.main()
+    denoise.main(["--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
     rows = json.loads(out.read_text())["0.01 Mpix"]
     forms = {f"{form}, {p}" for form in ("whole", "tiles") for p in ("float32", "bfloat16")}
     assert set(rows) == forms | {"rawaug denoise"}

@@ -331,7 +331,5 @@ def _made(folder: Path) -> Path:
 def test_the_figures_are_written(harness: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark's exit status and file follow what it found."""
     monkeypatch.setattr(harness, "kills", lambda folder, names, count, seed: iter([("synth", ["0.dng differ"], 1.0)]))
-    monkeypatch.setattr(harness, "FAULTS", {})
-    monkeypatch.setattr(sys, "argv", ["faults", "--commands", "synth", "--json", str(tmp_path / "figures.json")])
-    assert harness.main() == 1
+    assert harness.main(["--commands", "synth", "--faults", "--json", str(tmp_path / "figures.json")]) == 1
     assert json.loads((tmp_path / "figures.json").read_text())["synth"]["wrong"] == ["0.dng differ"]

@@ -1,7 +1,7 @@
 """A command's arguments from the signature of its function: types, defaults and, from the docstring, help.
 
-Parameters before the ``*`` are positional, a list takes one or more; those after it are options. A ``bool`` that is
-False by default is a flag. The fields of a dataclass are options themselves.
+Parameters before the ``*`` are positional, a list takes one or more, one with a default may be left out; those after
+it are options. A ``bool`` that is False by default is a flag. The fields of a dataclass are options themselves.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ def add_arguments(parser: Any, function: Callable[..., Any]) -> None:
         if is_dataclass(hint):
             parser.add_class_arguments(hint)
         elif parameter.kind is not parameter.KEYWORD_ONLY:
-            several = {"type": str, "nargs": "+"} if hint == list[str] else {"type": hint}
-            parser.add_argument(name, **several, **about)
+            several: dict[str, Any] = {"type": str, "nargs": "+"} if hint == list[str] else {"type": hint}
+            optional = {} if default is parameter.empty else {"nargs": "?", "default": default}
+            parser.add_argument(name, **several, **optional, **about)
         elif default is False:
             parser.add_argument(_flag(name), action="store_true", **about)
         elif default is parameter.empty:

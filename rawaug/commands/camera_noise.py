@@ -81,7 +81,7 @@ def _measured(
     if dark is not None:
         matching = dark.get(iso) or dark.get(None)
         if matching is None:
-            raise ValueError(f"dark: has no frame{where}; give dark frames of every ISO that is measured")
+            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
         read_var = from_dark_frames(*_aligned(matching)).read_var
     try:
         estimate = estimate_noise(*_aligned(frames), read_var=read_var)
@@ -101,13 +101,15 @@ def _by_iso(frames: Sequence[Frame]) -> dict[float | None, list[Frame]]:
     cameras = dict.fromkeys(frame.camera for frame in frames if frame.camera != _UNKNOWN)
     if len(cameras) > 1:
         counted = ", ".join(f"{name} ({sum(f.camera == name for f in frames)})" for name in cameras)
-        raise ValueError(f"noise: the frames are of {len(cameras)} cameras, {counted}; measure each camera by itself")
+        raise ValueError(
+            f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each camera separately"
+        )
     by_iso: dict[float | None, list[Frame]] = defaultdict(list)
     for frame in frames:
         by_iso[frame.iso].append(frame)
     if None in by_iso and len(by_iso) > 1:
         raise ValueError(
-            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; leave them out, or measure them alone"
+            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; omit them, or measure them separately"
         )
     return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
 

@@ -12,7 +12,7 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,34 +20,20 @@ from typing import Any
 
 from torch import Tensor
 
-import denoisers
-from denoisers.pretrained import DEFAULT, find
+from denoisers.pretrained import DEFAULT
 from rawaug import bayer
-from rawaug.commands.frame_denoisers import ClassicalDenoiser, FrameDenoiser, NetworkDenoiser
-from rawaug.commands.synth import require_same_settings
+from rawaug.commands.folder_settings import require_same_settings
+from rawaug.commands.frame_denoisers import FrameDenoiser, NetworkDenoiser, frame_denoiser
+from rawaug.commands.frame_noise import Noise, as_json, levels_of, stored_noise
 from rawaug.data.raw_folder import EXTENSIONS
 from rawaug.files import require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
 from rawaug.io.raw import develop
-from rawaug.isp.model import DictionaryISP
 from rawaug.lock import one_at_a_time
-from rawaug.noise import (
-    EldLevels,
-    FixedLevels,
-    MeasuredLevels,
-    camera_law,
-    camera_names,
-    estimate_noise,
-    noise_levels,
-)
 from rawaug.printable import printable
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS, Spec
-from rawaug.seeding import keyed_generator
-
-Noise = str | Sequence[float] | MeasuredLevels
-"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
+from rawaug.registry import COMMANDS
 
 _NO_NOISE = (0.0, 0.0)
 
@@ -98,21 +84,6 @@ def run(
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
 
 
-def frame_denoiser(
-    denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
-) -> FrameDenoiser:
-    """What denoises: the network, the classical filter, or the network that is taken where neither is named.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is none such, or both are named.
-    """
-    if classical is None:
-        return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
-    if denoiser is not None or self_ensemble:
-        raise ValueError("classical: a filter takes neither --denoiser nor --self-ensemble; give one or the other")
-    return ClassicalDenoiser(classical)
-
-
 @dataclass(frozen=True)
 class Denoised:
     """What was done to a file.
@@ -141,80 +112,6 @@ class DenoisedFolder:
     files: list[Denoised] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
-
-
-def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame and their source; ``auto`` is the profile, else the estimate.
-
-    Raises:
-        ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
-    """
-    if isinstance(noise, MeasuredLevels):
-        return *_of_law(noise, frame), "camera"
-    if not isinstance(noise, str):
-        fixed = FixedLevels(*noise)
-        return fixed.shot_var, fixed.read_var, "given"
-    if noise == "profile" or (noise == "auto" and frame.noise_profile is not None):
-        if frame.noise_profile is None:
-            raise ValueError(
-                f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or --noise '[shot_var, read_var]'"
-            )
-        return *frame.noise_profile, "profile"
-    if noise in ("auto", "estimate"):
-        try:
-            estimate = estimate_noise(frame.mosaic, frame.cfa)
-        except ValueError as error:
-            raise ValueError(
-                f"{frame.name}: {error}; or pass --noise '[shot_var, read_var]' or a camera's name"
-            ) from None
-        return estimate.shot_var, estimate.read_var, "estimate"
-    if noise not in camera_names():
-        raise ValueError(
-            f"noise {noise!r} is unknown; use auto, profile, estimate, [shot_var, read_var] or one of {camera_names()}"
-        )
-    if frame.iso is None:
-        raise ValueError(
-            f"{frame.name}: has no ISO tag, needed for {noise}'s noise levels; pass --noise '[shot_var, read_var]'"
-        )
-    try:
-        levels = noise_levels(noise, iso=frame.iso)
-    except ValueError as error:
-        raise ValueError(f"{frame.name}: {error}") from None
-    if isinstance(levels, EldLevels):
-        return *levels.typical(), noise
-    shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
-    return float(shot_var), float(read_var), noise
-
-
-def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
-    """The law at the frame's ISO.
-
-    Raises:
-        ValueError: if the law is of another camera, or does not reach the ISO.
-    """
-    known = {law.camera, frame.camera} - {"unknown"}
-    if len(known) > 1:
-        raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
-    try:
-        return law.at(frame.iso)
-    except ValueError as error:
-        raise ValueError(f"{frame.name}: {error}; pass --noise estimate or --noise '[shot_var, read_var]'") from None
-
-
-def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
-    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or no law in it.
-    """
-    if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
-        return noise
-    stored = denoisers.load(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
-    law = stored.get("noise")
-    if not isinstance(law, Mapping):
-        file = denoiser if noise == "camera" else noise
-        raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
-    return camera_law(law)
 
 
 def denoise_file(
@@ -338,7 +235,7 @@ def denoise_folder(
     targets = _targets(source, out)
     require_writable(out, folder=True)
     made, strength = _made(method), _checked(strength)
-    settings = {**made.settings, "noise": _as_json(noise)}
+    settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
     result = DenoisedFolder()
@@ -353,12 +250,6 @@ def denoise_folder(
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
     return result
-
-
-def _as_json(noise: Noise) -> Any:
-    if isinstance(noise, MeasuredLevels):
-        return noise.spec()
-    return noise if isinstance(noise, str) else list(noise)
 
 
 def _targets(source: Path, out: Path) -> dict[Path, Path]:

@@ -151,10 +151,7 @@ def evaluate(
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
-            methods = {label_of(spec): classical_method(spec, scoring.levels, seed) for spec in classical}
-            methods["denoised"] = scoring.method()
-            for pair in shown_on_page(pairs.kept()):
-                page.add_frame(row_of(methods, pair, scoring.levels, scoring.cfa, seed), scoring.cfa)
+            scoring.add_frames(page, classical)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
         result["broken"] = pairs.reasons()
@@ -186,6 +183,13 @@ class _Scoring:
     def method(self, views: int = 1) -> Method:
         """The denoiser, as what scores and pictures call."""
         return network_method(self.model, self.cfa, views=views, at_test=self.at_test)
+
+    def add_frames(self, page: Page, classical: Sequence[Spec]) -> None:
+        """Pictures of some frames: noisy, denoised by each filter and by the denoiser, clean."""
+        methods = {label_of(spec): classical_method(spec, self.levels, self.seed) for spec in classical}
+        methods["denoised"] = self.method()
+        for pair in shown_on_page(self.pairs.kept()):
+            page.add_frame(row_of(methods, pair, self.levels, self.cfa, self.seed), self.cfa)
 
     def _summary(self, views: int, label: str) -> dict[str, Any]:
         scored = score_method(self.method(views), self.pairs, self.levels, self.cfa, self.seed, label)

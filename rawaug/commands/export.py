@@ -84,10 +84,10 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
         FileNotFoundError, ValueError: if the denoiser or the frame cannot be read, a package is missing, ``out`` is not
             named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`rawaug.commands.onnx_files.TOLERANCE`.
     """
-    require_onnx()
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
+    require_onnx()
     model, _ = denoisers.load(find(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
     images = comparison_frame(frame)[: len(names)]

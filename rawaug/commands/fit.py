@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
@@ -12,6 +12,7 @@ from rawaug.commands.camera_noise import CameraNoise, measure_camera_noise
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.identity import shared_frame
 from rawaug.data.pair import Pair
+from rawaug.data.pair_folder import MosaicSettings
 from rawaug.data.readable import Readable, left_out
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.files import require_writable
@@ -34,6 +35,7 @@ def run(
     out: str,
     noise: Literal["auto", "on", "off"] = "auto",
     dark: str | None = None,
+    mosaics: MosaicSettings,
     config: FitConfig,
 ) -> None:
     """Fit a dictionary ISP to RAW files, with the camera's JPEGs of the same stems if present.
@@ -46,6 +48,7 @@ def run(
         noise: measure the camera's noise at each ISO of the files, for noise: camera; auto continues without it where
             the frames do not allow it.
         dark: folder of dark frames to measure the read variance.
+        mosaics: CFA and levels of pairs:PATH.
         config: of the fit.
     """
     if Path(out).suffix != ".safetensors":
@@ -62,6 +65,7 @@ def run(
             held_out=held_out,
             noise=noise,
             dark=dark,
+            **vars(mosaics),
             **vars(config),
         )
         isp.info["data"] = data
@@ -90,6 +94,9 @@ def fit(
     camera_jpeg: bool = True,
     held_out: str | Path | Sequence[Pair] | None = None,
     state: str | Path | None = None,
+    cfa: str | None = None,
+    black: float | Sequence[float] | None = None,
+    white: float | None = None,
     **settings: Any,
 ) -> DictionaryISP:
     """Fit an ISP to your own camera.
@@ -105,6 +112,7 @@ def fit(
         held_out: frames of which none is fitted; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
         state: file with the state of the fit, to resume it; removed at the end.
+        cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.
         settings: of :class:`rawaug.isp.fit.FitConfig`.
 
     Frames that cannot be read, of those fitted and those held out, are left out; ``isp.info["unreadable"]`` has a line
@@ -122,8 +130,12 @@ def fit(
     if noise not in ("auto", "on", "off"):
         raise ValueError(f"noise must be auto, on or off, got {noise!r}")
     start = time.perf_counter()
-    pairs = _pairs(source, camera_jpeg)
-    watch = None if held_out is None else _Watch(_unseen(_pairs(held_out, camera_jpeg), pairs))
+    mosaics = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
+    pairs = _pairs(source, camera_jpeg, mosaics)
+    watch = None
+    if held_out is not None:
+        own = mosaics if str(held_out).startswith("pairs:") else {}
+        watch = _Watch(_unseen(_pairs(held_out, camera_jpeg, own), pairs))
     frames = Readable(pairs)
     estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
     isp = fit_isp(frames, FitConfig(**settings), progress, state, watch)
@@ -196,18 +208,22 @@ def _unseen(held_out: Sequence[Pair], fitted: Sequence[Pair]) -> Sequence[Pair]:
     return held_out
 
 
-def _pairs(source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool) -> Sequence[Pair]:
+def _pairs(
+    source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
+) -> Sequence[Pair]:
     if isinstance(source, (str, Path)):
         source = [source]
     if not hasattr(source, "__getitem__") or not len(source):
         raise ValueError("nothing to fit; give one or more files, folders or pairs")
     if isinstance(source[0], Pair):
+        if mosaics:
+            raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
         return source  # type: ignore[return-value]
     if not isinstance(source[0], (str, Path)):
         raise ValueError(
             f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
         )
-    opened = [open_pairs(str(item), split="train", as_clean=False) for item in source]
+    opened = [open_pairs(str(item), split="train", as_clean=False, **mosaics) for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]
     files: list[Path] = []

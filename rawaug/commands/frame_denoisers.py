@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.network import Denoiser
-from denoisers.pretrained import find
+from denoisers.pretrained import DEFAULT, find
 from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -24,12 +24,23 @@ from rawaug.data.sample import Sample
 from rawaug.devices import find_device
 from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
-from rawaug.io import RawFrame
 from rawaug.noise import anscombe
 from rawaug.registry import FILTERS, Spec
 
 FILTER_TILE, FILTER_OVERLAP = 512, 32
 """Packed pixels; the filters look 8 pixels around, and BM3D 20."""
+
+
+class Frame(Protocol):
+    """What is denoised: a RAW file's frame, or a block of one."""
+
+    @property
+    def mosaic(self) -> Tensor:
+        """float32 ``(1, H, W)``."""
+
+    @property
+    def cfa(self) -> CFA:
+        """Its pattern."""
 
 
 class FrameDenoiser(Protocol):
@@ -43,7 +54,7 @@ class FrameDenoiser(Protocol):
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the frame and its levels, as JSON."""
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black."""
 
 
@@ -71,13 +82,13 @@ class NetworkDenoiser:
         """Whether the network has a noise map or a variance-stabilising transform."""
         return self.model.reads_variance
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """See :class:`FrameDenoiser`."""
         return denoise_mosaic(self.model, self.cfa, frame, levels, self.self_ensemble)
 
 
 def denoise_mosaic(
-    model: Denoiser, cfa: CFA, frame: RawFrame, levels: tuple[float, float], self_ensemble: bool = False
+    model: Denoiser, cfa: CFA, frame: Frame, levels: tuple[float, float], self_ensemble: bool = False
 ) -> Tensor:
     """The frame's mosaic denoised, float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black.
 
@@ -115,7 +126,7 @@ class ClassicalDenoiser:
         self.filter = FILTERS.make(spec)
         self.settings: dict[str, Any] = {"classical": spec}
 
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """See :class:`FrameDenoiser`."""
         packed = bayer.pack(frame.mosaic[None], frame.cfa)
         run = partial(self._tile, levels=levels)
@@ -128,3 +139,18 @@ class ClassicalDenoiser:
             return denoised
         shot_var, read_var = (torch.tensor([level]) for level in levels)
         return Stabilised(self.filter, anscombe)(noisy, shot_var=shot_var, read_var=read_var)
+
+
+def frame_denoiser(
+    denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
+) -> FrameDenoiser:
+    """What denoises: the network, the classical filter, or the network that is taken where neither is named.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is none such, or both are named.
+    """
+    if classical is None:
+        return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
+    if denoiser is not None or self_ensemble:
+        raise ValueError("classical: a filter takes neither --denoiser nor --self-ensemble; give one or the other")
+    return ClassicalDenoiser(classical)

@@ -5,6 +5,7 @@ format  files                                  content
 ======  =====================================  ====================================================================
 dng     ``NAME_clean.dng NAME_noisy.dng``      16 bits, as a camera would; opens in a RAW developer
 npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, and statements
+                                               (mosaics ``(1, H, W)`` where the pattern is not Bayer's)
 tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1; statements in its description
 ======  =====================================  ====================================================================
 
@@ -29,7 +30,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug import bayer
 from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
 from rawaug.extras import extra
 from rawaug.files import digest, read_header, replacing, write_tensors
@@ -128,8 +128,8 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
         _write_npz(stem, pair, augment)
     else:
         stated = _stated(pair, augment)
-        _write_tiff(_beside(stem, "_clean.tif"), pair.clean, augment.isp.cfa, stated)
-        _write_tiff(_beside(stem, "_noisy.tif"), pair.noisy, augment.isp.cfa, stated)
+        _write_tiff(_beside(stem, "_clean.tif"), augment.mosaic(pair.clean), stated)
+        _write_tiff(_beside(stem, "_noisy.tif"), augment.mosaic(pair.noisy), stated)
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
     write_tensors(pair.params.tensors(), header, params_file(stem))
 
@@ -166,14 +166,17 @@ def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def _write_tiff(path: Path, packed: Tensor, cfa: bayer.CFA, stated: dict[str, Any]) -> None:
+def _write_tiff(path: Path, mosaic: Tensor, stated: dict[str, Any]) -> None:
     with extra("raw"):
         import tifffile
 
-    mosaic = bayer.unpack(packed, cfa)[0].numpy()
     with replacing(path) as partial:
         tifffile.imwrite(
-            partial, mosaic, photometric="minisblack", metadata=None, description=json.dumps(stated, sort_keys=True)
+            partial,
+            mosaic[0].numpy(),
+            photometric="minisblack",
+            metadata=None,
+            description=json.dumps(stated, sort_keys=True),
         )
 
 
@@ -189,7 +192,7 @@ def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """What :mod:`rawaug.data.mosaic_files` reads beside a mosaic; a colour that no camera has is left out."""
     noise = pair.params.noise
-    stated: dict[str, Any] = {"cfa": str(augment.isp.cfa)}
+    stated: dict[str, Any] = {"cfa": augment.cfa}
     stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
     try:
         white_balance, matrix, _ = _color(pair, augment)
@@ -222,7 +225,7 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
     }
     noise = pair.params.noise
     levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
-    clean, noisy = (bayer.unpack(raw, augment.isp.cfa) for raw in (pair.clean, pair.noisy))
+    clean, noisy = (augment.mosaic(raw) for raw in (pair.clean, pair.noisy))
     return (
         RawFrame(mosaic=clean, noise_profile=None, **metadata),
         RawFrame(mosaic=noisy, noise_profile=levels, **metadata),
@@ -257,7 +260,7 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
     lens = augment.isp.find(LensShading)
     if lens is None:
         return ()
-    height, width = (2 * side for side in pair.clean.shape[-2:])
+    height, width = augment.mosaic(pair.clean).shape[-2:]
     rows, columns = _SHADING_NODES
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2

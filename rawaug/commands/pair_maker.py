@@ -5,7 +5,7 @@ The draws of a pair depend on (seed, picture's name, number) alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -15,10 +15,11 @@ from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture
 from rawaug.io.apart import apart
 from rawaug.io.picture_files import MAX_PIXELS
-from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.drawing import Drawing, draw_key
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
-from rawaug.seeding import keyed_generator
+from rawaug.registry import Spec
 
 Format = Literal["dng", "npz", "tiff", "webdataset"]
 
@@ -28,11 +29,13 @@ class Settings:
     """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
 
     format: Format
-    isp: str
+    drawing: Drawing
     isp_sha256: str
-    noise: str | list[float]
-    sampling: Sampling
     seed: int
+
+    def stored(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"format": self.format, "isp_sha256": self.isp_sha256, "seed": self.seed, **self.drawing.stored()}
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,9 @@ class Origin:
     picture_sha256: str
     isp: str
     isp_sha256: str
-    noise: str | list[float]
+    noise: Spec | Sequence[float]
     version: str = __version__
+    cfa: str | None = None
 
 
 class Outcome(NamedTuple):
@@ -81,7 +85,13 @@ class PairMaker:
 
     def __init__(self, settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
         self.settings, self.max_pixels = settings, max_pixels
-        self.augment = augmentation(settings.isp, settings.noise, settings.sampling)
+        self.augment = settings.drawing.make()
+
+    def origin(self, picture: Path, content: str) -> Origin:
+        """Of the pairs of a picture with this hash."""
+        drawing = self.settings.drawing
+        noise, cfa = drawing.noise_spec, self.augment.cfa
+        return Origin(str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa)
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers.
@@ -99,14 +109,13 @@ class PairMaker:
         after = picture.stat()
         if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
             raise ValueError(f"{picture}: changed while it was read; run the same command again")
-        s = self.settings
 
         def made() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:
-                params = self.augment.sample(srgb, keyed_generator(self.settings.seed, "synth", key, number))
+                params = self.augment.sample(srgb, draw_key(self.settings.seed, key, number))
                 yield number, self.augment.apply(srgb, params)
 
-        return Origin(str(picture), content, s.isp, s.isp_sha256, s.noise), made()
+        return self.origin(picture, content), made()
 
 
 def replayed(
@@ -125,7 +134,7 @@ def replayed(
         FileNotFoundError: if picture or ISP are not there.
         ValueError: if they have changed since.
     """
-    augment = augmentation(str(isp or origin.isp), origin.noise)
+    augment = RawAugment.from_pretrained(str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa)
     found = Path(picture or origin.picture)
     if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
         raise ValueError(f"{label}: the ISP {isp or origin.isp} is not the one this pair was made with")
@@ -134,8 +143,3 @@ def replayed(
         raise ValueError(f"{label}: the picture {found} has changed since this pair was made")
     pair: RawPair = augment.apply(srgb, drawn)
     return pair
-
-
-def augmentation(isp: str, noise: str | list[float], sampling: Any = "convex") -> RawAugment:
-    """The augmentation with these settings."""
-    return RawAugment.from_pretrained(isp, noise=noise, sampling=sampling)

@@ -31,6 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rawaug.bayer import CFA
 from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, replayed
 from rawaug.files import parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
@@ -144,11 +145,10 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """The JSON of a sample. Paths are those within the folder, which other machines have elsewhere."""
     own = {**vars(origin), "picture": name, "isp": Path(origin.isp).name, "number": number}
-    height, width = (2 * side for side in pair.clean.shape[-2:])
+    height, width = maker.augment.mosaic(pair.clean).shape[-2:]
     levels = {key: pair.params.noise[key].item() for key in ("shot_var", "read_var") if key in pair.params.noise}
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
-    cfa = str(maker.augment.isp.cfa)
-    return own | levels | {"cfa": cfa, "height": height, "width": width, "params": params}
+    return own | levels | {"height": height, "width": width, "params": params}
 
 
 def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:
@@ -203,6 +203,12 @@ def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
 def card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """The dataset card, with the header that Hugging Face reads."""
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
+    drawing = settings.drawing
+    others = {key: drawing.stored().get(key) for key in ("camera", "light", "tone", "exposure", "iso", "cfa")}
+    rows = "".join(f"\n| {key} | {value} |" for key, value in others.items() if value is not None)
+    form = "packed float32 `(4, h, w)` in the order R, Gr, Gb, B"
+    if drawing.cfa is not None and drawing.cfa not in CFA.__members__:
+        form = f"float32 mosaics `(1, H, W)` of the pattern {drawing.cfa}"
     category = next((name for limit, name in _SIZES if pairs < limit), "n>10M")
     return f"""---
 configs:
@@ -224,12 +230,12 @@ tags:
 
 | setting | value |
 |---|---|
-| ISP | {Path(settings.isp).name} (SHA-256 {settings.isp_sha256}) |
-| noise | {settings.noise} |
-| sampling of cameras | {settings.sampling} |
-| seed | {settings.seed} |
+| ISP | {Path(drawing.isp).name} (SHA-256 {settings.isp_sha256}) |
+| noise | {drawing.noise} |
+| sampling of cameras | {drawing.sampling} |
+| seed | {settings.seed} |{rows}
 
-Each sample has `clean.npy` and `noisy.npy`, packed float32 `(4, h, w)` in the order R, Gr, Gb, B, black 0, white 1,
-not clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise
-levels, and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
+Each sample has `clean.npy` and `noisy.npy`, {form}, black 0, white 1, not
+clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels
+and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
 """

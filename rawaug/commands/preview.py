@@ -22,6 +22,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stages import place_in_frame
 from rawaug.isp.tone_curves import STEPS
+from rawaug.patterns import pattern
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
 from rawaug.registry import COMMANDS
@@ -33,7 +34,14 @@ _MAXIMUM = 768
 
 @COMMANDS.register("preview")
 def run(
-    picture: str, *, out: str, isp: str = "universal", count: int = 8, seed: int = 0, max_pixels: int = MAX_PIXELS
+    picture: str,
+    *,
+    out: str,
+    isp: str = "universal",
+    count: int = 8,
+    seed: int = 0,
+    cfa: str | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> None:
     """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
 
@@ -42,10 +50,11 @@ def run(
         out: output PNG; the atoms are written to NAME-atoms.png.
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
-        seed: of these.
+        seed: random seed of these.
+        cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
         max_pixels: a larger picture is refused before it is decoded.
     """
-    for path in preview(picture, isp, out, count, seed, max_pixels):
+    for path in preview(picture, isp, out, count, seed, max_pixels, cfa):
         print(path)
 
 
@@ -56,6 +65,7 @@ def preview(
     count: int = 8,
     seed: int = 0,
     max_pixels: int = MAX_PIXELS,
+    cfa: str | None = None,
 ) -> list[Path]:
     """Draw both figures.
 
@@ -64,8 +74,9 @@ def preview(
         weights: an ISP, shipped or a path.
         out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
         count: number of augmented RAWs to plot.
-        seed: of these.
+        seed: random seed of these.
         max_pixels: a larger picture is refused before it is decoded.
+        cfa: pattern of the RAW, as in :class:`rawaug.RawAugment`.
 
     Returns:
         The two paths.
@@ -74,12 +85,12 @@ def preview(
         raise ValueError(f"count must be at least 0, got {count}")
     out = Path(out) if Path(out).suffix else Path(f"{out}.png")
     require_writable(out)
-    isp = DictionaryISP.from_pretrained(weights)
+    augment = RawAugment.from_pretrained(weights, cfa=cfa)
     whole = even_sided(read_picture(picture, max_pixels))
     out.parent.mkdir(parents=True, exist_ok=True)
     atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")
-    _draw_stages(isp, whole, count, seed).savefig(out, dpi=130)
-    _draw_atoms(isp).savefig(atoms, dpi=130)
+    _draw_stages(augment, whole, count, seed).savefig(out, dpi=130)
+    _draw_atoms(augment.isp).savefig(atoms, dpi=130)
     return [out, atoms]
 
 
@@ -91,25 +102,27 @@ def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
 
 
 @torch.no_grad()
-def _draw_stages(isp: DictionaryISP, whole: Tensor, count: int, seed: int) -> Any:
+def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> Any:
     with extra("train"):
         from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
+    isp = augment.isp
     srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
     reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
     panels, titles = {"sRGB x": srgb[0] / 255.0}, {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
     for name, image in reverse.intermediates.items():
         shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
         panels[f"{name}: {titles[name]}"] = shown.clamp(0, 1)
-    panels["RAW y"] = encode_srgb(bayer.demosaic(reverse.raw, isp.cfa)[0].clamp(0, 1))
-    augment = RawAugment(isp)
+    sensor = pattern(augment.cfa)
+    raw = sensor.demosaic(sensor.mosaic(image))
+    panels[f"RAW y, {sensor.name}"] = encode_srgb(raw[0].clamp(0, 1))
     generator = keyed_generator(seed, "preview")
     for k in range(count):
         pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
         gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
-        developed = isp.forward(bayer.unpack(pair.clean, isp.cfa), reverse.params)
-        panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed.srgb[0]
+        developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), reverse.params).clamp(0, 1)
+        panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed[0]
     columns = max(len(panels) - count, 4)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(2.6 * columns, 2.6 * rows), layout="constrained")

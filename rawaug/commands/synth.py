@@ -7,7 +7,6 @@ made once.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
@@ -19,20 +18,24 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from rawaug.bayer import CFA
 from rawaug.commands import pair_shards
+from rawaug.commands.folder_settings import require_same_settings
 from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.picture_folder import EXTENSIONS
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import find_weights, sha256, write_json
+from rawaug.files import find_weights, sha256
 from rawaug.io.apart import prepare
 from rawaug.io.picture_files import MAX_PIXELS
 from rawaug.lock import NAME, locked
 from rawaug.plugin.augment import Sampling
+from rawaug.plugin.drawing import Drawing
 from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
@@ -47,9 +50,7 @@ def run(
     *,
     format: Format = "dng",
     per_image: int = 1,
-    isp: str = "universal",
-    noise: tuple[float, float] | str = "cycleisp_sidd",
-    sampling: Sampling = "convex",
+    drawing: Drawing,
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -59,21 +60,19 @@ def run(
     """Write RAW pairs made from a folder of sRGB pictures; resumable.
 
     Args:
-        pictures: folder of sRGB pictures.
+        pictures: folder of sRGB pictures, or one picture.
         out: output folder.
         format: 16-bit DNG, packed float32 NPZ, float32 TIFF, or tar shards for WebDataset and Hugging Face.
         per_image: pairs per picture.
-        isp: ISP file, or the name of a shipped ISP.
-        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
-        sampling: how camera settings are drawn.
+        drawing: what is drawn.
         seed: random seed.
         workers: number of processes; by default one per core.
         max_pixels: larger pictures are refused before they are decoded.
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    made = synth(pictures, out, format, per_image, isp, noise, sampling, seed, workers, max_pixels, shard, per_shard)
-    print_synthesis(made)
+    rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
+    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **vars(drawing)))
 
 
 @dataclass
@@ -101,11 +100,12 @@ def synth(
     max_pixels: int = MAX_PIXELS,
     shard: str = "1/1",
     per_shard: int = PER_SHARD,
+    **drawn: Any,
 ) -> Synthesis:
-    """Make ``per_image`` pairs of every picture of a folder and its subfolders; existing pairs are kept.
+    """Make ``per_image`` pairs of every picture of a folder and its subfolders, or of one; existing pairs are kept.
 
     Args:
-        source: the folder of sRGB pictures.
+        source: the folder of sRGB pictures, or one picture.
         out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
         format: dng, npz, tiff or webdataset.
         per_image: pairs per picture; may grow from run to run, but not in shards.
@@ -118,26 +118,26 @@ def synth(
         max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
+        drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso`` and ``cfa``, as in
+            :class:`rawaug.plugin.drawing.Drawing`.
 
     Raises:
-        FileNotFoundError: if there is no such folder or ISP.
+        FileNotFoundError: if there is no such folder, picture or ISP.
         ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings
             or is in use by another run.
         OSError: if a worker dies, or the output folder is removed meanwhile.
     """
     start = time.perf_counter()
-    weights = str(isp) if not Path(isp).suffix else str(Path(isp).resolve())
-    levels = noise if isinstance(noise, str) else list(noise)
-    settings = Settings(format, weights, sha256(find_weights(weights)), levels, sampling, seed)
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
-    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
-        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
-        raise ValueError(f"{wanted}, got {format} and {per_image}")
+    source = source.parent if source.is_file() else source
+    settings = _settings(format, per_image, seed, isp=isp, noise=noise, sampling=sampling, **drawn)
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
-    PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
+    cfa = PairMaker(settings, max_pixels).augment.cfa  # raises for a wrong name here, not in a worker
+    if format == "dng" and cfa not in CFA.__members__:
+        raise ValueError(f"format dng holds Bayer mosaics, not {cfa}; use npz, tiff or webdataset")
     result = Synthesis(out)
     with locked(out / (NAME if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
         if format == "webdataset":
@@ -148,7 +148,7 @@ def synth(
             pair_shards.finish(shards, settings, out)
         else:
             tasks = list(picture_tasks(pictures, source, out, per_image))
-            require_same_settings(out / "synth.json", vars(settings))
+            require_same_settings(out / "synth.json", settings.stored())
             _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
@@ -173,9 +173,18 @@ def part_of(shard: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
+def _settings(format: Format, per_image: int, seed: int, **drawn: Any) -> Settings:
+    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
+        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
+        raise ValueError(f"{wanted}, got {format} and {per_image}")
+    isp = drawn["isp"]
+    drawing = Drawing(**drawn | {"isp": str(isp) if not Path(isp).suffix else str(Path(isp).resolve())})
+    return Settings(format, drawing, sha256(find_weights(drawing.isp)), seed)
+
+
 def _portable(settings: Settings) -> dict[str, object]:
     """The settings of shards, which machines that have the ISP's file in different places share."""
-    return {**vars(settings), "isp": Path(settings.isp).name}
+    return {**settings.stored(), "isp": Path(settings.drawing.isp).name}
 
 
 def _work_off(
@@ -195,33 +204,16 @@ def _work_off(
 
 
 def _pictures(source: Path, out: Path) -> list[Path]:
+    if source.is_file():
+        return [source]
     if not source.is_dir():
-        raise FileNotFoundError(f"{source}: no such folder of pictures")
+        raise FileNotFoundError(f"{source}: no such folder of pictures, and no picture")
     if out.resolve().is_relative_to(source):
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
     pictures = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
     if not pictures:
         raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
     return pictures
-
-
-def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``.
-
-    Raises:
-        ValueError: if the existing files were made with other settings.
-    """
-    if path.is_file() and not overwrite:
-        try:
-            known = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
-        for key in known | settings:
-            value, asked = known.get(key), settings.get(key)
-            if asked != value:
-                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
-        return
-    write_json(settings, path)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+from torch.utils.data import ConcatDataset
 
 from rawaug.data.check import DataReport, check
 from rawaug.data.demo.camera import DemoCamera
@@ -25,6 +25,8 @@ from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.picture_folder import PictureFolder
 from rawaug.data.raw_folder import RawFolder
 from rawaug.data.rawir import Rawir
+from rawaug.data.rgb2raw import Rgb2Raw
+from rawaug.data.shapes import Shapes
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.data.sidd.submission import check_submission, write_submission
@@ -42,6 +44,8 @@ __all__ = [
     "PictureFolder",
     "RawFolder",
     "Rawir",
+    "Rgb2Raw",
+    "Shapes",
     "SiddBenchmark",
     "SiddBlocks",
     "SiddFrames",
@@ -124,22 +128,27 @@ def _require_none(settings: Mapping[str, Any], spec: object) -> None:
         raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
 
 
-def open_pictures(spec: str, min_side: int = 2, max_pixels: int | None = None) -> Sequence[Tensor] | PictureFolder:
-    """Open sRGB pictures, uint8 ``(3, H, W)``: a folder, or ``"demo:"``.
+def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int | None = None) -> Any:
+    """Open sRGB pictures, a map-style dataset of uint8 ``(3, H, W)``: a folder, ``"demo:"``, ``"shapes:100"``.
 
     Args:
-        spec: ``"demo:"`` or the path of a folder.
+        spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
         max_pixels: larger ones likewise; None for :data:`rawaug.io.picture_files.MAX_PIXELS`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
+
+    Example:
+        >>> len(open_pictures(["demo:", "shapes:10"]))
+        42
     """
+    if not isinstance(spec, str):
+        return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
     kind, path = _kind_and_path(spec)
     if kind is None:
         return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)
-    pictures: Sequence[Tensor] = _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
-    return pictures
+    return _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
 
 
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:

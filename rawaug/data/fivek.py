@@ -2,7 +2,9 @@
 
 Each DNG is developed by LibRaw with the camera's white balance and without automatic brightness (see
 :func:`rawaug.io.read_raw_and_develop`), as the sRGB of the pair. ``fivek.json`` beside this file lists the numbers of
-the splits: 650 and 127 frames of the Canon, 414 and 73 of the Nikon.
+the splits: 650 and 127 frames of the Canon, 414 and 73 of the Nikon. InvISP's pictures (``invisp_canon:``,
+``invisp_nikon:``) differ: LibRaw scales each frame by its own maximum (``adjust_maximum_thr`` 0.75, its default), and
+they are stored as JPEGs of quality 90.
 
 Source: V. Bychkovsky, S. Paris, E. Chan, F. Durand, "Learning photographic global tonal adjustment with a database of
 input/output image pairs", CVPR 2011; Y. Xing, Z. Qian, Q. Chen, "Invertible image signal processing", CVPR 2021.
@@ -27,7 +29,11 @@ _DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
 @DATASETS.register("fivek")
 def fivek_pairs(
-    path: str | Path, split: str, cameras: Sequence[str] = CAMERAS, adjust_maximum_thr: float = 0.0
+    path: str | Path,
+    split: str,
+    cameras: Sequence[str] = CAMERAS,
+    adjust_maximum_thr: float = 0.0,
+    jpeg_quality: int | None = None,
 ) -> RawFolder:
     """The pairs of a split, Canon before Nikon, each sorted by number.
 
@@ -35,7 +41,8 @@ def fivek_pairs(
         path: contains the DNGs under their published names, ``a0016-jmac_MG_0795.dng``, at any depth.
         split: ``"train"`` or ``"test"``.
         cameras: some of :data:`CAMERAS`.
-        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum; InvISP's script leaves it at 0.75.
+        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum.
+        jpeg_quality: the pictures as JPEGs of this quality give them back; None leaves them as they are.
 
     Raises:
         FileNotFoundError: if there is no such folder, or one of the split's DNGs is missing.
@@ -57,11 +64,16 @@ def fivek_pairs(
             f"{path}: {len(missing)} of the {len(wanted)} DNGs of fivek {'+'.join(cameras)}, {split}, are missing, "
             f"first a{missing[0]}-*.dng"
         )
-    return RawFolder([files[number] for number in wanted], camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr)
+    chosen = [files[number] for number in wanted]
+    return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
-DATASETS.register("fivek_canon")(partial(fivek_pairs, cameras=["canon"]))
-DATASETS.register("fivek_nikon")(partial(fivek_pairs, cameras=["nikon"]))
+AS_INVISP = {"adjust_maximum_thr": 0.75, "jpeg_quality": 90}
+"""How InvISP's published script makes the pictures."""
+
+for _camera in CAMERAS:
+    DATASETS.register(f"fivek_{_camera}")(partial(fivek_pairs, cameras=[_camera]))
+    DATASETS.register(f"invisp_{_camera}")(partial(fivek_pairs, cameras=[_camera], **AS_INVISP))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:

@@ -71,6 +71,11 @@ class Pair:
         if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
             raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
 
+    @property
+    def balance_known(self) -> bool:
+        """Whether ``white_balance`` is the camera's."""
+        return self.white_balance != (1.0, 1.0, 1.0)
+
     def with_levels(self) -> Pair:
         """This pair; the levels of a noisy capture that came without are measured against ``raw``."""
         if self.noisy is None or self.shot_var is not None:

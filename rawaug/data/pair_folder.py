@@ -1,4 +1,4 @@
-"""A folder of noisy/clean RAW pairs of one's own, or as ``rawaug synth`` writes them: ``pairs:PATH``.
+"""A folder of noisy/clean RAW pairs, yours or written by ``rawaug synth``: ``pairs:PATH``.
 
 The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files of other names hold both.
 Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand at the same places in ``clean``.
@@ -31,22 +31,31 @@ _WILD = re.compile(r"[*?]")
 
 
 @dataclass
-class PairSettings:
+class MosaicSettings:
+    """How the mosaics of ``pairs:PATH`` are read where their files do not say it.
+
+    Args:
+        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, for files that do not state it.
+        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
+        white: of pairs:PATH: white level of files that do not state it.
+    """
+
+    cfa: str | None = None
+    black: float | tuple[float, float, float, float] | None = None
+    white: float | None = None
+
+
+@dataclass
+class PairSettings(MosaicSettings):
     """How noisy/clean pairs are found and read, where ``pairs:PATH`` alone does not say it.
 
     Args:
         noisy: of pairs:PATH: pattern of the noisy files' names, such as "*_noisy.*", the naming of rawaug synth.
         clean: of pairs:PATH: pattern of the clean files' names; null replaces the word noisy in ``noisy`` by clean.
-        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, of files that do not state it.
-        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
-        white: of pairs:PATH: white level of files that do not state it.
     """
 
     noisy: str | None = None
     clean: str | None = None
-    cfa: str | None = None
-    black: float | tuple[float, float, float, float] | None = None
-    white: float | None = None
 
 
 class PairFiles(NamedTuple):
@@ -213,7 +222,7 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
     cleans = (file for file in files if _regex(clean).fullmatch(file.relative_to(top).as_posix()))
     single = next((file for file in cleans if file not in paired), None)
     if single is not None:
-        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or move this one away")
+        raise FileNotFoundError(f"{single}: has no noisy frame named {noisy}; add it, or remove this one")
     return found
 
 
@@ -222,7 +231,9 @@ def _clean_pattern(noisy: str) -> str:
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
     if not count:
-        raise ValueError(f"the pattern {noisy} does not say noisy; give the pattern of the clean files too")
+        raise ValueError(
+            f"the pattern {noisy} does not contain the word noisy; give the pattern of the clean files too"
+        )
     return clean
 
 

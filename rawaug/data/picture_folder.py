@@ -13,11 +13,12 @@ import os
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, get_worker_info
+from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 
 from rawaug.io.apart import apart, apart_each, prepare
 from rawaug.io.picture_files import MAX_PIXELS, read_picture
@@ -165,6 +166,14 @@ class PictureFolder(Dataset[Tensor]):
             self._epochs_logged[0] = epoch
             if self._bad.any():
                 _log.warning("%s", self.report())
+
+
+def reports(pictures: Any) -> list[str]:
+    """What each folder in ``pictures`` skipped so far, a text a folder; those behind a cache or in a list too."""
+    if isinstance(pictures, PictureFolder):
+        return [pictures.report()] if pictures.skipped else []
+    inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
+    return [report for each in inside if each is not None for report in reports(each)]
 
 
 class _Names(Sequence[str]):

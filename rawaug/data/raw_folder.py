@@ -15,6 +15,7 @@ from rawaug.data.lazy import LazyPairs
 from rawaug.data.pair import Pair
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.apart import apart
+from rawaug.io.jpeg import through_jpeg
 from rawaug.io.picture_files import MAX_PIXELS
 
 EXTENSIONS = (
@@ -39,6 +40,7 @@ class RawFolder(LazyPairs):
         path: where the RAW files are.
         camera_jpeg: False always uses LibRaw's rendering.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
+        jpeg_quality: LibRaw's rendering as a JPEG of this quality gives it back; None leaves it as it is.
         max_pixels: of a JPEG; a larger one is an error of its pair.
 
     Raises:
@@ -57,6 +59,7 @@ class RawFolder(LazyPairs):
         *,
         camera_jpeg: bool = True,
         adjust_maximum_thr: float = 0.0,
+        jpeg_quality: int | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
         self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
@@ -69,7 +72,7 @@ class RawFolder(LazyPairs):
                 "noisy/clean pairs of other formats are read as pairs:PATH"
             )
         self.camera_jpeg = camera_jpeg
-        self.adjust_maximum_thr, self.max_pixels = adjust_maximum_thr, max_pixels
+        self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
         super().__init__(_names(self.files))
 
     def files_of(self, index: int) -> Sequence[Path]:
@@ -89,7 +92,9 @@ class RawFolder(LazyPairs):
                 return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
-        return _pair(self.names[index], *apart(read_raw_and_develop, file, self.adjust_maximum_thr), registered=True)
+        frame, srgb = apart(read_raw_and_develop, file, self.adjust_maximum_thr)
+        srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
+        return _pair(self.names[index], frame, srgb, registered=True)
 
 
 def _centre(image: Tensor, height: int, width: int) -> Tensor:

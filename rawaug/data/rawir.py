@@ -2,8 +2,9 @@
 
 A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
 be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
-Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). There is no white balance or colour
-matrix in a form that is safe to open (RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). An ``.npz`` holds the same array as
+``raw`` and its white level as ``max_val``. There is no white balance or colour matrix in a form that is safe to open
+(RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
 
 The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
 "Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 import os
 import tokenize
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.lazy import LazyPairs
+from rawaug.data.mat import MAX_BYTES
 from rawaug.data.pair import Pair
 from rawaug.io import read_picture
 from rawaug.io.apart import apart
@@ -34,6 +38,7 @@ _DAMAGE = (
     tokenize.TokenError,
 )
 """What NumPy raises for headers that say anything."""
+_ARRAYS = (".npy", ".npz")
 _MAGIC = b"\x93NUMPY"
 
 _SPLITS = {"train": "train", "validation": "val", "test": "test"}
@@ -44,13 +49,13 @@ class Rawir(LazyPairs):
     """The pairs below a folder, in RGGB.
 
     Args:
-        path: contains ``.npy`` files with a picture beside each, at any depth. Where it has subfolders ``train``,
-            ``val`` or ``test``, only the one of the split is taken.
+        path: contains ``.npy`` or ``.npz`` files with a picture beside each, at any depth. Where it has subfolders
+            ``train``, ``val`` or ``test``, only the one of the split is taken.
         split: ``"train"``, ``"validation"`` or ``"test"``.
         white: in digital numbers; by default as :data:`WHITE` says.
 
     Raises:
-        FileNotFoundError: if there is no such folder, or an ``.npy`` has no picture beside it.
+        FileNotFoundError: if there is no such folder, or an array has no picture beside it.
         ValueError: if there is no such split, or it holds no pair.
 
     Example:
@@ -67,12 +72,16 @@ class Rawir(LazyPairs):
         if any((folder / name).is_dir() for name in _SPLITS.values()):
             folder = folder / _SPLITS[split]
         self.files = sorted(
-            Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(".npy")
+            Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(_ARRAYS)
         )
         if not self.files:
-            raise ValueError(f"{folder}: contains no .npy file of RAWIR")
+            raise ValueError(f"{folder}: contains no .npy or .npz file of RAWIR")
         self.pictures = [picture_beside(file) for file in self.files]
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
+
+    def camera_of(self, file: Path) -> str:
+        """The camera of a file, which the names do not say."""
+        return "unknown"
 
     def read(self, index: int) -> Pair:
         file, picture = self.files[index], self.pictures[index]
@@ -81,6 +90,7 @@ class Rawir(LazyPairs):
             srgb=apart(read_picture, picture),
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
+            camera=self.camera_of(file),
             white_balance=(1.0, 1.0, 1.0),
             color_matrix=torch.eye(3),
             registered=not _is_p20(file),
@@ -88,16 +98,16 @@ class Rawir(LazyPairs):
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
-    """Packed RAW ``(4, h, w)`` of an ``.npy`` file, white at 1; the picture beside it says which white level.
+    """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level.
 
     Raises:
         OSError: if the file is damaged.
         ValueError: if its array is of another kind, or exceeds white.
     """
-    numbers = _array(file)
+    numbers, stated = apart(_archive, file) if file.suffix == ".npz" else (_array(file), None)
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
-    white = white or WHITE[picture.suffix.lower()]
+    white = white or stated or WHITE[picture.suffix.lower()]
     if numbers.max() > white:
         raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
     return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
@@ -117,6 +127,23 @@ def _array(file: Path) -> np.ndarray:
     except _DAMAGE as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise OSError(f"{file}: cannot be read as an array ({reason}); copy it again") from error
+
+
+def _archive(file: Path) -> tuple[np.ndarray, float]:
+    """``raw`` and ``max_val`` of an ``.npz`` file.
+
+    Raises:
+        OSError: if it is damaged, or lacks one.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            size = sum(arrays.zip.getinfo(f"{name}.npy").file_size for name in ("raw", "max_val"))
+            if size > MAX_BYTES:
+                raise ValueError(f"declares {size} bytes, above the limit of {MAX_BYTES}")
+            return arrays["raw"], float(arrays["max_val"])
+    except (*_DAMAGE, zipfile.BadZipFile, zlib.error) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{file}: cannot be read as raw and max_val ({reason}); copy it again") from error
 
 
 def picture_beside(file: Path) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -80,17 +82,24 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     return [f"left out of {printable(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(printable, reasons)]
 
 
-def each_readable(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
+def each_readable(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
     """The pairs that can be read, one by one; at the end the others are printed.
 
     Args:
-        pairs: a dataset.
+        pairs: a dataset, or one that is :class:`Readable` already, which then keeps what was found.
         of: what a user calls it.
+        seconds: after which no further pair is read, from the first one on, which also waits for the libraries.
+        least: that many are read all the same.
 
     Raises:
         ValueError: if there are pairs, and none can be read.
     """
-    readable = Readable(pairs)
-    yield from readable
+    readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
+    start = math.inf
+    for count, pair in enumerate(readable, start=1):
+        start = min(start, time.perf_counter())
+        yield pair
+        if count >= least and time.perf_counter() - start > seconds:
+            break
     if lines := left_out(readable, of):
         print("\n".join(lines))

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 class Remembered(Dataset[Tensor]):
     """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read again each time.
 
-    Each worker process has its own cache. All else (``skipped``, ``report``, ...) is the dataset's.
+    Each worker process has its own cache.
 
     Example:
         >>> import torch

@@ -49,6 +49,7 @@ class Ablation:
         experiment: "ablation".
         name: of the folder in ``out`` that it writes.
         data: the pairs; every frame is measured by a fit on the others.
+        count: only the first so many of them.
         fit: of the ISP.
         seed: of the fits.
         out: folder of all runs.
@@ -57,6 +58,7 @@ class Ablation:
     experiment: str = "ablation"
     name: str = "ablation"
     data: str = "demo:train"
+    count: int | None = None
     fit: FitConfig = field(default_factory=FitConfig)
     seed: int = 0
     out: str = "runs"
@@ -64,28 +66,24 @@ class Ablation:
 
 def smoke_ablation(ablation: Ablation) -> Ablation:
     """The ablation in seconds, on the demo camera."""
-    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", fit=ablation.fit.smoke())
+    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", count=2, fit=ablation.fit.smoke())
 
 
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
     require_free(ablation, overwrite)
-    pairs = list(each_readable(open_pairs(ablation.data, split="train"), "data"))
+    pairs = list(each_readable(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)
     stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
     without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
     for left_out in progress(pairs, label="ablation", unit="frame"):
-        others = [pair for pair in pairs if pair is not left_out]
-        isp = fit_isp(others, config, progress=False)
-        for given, curves in stagewise.items():
-            curves.append(stage_psnr(isp, left_out, given != "blind"))
-        without["none"].append(psnr_r(isp, left_out, white_balance=True))
-        for stage in LEFT_OUT:
-            kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
-            lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
-            without[stage].append(psnr_r(lacking, left_out, white_balance=stage != "gains"))
+        curves, values = measure([pair for pair in pairs if pair is not left_out], left_out, config)
+        for given, curve in curves.items():
+            stagewise[given].append(curve)
+        for stage, value in values.items():
+            without[stage].append(value)
     means = {given: torch.tensor(curves).mean(0).tolist() for given, curves in stagewise.items()}
     result = {"settings": asdict(ablation), "stages": means, "without": {k: _mean(v) for k, v in without.items()}}
     write_json(result, folder / "ablation.json")
@@ -95,6 +93,20 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     _print(result)
     print(f"picture: {picture}")
     return result
+
+
+def measure(
+    others: Sequence[Pair], left_out: Pair, config: FitConfig
+) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
+    """One frame, by fits on the others: PSNR after each stage, and PSNR_r without a stage."""
+    isp = fit_isp(others, config, progress=False)
+    curves = {given: stage_psnr(isp, left_out, given != "blind") for given in ("blind", "as-shot gains")}
+    without = {"none": psnr_r(isp, left_out, white_balance=True)}
+    for stage in LEFT_OUT:
+        kept = tuple(s for s in config.isp.get("stages", POINTWISE_STAGES) if s != stage)
+        lacking = fit_isp(others, replace(config, isp={**config.isp, "stages": kept}), progress=False)
+        without[stage] = psnr_r(lacking, left_out, white_balance=stage != "gains")
+    return curves, without
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
@@ -99,16 +99,14 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
         settings: of the sweep.
         overwrite: replace another of its name.
     """
-    require_free(settings, overwrite)
-    noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
-    makers = _makers(settings)
-    frames = [_clean(pair, settings.crop) for spec in settings.data for pair in _each(spec, settings.count)]
+    noises, makers, data = prepared_sweep(settings, overwrite)
+    frames = [clean_middle(pair, settings.crop) for spec, pairs in data.items() for pair in each_readable(pairs, spec)]
     claim(settings, overwrite)
     rows: dict[str, Any] = {}
     for name, make in makers.items():
         seconds, rows[name] = list[float](), {"iso": {}}
         for iso, noise in noises.items():
-            scores = [_scored(make, pair, noise, settings.seed, f"{name}, ISO {iso}", seconds) for pair in frames]
+            scores = [scored(make, pair, noise, settings.seed, f"{name}, ISO {iso}", seconds) for pair in frames]
             rows[name]["iso"][str(iso)] = {key: fmean(score[key] for score in scores) for key in METRICS}
         rows[name]["seconds_per_megapixel"] = sum(seconds) / len(noises) / sum(p.raw.numel() / 1e6 for p in frames)
     result = {"settings": asdict(settings), "threads": torch.get_num_threads(), "frames": len(frames), "rows": rows}
@@ -116,12 +114,24 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     return result
 
 
-def _each(spec: str, count: int | None) -> Iterator[Pair]:
-    pairs = open_pairs(spec, split="test")
-    return each_readable(SomePairs(pairs, range(len(pairs))[:count]), spec)
+def prepared_sweep(
+    settings: DenoiserSweep, overwrite: bool = False
+) -> tuple[dict[int, NoiseModel], dict[str, Maker], dict[str, Sequence[Pair]]]:
+    """The noise by ISO, the methods by name and the frames by dataset, not yet read; all that can be missing is found.
+
+    Raises:
+        OSError, ValueError: in one line, for the first thing that is missing or wrong.
+    """
+    require_free(settings, overwrite)
+    noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
+    makers, opened = _makers(settings), dict[str, Sequence[Pair]]()
+    for spec in settings.data:
+        pairs = open_pairs(spec, split="test")
+        opened[spec] = SomePairs(pairs, range(len(pairs))[: settings.count])
+    return noises, makers, opened
 
 
-def _clean(pair: Pair, crop: int | None) -> Pair:
+def clean_middle(pair: Pair, crop: int | None) -> Pair:
     """The middle of a frame, without its own noisy capture."""
     middle = pair if crop is None else pair.middle(crop)
     return replace(middle, noisy=None, shot_var=None, read_var=None)
@@ -178,9 +188,7 @@ def _published(path: str) -> denoisers.PMRID:
     return model.eval()
 
 
-def _scored(
-    make: Maker, pair: Pair, noise: NoiseModel, seed: int, label: str, seconds: list[float]
-) -> dict[str, float]:
+def scored(make: Maker, pair: Pair, noise: NoiseModel, seed: int, label: str, seconds: list[float]) -> dict[str, float]:
     method = make(pair, noise, seed)
 
     def timed(pair: Pair, sample: Sample) -> Tensor:

@@ -19,10 +19,10 @@ from denoisers.network import Denoiser
 from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
-from rawaug.data import PictureFolder
 from rawaug.data.identity import stamps
 from rawaug.data.pair import Pair
 from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
+from rawaug.data.picture_folder import reports
 from rawaug.devices import find_device
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
@@ -43,6 +43,7 @@ from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.rehearsal import rehearse
 from rawaug.experiment.run_folder import claim, run_folder
+from rawaug.experiment.search import chosen
 from rawaug.extras import extra
 from rawaug.files import find_weights, fingerprint, replacing, sha256, write_json
 from rawaug.io.apart import reading_within
@@ -267,7 +268,15 @@ class _Run:
         others = self.untrained(noise, cfa)
         classical: dict[str, Any] = {}
         everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
+        runs = [self.folder / f"seed{s}" for s in range(recipe.seed, recipe.seed + recipe.seeds)]
+        candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
+        searches = chosen(candidates, runs, bool(self.validation))
+        everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
+        searched = [
+            f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
+            for arm, found in searches.items()
+        ]
         write_json(everything, self.folder / "results.json")
         for name, method in others.items():
             classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
@@ -291,9 +300,7 @@ class _Run:
         written = page.write(self.folder / "report.html", asdict(recipe))
         print_table(results, title, classical)
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
-        if isinstance(self.pictures, PictureFolder) and self.pictures.skipped:
-            print(self.pictures.report())
-        print("\n".join([*self.unreadable, *self.usage(results)]))
+        print("\n".join([*reports(self.pictures), *self.unreadable, *searched, *self.usage(results)]))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
@@ -309,7 +316,7 @@ class _Run:
 
 def _settings(part: Any) -> dict[str, Any]:
     """Of a part of the recipe; keys that came later are left out where they are null: older runs stay what they are."""
-    later = ("start", "denoiser", "learning_rate", "steps")
+    later = ("start", "denoiser", "learning_rate", "steps", "search", "candidate_of")
     return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
 
 

@@ -20,6 +20,7 @@ from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
+from rawaug.data.lazy import SomePairs
 from rawaug.data.readable import each_readable
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import Score, score_denoiser
@@ -47,6 +48,7 @@ class DownstreamConfig:
         methods: families to compare.
         test: RAW frames of unseen cameras; folders, or ``kind:path``.
         test_crop: side of the central crop scored of each test frame; null for the whole frame.
+        test_count: number of frames of each of ``test``; null for all.
         exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
             headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
         noise: preset, in training and on the test frames.
@@ -57,6 +59,7 @@ class DownstreamConfig:
     methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
     test: list[str] = field(default_factory=lambda: ["demo:test"])
     test_crop: int | None = 1024
+    test_count: int | None = None
     exposure: tuple[float, float] | None = (-1.5, 0.0)
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
@@ -104,7 +107,9 @@ def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) 
 
 def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamScore:
     """Mean scores on the test frames; their noise is frozen with seed 0."""
-    pairs = (pair for spec in config.test for pair in each_readable(open_pairs(spec, split="test"), spec))
+    opened = ((open_pairs(spec, split="test"), spec) for spec in config.test)
+    chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
+    pairs = (pair for frames, spec in chosen for pair in each_readable(frames, spec))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
     scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
     return mean_of(scores)

@@ -47,7 +47,9 @@ def require_training_device(device: str, devices: int = 1) -> None:
     if devices < 1:
         raise ValueError(f"devices must be at least 1, got {devices}")
     if ":" in device:
-        raise ValueError(f"device {device!r}: a training takes a kind of device; choose one by CUDA_VISIBLE_DEVICES")
+        raise ValueError(
+            f"device {device!r}: training takes a kind of device, as cuda; choose which by CUDA_VISIBLE_DEVICES"
+        )
     find_device(device, count=devices)
 
 

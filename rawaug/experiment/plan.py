@@ -57,13 +57,13 @@ class Plan:
         camera = (
             f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
             if recipe.camera is None
-            else f"{recipe.camera}, as it is"
+            else f"{recipe.camera}, unchanged"
         )
-        watched = "no frames: watched on RAW made from the pictures, the last weights are kept"
+        watched = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         found = {
-            "train": _used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
-            "validate": _used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
-            "test": _used(self.test, test, data.test),
+            "train": used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
+            "validate": used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
+            "test": used(self.test, test, data.test),
             "pictures": f"{len(self.pictures)} of {data.pictures}",
             "ISP": camera,
         }
@@ -158,7 +158,8 @@ def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, cle
     return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 
-def _used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
+    """So many of so many frames of a source, and the names of the first ones."""
     names = names_of(frames)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"

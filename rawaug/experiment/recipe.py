@@ -31,7 +31,8 @@ class DataConfig(PairSettings):
         count: number of pairs to use; null for all.
         select: which: first; scenes, whole ones; phones, as many of each; or a list of names of frames or their
             folders.
-        pictures: the sRGB pictures to augment with: a folder, ``demo:``, or ``pairs``, those of the chosen pairs.
+        pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
+            ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
         read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
@@ -46,7 +47,7 @@ class DataConfig(PairSettings):
     pairs: str | None = "demo:train"
     count: int | None = None
     select: str | list[str] = "first"
-    pictures: str = "demo:"
+    pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     max_pixels: int | None = None
     read_seconds: float | None = None
@@ -90,7 +91,10 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator, as older recipes have them; read for one release.
+        alpha, correct, gamma: settings of the estimator, deprecated; older recipes set them here.
+        search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
+            for each value, and the results name the best.
+        candidate_of: of such an arm: whose it is.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
         steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
@@ -105,6 +109,8 @@ class ArmConfig:
     alpha: float | None = None
     correct: bool | None = None
     gamma: float | None = None
+    search: dict[str, list[float]] | None = None
+    candidate_of: str | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
     steps: int | None = None
@@ -125,6 +131,24 @@ class ArmConfig:
         self.estimator = {"name": name, "settings": settings} if settings else name
         ESTIMATORS.make(self.estimator)
 
+    def candidates(self, label: str) -> dict[str, ArmConfig]:
+        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``.
+
+        Raises:
+            ValueError: if the search has not one key with values, or it is no setting of the estimator.
+        """
+        if self.search is None:
+            return {label: self}
+        name, settings = name_and_settings(self.estimator)
+        ((key, values),) = self.search.items() if len(self.search) == 1 else [("", [])]
+        if not values:
+            raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
+        found = {}
+        for value in values:
+            estimator = {"name": name, "settings": {**settings, key: value}}
+            found[f"{label}_{key}{value:g}"] = replace(self, estimator=estimator, search=None, candidate_of=label)
+        return found
+
     @property
     def sees_clean(self) -> bool:
         """Whether the estimator needs clean frames."""
@@ -140,7 +164,7 @@ class Recipe:
         name: of the output folder within ``out``.
         data: where pictures come from.
         isp: how the dictionary ISP is fitted.
-        camera: an ISP to use as it is, a shipped one's name or a file; null fits one to ``data.pairs``.
+        camera: an ISP to use unchanged, by a shipped one's name or a file; null fits one to ``data.pairs``.
         noise: added to clean RAW, in training and to test frames without a noisy capture: the name of a preset
             or of a camera, a list of names of which each picture draws one, [shot_var, read_var], {name, settings} of a
             camera or a model, or "camera", the levels measured on the frames that the ISP is fitted to.
@@ -150,7 +174,7 @@ class Recipe:
         classical: classical denoisers to compare with, such as Wavelet, or {name: Wavelet, settings: {strength: 0.8}}.
             BM3D is left out, with a line that says so, where its wheel is not installed.
         views: of the self-ensemble: 4, the flips, as in the paper, or 8, with quarter turns.
-        untouched: trained denoisers to compare with as they are: names of shipped ones, or files.
+        untouched: trained denoisers to compare with, unchanged: names of shipped ones, or files.
         self_ensemble: also score every arm averaged over eight views, at eight times the cost.
         seed: of the first run.
         steps: optimiser steps, in place of ``train.steps``.
@@ -182,6 +206,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.arms:
             raise ValueError("arms: a recipe needs at least one arm")
+        self.arms = {name: one for label, arm in self.arms.items() for name, one in arm.candidates(label).items()}
         require_between("seed", self.seed, -(2**63), 2**62)
         require_between("seeds", self.seeds, 1, 1000)
         if self.steps is not None:

@@ -9,6 +9,7 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 from __future__ import annotations
 
 import json
+import math
 import statistics
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from rawaug import bayer
@@ -25,16 +25,17 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.data.identity import shared_frame
 from rawaug.data.lazy import SomePairs, names_of
 from rawaug.data.pair import Pair
-from rawaug.data.readable import Readable, each_readable, left_out
+from rawaug.data.readable import Readable, each_readable
 from rawaug.data.select import selected
+from rawaug.evaluation.altered import ALTERED
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, psnr_d
 from rawaug.experiment.early_checks import require_precision
+from rawaug.experiment.method_table import print_methods, row_name
 from rawaug.experiment.methods import (
     FAMILIES,
-    ROWS,
     Fitted,
+    balanced_rows,
     cycle_psnr,
     fit_family,
     is_method,
@@ -73,6 +74,10 @@ class Comparison:
         longer: factor of a second, longer budget for them; 0 for none.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
+        balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
+            gamma-compressed RAW.
+        altered: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
+            :mod:`rawaug.evaluation.altered`; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
         downstream: PSNR_d; null skips it.
@@ -96,6 +101,8 @@ class Comparison:
     longer: float = 0.0
     longer_frames: int = 2
     patches: int | None = 8
+    balanced: bool = False
+    altered: list[str] = field(default_factory=list)
     pictures: str = "demo:"
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
@@ -112,6 +119,8 @@ class Comparison:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
+        if unknown := [kind for kind in self.altered if kind not in ALTERED]:
+            raise ValueError(f"altered: {unknown}; choose from {', '.join(ALTERED)}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
@@ -140,24 +149,33 @@ def smoke_comparison(comparison: Comparison) -> Comparison:
 
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
-    require_free(comparison, overwrite)
-    if comparison.downstream is not None:
-        require_precision(comparison.downstream.train.precision)
-    comparing = _Comparison(comparison)
+    prepared = PreparedComparison(comparison, overwrite)
     claim(comparison, overwrite)
-    return comparing.table()
+    return prepared.table()
 
 
-class _Comparison:
-    def __init__(self, settings: Comparison) -> None:
+class PreparedComparison:
+    """A comparison whose data are open and checked; nothing is written yet.
+
+    Args:
+        settings: of the comparison.
+        overwrite: it may replace another of its name.
+        seconds: for reading the frames that are fitted; what then remains unread is left out.
+    """
+
+    def __init__(self, settings: Comparison, overwrite: bool = False, seconds: float = math.inf) -> None:
+        require_free(settings, overwrite)
+        if settings.downstream is not None:
+            require_precision(settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
-        chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
-        self.pairs = list(each_readable(chosen, "data"))
+        self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+        self.available = len(found)
+        self.pairs = list(each_readable(self.chosen, "data", seconds, least=2))
+        if len(self.pairs) < 2 and not settings.test:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         if settings.test:
             self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
-        elif len(self.pairs) < 2:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         exact = any(learns_by_descent(method) for method in settings.methods)
         for pair in self.pairs:
             if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
@@ -167,16 +185,14 @@ class _Comparison:
             noise = noise_model(settings.noise)
             self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        names = [pair.name for pair in self.pairs]
+        names = names_of(self.chosen)
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
         self.scored: Sequence[Pair] = self.pairs
         if settings.test:
             test = open_pairs(settings.test, split="test")
             tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
-            deque(tested, maxlen=0)
-            for line in left_out(tested, "test"):
-                print(line)
+            deque(each_readable(tested, "test", seconds), maxlen=0)
             self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")
@@ -194,7 +210,10 @@ class _Comparison:
             rows |= self._rows(family, scale)
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
-        _print(rows, self.settings, ceiling)
+        frames, settings = len(next(iter(rows.values()))["frames"]), self.settings
+        on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
+        title = f"{settings.name}: {on}, {settings.seeds} seed(s), {settings.data}"
+        print_methods(title, rows, settings.balanced, ceiling)
         return rows
 
     def _families(self) -> Iterator[tuple[str, float]]:
@@ -215,8 +234,9 @@ class _Comparison:
         for row in folds[0][2]["rows"]:
             by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
             quarters = [worst_and_best_quarter(values) for values in by_seed]
-            name = family if row == "blind" else f"{family}, {ROWS[row]}"
-            rows[f"{name}, {scale:g} times as long" if longer else name] = {
+            name = row_name(family, row)
+            name = f"{name}, {scale:g} times as long" if longer else name
+            rows[name] = {
                 "psnr_r": [statistics.fmean(values) for values in by_seed],
                 "frames": {names[k]: [values[k] for values in by_seed] for k in frames},
                 "worst25": [worst for worst, _ in quarters],
@@ -226,6 +246,9 @@ class _Comparison:
                 "parameters": folds[0][2]["parameters"],
                 **(whole if row == "blind" else {}),
             }
+            if row in folds[0][2].get("balanced", {}):
+                by_seed = [[fold["balanced"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+                rows[name]["balanced"] = [statistics.fmean(values) for values in by_seed]
         return rows
 
     def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
@@ -233,7 +256,8 @@ class _Comparison:
         settings, name = self.settings, names_of(self.scored)[frame]
         seconds = settings.seconds * scale
         budget = (seconds, settings.crop, settings.batch)
-        key = fingerprint(family, budget, seed, settings.patches, *self._frames())
+        more = [settings.balanced, settings.altered] if settings.balanced or settings.altered else []
+        key = fingerprint(family, budget, seed, settings.patches, *self._frames(), *more)
         path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
         if (known := _read(path, key)) is not None:
             return known
@@ -246,6 +270,11 @@ class _Comparison:
         else:
             fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
         result = score_rows(fitted, pair, settings.patches)
+        for kind in settings.altered:
+            found = score_rows(fitted, ALTERED[kind](pair), settings.patches)["rows"]
+            result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
+        if settings.balanced:
+            result["balanced"] = balanced_rows(fitted, pair)
         result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
         write_json(result, path)
         return result
@@ -308,23 +337,3 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
 def _median(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return statistics.median(known) if known else None
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    def figures(name: str) -> str:
-        value = row.get(name)
-        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
-
-    cells = [figures(name) for name in ("psnr_r", "worst25", "best25", "cycle", "cycle_without_mosaic", "psnr_d")]
-    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
-    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
-
-
-def _print(rows: dict[str, dict[str, Any]], settings: Comparison, ceiling: float) -> None:
-    frames = len(next(iter(rows.values()))["frames"])
-    protocol = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
-    title = f"{settings.name}: {protocol}, {settings.seeds} seed(s), {settings.data}"
-    heads = ("PSNR_r", "worst 25%", "best 25%", "cycle", "no mosaic", "PSNR_d", "M par.", "s to fit", "Mpix/s")
-    print_rows(title, ["method", *heads], [[name, *_cells(row)] for name, row in rows.items()])
-    threads = torch.get_num_threads()
-    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")

@@ -6,8 +6,6 @@ training on the run's device and in its precision, and its network is validated 
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib import import_module
@@ -19,7 +17,7 @@ from torch.utils.data import default_collate
 from denoisers.network import Denoiser
 from rawaug.commands.fit import fit
 from rawaug.data.pair import Pair
-from rawaug.data.readable import Readable, left_out
+from rawaug.data.readable import each_readable
 from rawaug.evaluation.scores import classical_method, installed_classical, network_method, score_method
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
@@ -37,8 +35,8 @@ from rawaug.training.validation import validate
 
 READ_SECONDS = 5.0
 """For the frames of each part; what then remains unread is counted."""
-_SIDE = 256
-"""Of the middle of a frame that is validated or scored."""
+SIDE = 256
+"""Of the middle of a frame that is fitted, validated or scored."""
 
 
 def rehearse(recipe: Recipe, plan: Plan) -> None:
@@ -52,7 +50,9 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
         for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage"):
             import_module(name)
     parts = {"train": plan.pairs, "validate": plan.validation, "test": plan.test}
-    pairs, validation, test = (_read(what, frames) for what, frames in parts.items())
+    pairs, validation, test = (
+        list(each_readable(frames, f"the frames to {what}", READ_SECONDS)) for what, frames in parts.items()
+    )
     read = (
         f"{what} {len(found)} of {len(parts[what])}"
         for what, found in zip(parts, (pairs, validation, test), strict=True)
@@ -66,25 +66,12 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
         start = start_of(recipe.network_of(arm))
         own = in_pattern(isp, isp.cfa if start is None else start.cfa)
         net = _one_step(recipe, arm, pairs, plan.pictures, own, noise)
-        watched = validation_samples(recipe, [pair.middle(_SIDE) for pair in validation[:1]], plan.pictures, own, noise)
+        watched = validation_samples(recipe, [pair.middle(SIDE) for pair in validation[:1]], plan.pictures, own, noise)
         validate(net, watched[:1], torch.device("cpu"))
         _score(network_method(net.eval(), isp.cfa, own.cfa), test, noise, isp)
     for spec in installed_classical(recipe.classical):
         _score(classical_method(spec, noise, seed=0), test, noise, isp)
     print(f"tried: every arm for one step; frames read: {', '.join(read)}")
-
-
-def _read(what: str, frames: Sequence[Pair]) -> list[Pair]:
-    """The first frames, at least one if there are any, as many as can be read in time; damaged ones are printed."""
-    readable, found, start = Readable(frames), list[Pair](), math.inf
-    for pair in readable:
-        found.append(pair)
-        start = min(start, time.perf_counter())  # the first one also waits for the libraries
-        if time.perf_counter() - start > READ_SECONDS:
-            break
-    for line in left_out(readable, f"the frames to {what}"):
-        print(line)
-    return found
 
 
 def _isp(recipe: Recipe, pairs: Sequence[Pair]) -> DictionaryISP:
@@ -121,5 +108,5 @@ def _one_step(
 
 
 def _score(method: Any, test: Sequence[Pair], noise: NoiseModel, isp: DictionaryISP) -> None:
-    middle = [pair.middle(_SIDE) for pair in test[:1]]
+    middle = [pair.middle(SIDE) for pair in test[:1]]
     list(score_method(method, middle, noise, isp.cfa, 0, "dry run"))

@@ -141,7 +141,7 @@ def _helper() -> _Helper | None:
             found = _of_this_thread.helper = _Helper(_connected())
         except (OSError, RuntimeError) as error:
             _unavailable = True
-            warnings.warn(f"files are read in this process, which a damaged one may end: {error}", stacklevel=4)
+            warnings.warn(f"files are read in this process, so a damaged one may crash it: {error}", stacklevel=4)
     return found
 
 

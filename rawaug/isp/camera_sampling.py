@@ -15,12 +15,13 @@ a few atoms at a time its corners, where cameras are rare.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from rawaug.isp.cameras import white_balance
-from rawaug.isp.dictionary import CameraDictionary, sparse_weights
-from rawaug.isp.light import COLDEST, LAMP_SHARE, WARMEST, sample_lights
+from rawaug.isp.cameras import XYZ_TO_SRGB
+from rawaug.isp.dictionary import CameraDictionary, sparse_shares, sparse_weights
+from rawaug.isp.light import Array, LightRange, sample_lights
 from rawaug.isp.setting import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
@@ -30,17 +31,17 @@ EXPOSURE = (-1.0, 0.2)
 CAMERAS_MIXED = 2
 TONES_MIXED = 3
 _ROUNDS = 100
+_ALL_LIGHTS = LightRange()
 
 
 class CameraSampler:
-    """Draws settings of an ISP whose colour atoms are published cameras.
+    """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU.
 
     Args:
         cameras: the atoms of colour.
         tone_atoms: number of tone curves; 0 where the tone is learned.
         cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
-        kelvin: lowest and highest colour temperature of the light.
-        lamps: share of fluorescent and LED lamps.
+        lights: what the light is drawn from.
         consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
             and gains are drawn one by one.
 
@@ -54,18 +55,19 @@ class CameraSampler:
         tone_atoms: int,
         cameras_mixed: int = CAMERAS_MIXED,
         tones_mixed: int = TONES_MIXED,
-        kelvin: tuple[float, float] = (WARMEST, COLDEST),
-        lamps: float = LAMP_SHARE,
+        lights: LightRange = _ALL_LIGHTS,
         consistent: bool = True,
     ) -> None:
         if min(cameras_mixed, tones_mixed) < 1:
             raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
-        self.cameras, self.tone_atoms = cameras, tone_atoms
-        self.cameras_mixed, self.tones_mixed = cameras_mixed, tones_mixed
-        self.kelvin, self.lamps, self.consistent = kelvin, lamps, consistent
+        self.known, self.atoms, self.responses = (
+            tensor.detach().to("cpu", torch.float64).numpy()
+            for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
+        )
+        self.tone_atoms, self.cameras_mixed, self.tones_mixed = tone_atoms, cameras_mixed, tones_mixed
+        self.lights, self.consistent = lights, consistent
 
-    @torch.no_grad()
-    def sample(self, batch: int, generator: torch.Generator) -> ISPParams:
+    def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
         """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light.
 
         Raises:
@@ -74,32 +76,40 @@ class CameraSampler:
         weights, balance = self._cameras_in_light(batch, generator)
         if not self.consistent:
             _, balance = self._cameras_in_light(batch, generator)
-        matrix = self.cameras.combine(weights)
-        gains = (balance / balance.amin(dim=1, keepdim=True)).to(matrix)
-        tones = none = gains[:, :0]
+        matrix = (weights @ self.atoms).reshape(-1, 3, 3)
+        gains = balance / balance.min(axis=1, keepdims=True)
+        colour_weights, matrices, channel_gains = (
+            torch.from_numpy(drawn).to(device, torch.float32) for drawn in (weights, matrix, gains)
+        )
+        tones = none = channel_gains[:, :0]
         if self.tone_atoms:
-            tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(matrix)
-        return ISPParams(weights, none, matrix, gains, tones)
+            tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(channel_gains)
+        return ISPParams(colour_weights, none, matrices, channel_gains, tones)
 
-    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
         """Weights ``(B, N)`` and balances ``(B, 3)``; draws with gains beyond what is plausible are drawn again."""
-        device, known = self.cameras.matrices.device, self.cameras.known.cpu().double()
-        weights, balance = torch.empty(batch, known.shape[1]).double(), torch.empty(batch, 3).double()
-        open_ = torch.arange(batch)
+        weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
+        open_ = np.arange(batch)
         for _ in range(_ROUNDS):
-            shares = sparse_weights(len(open_), len(known), self.cameras_mixed, generator)
-            weights[open_] = shares @ known
-            light = sample_lights(len(open_), generator, self.kelvin, self.lamps)
-            balance[open_] = white_balance(self.cameras.xyz_to_camera(weights[open_].to(device)).cpu(), light)
+            chosen, shares = sparse_shares(len(open_), len(self.known), self.cameras_mixed, generator)
+            drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
+            light = sample_lights(len(open_), generator, *self.lights)
+            weights[open_], balance[open_] = drawn, self.balance(drawn, light)
             open_ = open_[~plausible(balance[open_])]
             if not len(open_):
-                return weights.to(self.cameras.matrices), balance
+                return weights, balance
         raise ValueError(
-            f"no light at {self.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; widen kelvin"
+            f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; take other lights"
         )
 
+    def balance(self, weights: Array, light: Array) -> Array:
+        """White balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` of atoms in light of white points ``(B, 3)``."""
+        linear = light @ XYZ_TO_SRGB.numpy().T
+        response = weights @ self.responses * np.einsum("bij,bj->bi", (weights @ self.atoms).reshape(-1, 3, 3), linear)
+        return np.asarray(response[:, 1:2] / response)
 
-def plausible(balance: Tensor) -> Tensor:
+
+def plausible(balance: Array) -> NDArray[np.bool_]:
     """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
     low, high = PLAUSIBLE_GAINS
-    return ((balance >= low) & (balance <= high)).all(dim=1)
+    return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))

@@ -27,6 +27,7 @@ SRGB_TO_XYZ = torch.tensor(
     dtype=torch.float64,
 )
 """Linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
+XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)
 
 DAYLIGHT_GAINS = (0.6, 4.0)
 """Red and blue gains under D65 of a plausible camera."""

@@ -11,16 +11,14 @@ solved for in turn.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA
-from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, ToneDictionary
+from rawaug.isp.dictionary import CameraDictionary, ToneDictionary
 from rawaug.isp.hull import nearest_in_hull
 from rawaug.isp.setting import ISPParams
+from rawaug.isp.staged import StagedISP
 from rawaug.kernels.raw_torch import through_curves
 
 CLIPPED = 0.98
@@ -31,22 +29,8 @@ PULL = 1e-4
 """Of the typical weights, against the readings' mean square."""
 
 
-class Camera(Protocol):
-    """What is used of an ISP: its pattern, its colour atoms and its reverse pass."""
-
-    colour: ColourDictionary
-
-    @property
-    def tone(self) -> ToneDictionary | None: ...
-
-    @property
-    def cfa(self) -> CFA: ...
-
-    def reverse_pixels(self, x: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor: ...
-
-
 def with_white_balance(
-    isp: Camera,
+    isp: StagedISP,
     params: ISPParams,
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
@@ -85,14 +69,14 @@ def _require_factor(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
 
 
-def _in_light(isp: Camera, params: ISPParams, balance: Tensor) -> ISPParams:
+def _in_light(isp: StagedISP, params: ISPParams, balance: Tensor) -> ISPParams:
     weights = isp.colour.weights_for(balance)
     return params._replace(
         colour_weights=weights, matrix=isp.colour.combine(weights), gains=isp.colour.gains_for(balance, weights)
     )
 
 
-def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
+def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
     """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
 
     Readings at or above 0.98 are left out (clipped); a channel without any reading keeps its gain.
@@ -114,7 +98,22 @@ def with_raw_samples(isp: Camera, x: Tensor, params: ISPParams, raw_samples: Ten
     where = place.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
-    value = raw_samples[..., 2]
+    return with_readings(isp, pixels, where, own, raw_samples[..., 2], params)
+
+
+def with_readings(
+    isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
+) -> ISPParams:
+    """As :func:`with_raw_samples`, for pixels that are at hand.
+
+    Args:
+        isp: whose reverse pass is used.
+        pixels: sRGB ``(B, 3, 1, K)``, float.
+        where: their coordinates ``(1 or B, 2, 1, K)``.
+        own: ``(B, 3, K)`` 1 in the channel that is read, else 0.
+        value: the readings ``(B, K)``.
+        params: chosen parameters.
+    """
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):
@@ -168,7 +167,7 @@ def _require_places(raw_samples: Tensor, x: Tensor) -> None:
         raise ValueError(f"raw_samples: a row or column is outside the picture, {x.shape[-2]} x {x.shape[-1]}")
 
 
-def _solve(isp: Camera, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
+def _solve(isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams) -> ISPParams:
     unit = params._replace(gains=torch.ones_like(params.gains))
     x5 = isp.reverse_pixels(pixels, unit, where)[:, :, 0]
     y = value[:, None].expand_as(x5)

@@ -14,11 +14,13 @@ balance. The atoms of published cameras have rows of sum 1 instead, negative ent
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rawaug.isp.cameras import SRGB_TO_XYZ, colour_matrix, white_balance
+from rawaug.isp.cameras import XYZ_TO_SRGB, colour_matrix, white_balance
 from rawaug.isp.light import D65, white_point
 from rawaug.isp.tone_curves import NODES, srgb_to_linear
 
@@ -107,13 +109,16 @@ class CameraDictionary(ColourDictionary):
         """``(N, 3, 3)``, rows of sum 1."""
         return self.matrices / self.matrices.sum(dim=2, keepdim=True)
 
+    def responses(self) -> Tensor:
+        """Responses of the atoms to D65 ``(N, 3)``, float64, green 1."""
+        red, blue = (-self.light.double()).exp().unbind(1)
+        return torch.stack([red, torch.ones_like(red), blue], dim=1)
+
     def xyz_to_camera(self, weights: Tensor) -> Tensor:
         """Weights ``(B, N)`` to matrices from XYZ to camera ``(B, 3, 3)``, float64, green response 1 to D65."""
         weights = weights.double()
-        inverse = (-self.light.double()).exp()
-        response = weights @ torch.stack([inverse[:, 0], torch.ones_like(inverse[:, 0]), inverse[:, 1]], dim=1)
         matrix = torch.einsum("bn,nij->bij", weights, self.atoms().double())
-        return response[:, :, None] * matrix @ torch.linalg.inv(SRGB_TO_XYZ.to(matrix))
+        return (weights @ self.responses())[:, :, None] * matrix @ XYZ_TO_SRGB.to(matrix)
 
     def weights_for(self, white_balance: Tensor) -> Tensor:
         """The typical camera ``(B, N)``: as-shot multipliers ``(B, 3)`` are of an unknown light, and name no camera."""
@@ -170,9 +175,23 @@ class ToneDictionary(nn.Module):
     def combine(self, weights: Tensor) -> Tensor:
         """Weights ``(B, K)`` to tables ``(B, 1021)``, the same bits in a batch of any size."""
         table = weights.new_zeros(len(weights), self.curves.shape[1])
-        for weight, curve in zip(weights.unbind(1), self.curves, strict=True):
+        for weight, curve in self._weighed(weights):
             table += weight[:, None] * curve
         return table
+
+    def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms.
+
+        Weights of 0 are left out on a CPU, where it costs nothing to look at them, unless they are being fitted.
+        """
+        if weights.is_cuda or weights.requires_grad:
+            yield from zip(weights.unbind(1), self.curves, strict=True)
+            return
+        unused = weights == 0
+        most = weights.shape[1] - int(unused.sum(dim=1).min())
+        chosen = unused.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
+        for weight, atom in zip(weights.gather(1, chosen).unbind(1), chosen.unbind(1), strict=True):
+            yield weight, self.curves[atom]
 
 
 def project_to_simplex(weights: Tensor) -> Tensor:
@@ -203,11 +222,16 @@ def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor
 
 
 def sparse_weights(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> Tensor:
-    """Weights ``(batch, atoms)`` on the simplex, float64, of which at most ``mixed`` are not zero: Dirichlet(1/2).
+    """Weights ``(batch, atoms)`` on the simplex, float64, of which at most ``mixed`` are not zero: Dirichlet(1/2)."""
+    chosen, shares = sparse_shares(batch, atoms, mixed, generator)
+    return shares.new_zeros(batch, atoms).scatter_add_(1, chosen, shares)
+
+
+def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Indices of atoms ``(batch, mixed)``, drawn with replacement, and their shares, float64: Dirichlet(1/2).
 
     Squares of normals divided by their sum: they crowd the corners and edges of a hull.
     """
     chosen = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
-    shares = squares / squares.sum(dim=1, keepdim=True)
-    return torch.zeros(batch, atoms, dtype=torch.float64).scatter_add_(1, chosen, shares)
+    return chosen, squares / squares.sum(dim=1, keepdim=True)

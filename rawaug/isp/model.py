@@ -8,42 +8,24 @@ Source: Conde et al., "Model-Based Image Signal Processors via Learnable Diction
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rawaug import bayer
-from rawaug.bayer import CFA
 from rawaug.files import find_weights
-from rawaug.isp import (
-    conditioning,
-    paper_stages,  # noqa: F401 - registers the stages
-    stages,
-)
+from rawaug.isp import conditioning, stages
 from rawaug.isp.camera_sampling import CameraSampler
-from rawaug.isp.config import ISPConfig
-from rawaug.isp.curve_stage import ToneCurve
-from rawaug.isp.dictionary import (
-    CameraDictionary,
-    ColourDictionary,
-    GainDictionary,
-    ToneDictionary,
-    convex_weights,
-)
-from rawaug.isp.encoder import Encoder, Encoders, thumbnail
+from rawaug.isp.dictionary import CameraDictionary, convex_weights
+from rawaug.isp.encoder import thumbnail
 from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
-from rawaug.isp.reverse import ReverseISP
+from rawaug.isp.light import light_range
 from rawaug.isp.setting import ISPParams, ISPResult
-from rawaug.isp.stage import Stage, stage_class
-from rawaug.seeding import derived_seed, initialised_from
-
-S = TypeVar("S", bound=Stage)
+from rawaug.isp.staged import StagedISP
 
 
-class DictionaryISP(ReverseISP):
+class DictionaryISP(StagedISP):
     """A learned, interpretable camera.
 
     Args:
@@ -59,75 +41,7 @@ class DictionaryISP(ReverseISP):
 
     name = "dictionary"
 
-    def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
-        super().__init__()
-        self._config = config or ISPConfig()
-        with initialised_from(seed):
-            self.colour = ColourDictionary(self.config.colour_atoms)
-            if self.config.cameras:
-                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
-            self.gain = GainDictionary(self.config.gain_atoms)
-            made = [stage_class(name)(self.config) for name in self.config.stages]
-            self.stages = nn.ModuleDict({stage.name: stage for stage in made})
-            self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
-        self.use_encoders(self.config.encoders, seed)
-
-    @property
-    def config(self) -> ISPConfig:
-        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
-        return self._config
-
-    @property
-    def cfa(self) -> CFA:
-        """The pattern of the RAW that this ISP makes."""
-        return CFA(self.config.cfa)
-
-    @property
-    def ordered_stages(self) -> list[Stage]:
-        """The stages in reverse order."""
-        return [cast(Stage, stage) for stage in self.stages.values()]
-
-    def find(self, kind: type[S]) -> S | None:
-        """The stage of this class, or None."""
-        return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
-
-    @property
-    def reverse_parameters(self) -> int:
-        """Number of parameters of the reverse pass."""
-        names = (name for name, _ in self.named_parameters())
-        reverse = [name for name in names if not name.startswith("forward_") and ".forward_" not in name]
-        return sum(self.get_parameter(name).numel() for name in reverse)
-
-    # -- configuration ----------------------------------------------------------------------------------------------
-
-    def configure(self, **changes: Any) -> None:
-        """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them.
-
-        Raises:
-            ValueError: if there is no such stage in the ISP, or a value is out of its range.
-        """
-        config = replace(self.config, **changes)
-        if absent := [name for name in config.stages if name not in self.stages]:
-            raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
-        self._config = config
-        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
-        for stage in self.ordered_stages:
-            stage.config = config
-
-    def use_encoders(self, enabled: bool, seed: int = 0) -> None:
-        """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
-
-        Without them the learned constants decide.
-        """
-        with initialised_from(derived_seed(seed, "encoders")):
-            for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
-                if not enabled:
-                    encoder.layers = None
-                elif not encoder.looks:
-                    encoder.add_layers(self.config.encoder_widths)
-        self.configure(encoders=enabled)
-
-    # -- parameters -------------------------------------------------------------------------------------------------
+    # -- settings ---------------------------------------------------------------------------------------------------
 
     def params_from_weights(
         self, colour_weights: Tensor, gain_weights: Tensor, tone_weights: Tensor | None = None
@@ -145,21 +59,22 @@ class DictionaryISP(ReverseISP):
         atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
         a fitted camera they always have weights of their own.
         """
-        if isinstance(self.colour, CameraDictionary):
-            return CameraSampler(self.colour, self.config.tone_atoms, consistent=consistent).sample(batch, generator)
         config, device = self.config, self.colour.matrices.device
+        if (cameras := self.camera_sampler(consistent)) is not None:
+            return cameras.sample(batch, generator, device)
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
 
-    @property
-    def tone(self) -> ToneDictionary | None:
-        """The dictionary of tone curves; None where the curve is learned."""
-        stage = self.find(ToneCurve)
-        return stage.dictionary if stage else None
+    def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
+        """What draws settings where the atoms are published cameras, as these are now; else None.
 
-    def typical_tones(self) -> Tensor:
-        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
-        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
+        ``light`` is a colour temperature in kelvin or the name of a lamp (:data:`rawaug.isp.light.LAMPS`); any light by
+        default.
+        """
+        if not isinstance(self.colour, CameraDictionary):
+            return None
+        lights = light_range(light)
+        return CameraSampler(self.colour, self.config.tone_atoms, lights=lights, consistent=consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
@@ -253,16 +168,6 @@ class DictionaryISP(ReverseISP):
             raise ValueError(f"the picture is on {like.device} but the ISP is on {own.device}; call isp.to(...)")
         return torch.autocast(like.device.type, enabled=False)
 
-    def reverse_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
-        for stage in self.ordered_stages:
-            x = stage.reverse(x, params, place)
-            if seen is not None:
-                seen[f"x{stage.makes}"] = x
-        return x
-
     def forward(
         self,
         raw: Tensor,
@@ -276,21 +181,11 @@ class DictionaryISP(ReverseISP):
         with self._float32(raw):
             x5 = bayer.demosaic(stages.scene_referred(raw), self.cfa)
             if params is None:
-                params = self.choose_forward(self._unshaded(x5, place))
+                params = self.choose_forward(self.unshaded(x5, place))
             params = conditioning.with_white_balance(self, params, white_balance, None)
             seen: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
-
-    def forward_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
-        for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, params, place)
-            if seen is not None and stage.makes > 1:
-                seen[f"x{stage.makes - 1}"] = x
-        return x
 
     def make(self, srgb: Tensor, setting: ISPParams | None = None, place: Tensor | None = None) -> Tensor:
         """The mosaic of :meth:`reverse`."""
@@ -309,18 +204,6 @@ class DictionaryISP(ReverseISP):
         x = stages.as_float(srgb)
         params = self.choose(x)
         return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
-
-    def linear(self, x: Tensor) -> Tensor:
-        """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
-        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
-            x = stage.reverse(x, None) if stage.makes <= 2 else x
-        return x
-
-    def _unshaded(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """x5 to x4, what the forward encoders look at."""
-        for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, None, place) if stage.makes >= 5 else x
-        return x
 
     # -- files ------------------------------------------------------------------------------------------------------
 

@@ -18,8 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_BAND = 2**19
-"""Pixels that a CPU works on at a time, to bound memory."""
+BAND = 2**19
+"""Bounds the memory that a CPU takes."""
 
 
 class Camera(NamedTuple):
@@ -71,13 +71,16 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
     return [y, x, down[0] - y, down[1] - x, right[0] - y, right[1] - x]
 
 
-def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
-    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
+def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> Tensor:
+    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``.
+
+    ``band``: pixels that a CPU works on at a time.
+    """
     batch, _, height, width = srgb.shape
     raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device, dtype=torch.float32)
     pictures, rows = batch, height
     if srgb.device.type == "cpu":
-        pictures, rows = 1, max(2, _BAND // max(width, 1) // 2 * 2)
+        pictures, rows = 1, max(2, band // max(width, 1) // 2 * 2)
     for b in range(0, batch, pictures):
         own = slice(b, b + pictures)
         camera_here = camera._replace(curves=camera.curves[own], colour=camera.colour[own], frame=camera.frame[own])

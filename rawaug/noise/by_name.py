@@ -14,7 +14,8 @@ names                                                                what       
 ===================================================================  ===========================  ============
 
 Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives settings:
-``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model.
+``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
+no name: ``{"pair_psnr": 41.18}``.
 """
 
 from __future__ import annotations
@@ -117,6 +118,8 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
         >>> len(noise_model({"name": "SensorNoise", "settings": {"levels": "upi", "row_var": 1e-6}}).models)
         2
     """
+    if isinstance(spec, Mapping) and "pair_psnr" in spec:
+        spec = {"name": "CalibratedNoise", "settings": dict(spec)}
     if isinstance(spec, (str, Mapping)):
         name, settings = name_and_settings(spec)
         if name not in NOISE:

@@ -57,6 +57,8 @@ def expected_pair_psnr(law: NoiseLevels, signal: Sequence[float]) -> float:
 class CalibratedNoise(ShotReadNoise):
     """Shot and read noise at a stated mean PSNR of the pairs; the ratio of read to shot noise is that of the law.
 
+    In recipes ``noise: {pair_psnr: 41.18}``.
+
     Args:
         pair_psnr: in dB, over all pairs; a single one scatters as the law and the pictures do.
         signal: mean signal of the clean RAW, a number or one for each of some pictures; by default that of photographs

@@ -13,7 +13,7 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, overload
 
@@ -34,6 +34,7 @@ from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise
 from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
+from rawaug.registry import nearest
 from rawaug.seeding import keyed_generator, rank_key
 
 Sampling = Literal["convex", "independent", "perturb", "chosen"]
@@ -61,6 +62,9 @@ class RawAugment(nn.Module):
             above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
             like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
+        light: of an ISP of published cameras, the light that cameras are drawn in: a colour temperature in kelvin, or
+            one of :data:`rawaug.isp.light.LAMPS` by name. Any light by default.
+        tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
     Raises:
         ValueError: if a setting is unknown or out of range, or the noise is one of Bayer's planes and the pattern has
@@ -84,31 +88,69 @@ class RawAugment(nn.Module):
         seed: int = 0,
         exposure: tuple[float, float] | None = None,
         cfa: str | None = None,
+        light: float | str | None = None,
+        tone: str | None = None,
     ) -> None:
         super().__init__()
         self.pattern = None if cfa is None else pattern(cfa)
         if self.pattern is not None and self.pattern.name in CFA.__members__:
             isp, self.pattern = deepcopy(isp), None
             isp.configure(cfa=str(cfa))
+        self.isp = frozen(isp)
+        self.baked = frozen(reverse_pass(isp))
+        self.register_load_state_dict_pre_hook(_drop_isp)
+        self._draw(noise, sampling, strength, seed, exposure, light, tone)
+
+    def _draw(
+        self,
+        noise: NoiseSpec | NoiseModel,
+        sampling: Sampling,
+        strength: float,
+        seed: int,
+        exposure: tuple[float, float] | None,
+        light: float | str | None,
+        tone: str | None,
+    ) -> None:
         if sampling not in get_args(Sampling):
             raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
         if not strength >= 0:
             raise ValueError(f"strength must be at least 0, got {strength}")
+        cameras = bool(self.isp.config.cameras)
         if exposure is None:
-            exposure = EXPOSURE if isp.config.cameras else (0.0, 0.0)
+            exposure = EXPOSURE if cameras else (0.0, 0.0)
         if len(exposure) != 2 or not exposure[0] <= exposure[1]:
             raise ValueError(f"exposure must be (lowest, highest) in stops, got {exposure}")
-        self.isp = frozen(isp)
-        self.baked = frozen(reverse_pass(isp))
-        self.register_load_state_dict_pre_hook(_drop_isp)
-        self.noise = noise_for(isp, noise)
+        if (light, tone) != (None, None) and not (cameras and sampling in ("convex", "independent")):
+            whose = f"with sampling {sampling!r}" if cameras else "of a fitted ISP"
+            raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
+        self.noise = noise_for(self.isp, noise)
         if self.pattern is not None and self.noise.by_plane:
-            raise ValueError(f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} has not")
-        self.sampling = sampling
-        self.strength = strength
-        self.seed = seed
-        self.exposure = exposure
+            raise ValueError(
+                f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} does not have"
+            )
+        self.sampling, self.strength, self.seed, self.exposure = sampling, strength, seed, exposure
+        self.cameras = self.isp.camera_sampler(sampling == "convex", light)
+        self.light = light
+        self.tone = None if tone is None else tone_weights(self.isp, tone)
         self._calls = 0
+
+    def redrawn(
+        self,
+        noise: NoiseSpec | NoiseModel,
+        sampling: Sampling = "convex",
+        strength: float = 0.1,
+        seed: int = 0,
+        exposure: tuple[float, float] | None = None,
+        light: float | str | None = None,
+        tone: str | None = None,
+    ) -> RawAugment:
+        """The same ISP and pattern with other draws, in no time: both share the baked ISP.
+
+        Arguments and errors are those of the constructor.
+        """
+        other = copy(self)
+        other._draw(noise, sampling, strength, seed, exposure, light, tone)
+        return other
 
     @classmethod
     def from_pretrained(
@@ -155,12 +197,19 @@ class RawAugment(nn.Module):
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
-            return self.isp.draw_setting(len(srgb), generator, consistent=self.sampling == "convex")
+            if self.cameras is None:
+                return self.isp.draw_setting(len(srgb), generator)
+            return self._toned(self.cameras.sample(len(srgb), generator, self.device))
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
         weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
         return self.isp.params_from_weights(*(perturb(w, self.strength, generator) for w in weights))
+
+    def _toned(self, setting: ISPParams) -> ISPParams:
+        if self.tone is None:
+            return setting
+        return setting._replace(tone_weights=self.tone.to(setting.tone_weights).expand_as(setting.tone_weights))
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""
@@ -242,6 +291,15 @@ class RawAugment(nn.Module):
         return super()._apply(moved, recurse)
 
     @property
+    def cfa(self) -> str:
+        """The name of the RAW's pattern."""
+        return str(self.isp.cfa) if self.pattern is None else self.pattern.name
+
+    def mosaic(self, raw: Tensor) -> Tensor:
+        """RAW of a pair as the mosaic ``(..., 1, H, W)``: packed Bayer RAW unpacked, other patterns as they are."""
+        return bayer.unpack(raw, self.isp.cfa) if self.pattern is None else raw
+
+    @property
     def device(self) -> torch.device:
         """Where the module is."""
         return self.isp.gain.log_gains.device
@@ -278,6 +336,19 @@ def frozen(module: M) -> M:
                 delattr(part, name)
                 part.register_buffer(name, tensor.detach(), persistent=False)
     return copy
+
+
+def tone_weights(isp: DictionaryISP, name: str) -> Tensor:
+    """Weights ``(K,)`` of one tone curve of the ISP, by name.
+
+    Raises:
+        ValueError: if it has no such curve.
+    """
+    names = list(isp.info.get("tones", []))
+    if isp.tone is None or name not in names:
+        listed = ", ".join(names) or "none by name: its tone is learned"
+        raise ValueError(f"tone {name!r} is no curve of this ISP, which has {listed}{nearest(name, names)}")
+    return torch.eye(len(names))[names.index(name)]
 
 
 def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:

@@ -118,7 +118,7 @@ class Visits(_Epochs):
             return (self.pinned, index)
         if index >= len(self._counts):
             raise ValueError(
-                f"the dataset has grown from {len(self._counts)} pictures since RawPairs was made of it; make it anew"
+                f"the dataset has grown from {len(self._counts)} pictures since RawPairs was created; create it again"
             )
         visit = int(self._counts[index])
         self._counts[index] = visit + 1

@@ -20,7 +20,7 @@ class DenoiserConfig:
         name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
         settings: its constructor's keys.
         start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
-            then the file's, unless they are given, and must agree with it. Null starts from nothing.
+            then the file's, unless they are given, and must agree with it. Null starts from random weights.
     """
 
     name: str = "UNet"
@@ -38,8 +38,8 @@ class TrainConfig:
         crop: side of the mosaic crops in pixels.
         learning_rate: peak learning rate of Adam.
         warmup: steps of linear warm-up.
-        schedule: of the rate after it: cosine, to 1%, or step, a halving every ``halve_every`` steps.
-        halve_every: steps.
+        schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
+        halve_every: steps between halvings.
         loss: l1, l2 or charbonnier, or {name, settings}.
         weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.

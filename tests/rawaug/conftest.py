@@ -28,8 +28,12 @@ def write_dng(
     orientation: int = 1,
     noise_profile: Sequence[float] | None = None,
     extra: Sequence[tuple[Any, ...]] = (),
+    **layout: Any,
 ) -> Path:
-    """Write uint16 ``(H, W)`` as a Bayer DNG, ``(H, W, 3)`` as a linear one; ``black`` is one level, or one a site."""
+    """Write uint16 ``(H, W)`` as a Bayer DNG, ``(H, W, 3)`` as a linear one; ``black`` is one level, or one a site.
+
+    ``layout`` is tifffile's: strips, tiles, byte order.
+    """
     byte, text, short, rational, srational, double = 1, 2, 3, 5, 10, 12
     tags: list[tuple[Any, ...]] = [
         (271, text, 0, "Maker", True),
@@ -50,7 +54,7 @@ def write_dng(
     if noise_profile is not None:
         tags.append((51041, double, len(noise_profile), tuple(noise_profile), True))
     photometric = 32803 if numbers.ndim == 2 else 34892
-    tifffile.imwrite(path, numbers, photometric=photometric, extratags=sorted([*tags, *extra]), metadata=None)
+    tifffile.imwrite(path, numbers, photometric=photometric, extratags=sorted([*tags, *extra]), metadata=None, **layout)
     return path
 
 

@@ -6,9 +6,8 @@ import torch
 from rawaug.devices import find_device
 
 
+@pytest.mark.usefixtures("no_gpu")
 def test_devices_are_found_or_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     assert find_device("auto") == find_device("cpu") == torch.device("cpu")
     for name in ("cuda", "gpu", "mps", "cuda:0"):
         with pytest.raises(ValueError, match=f"device '{name}': 1 needed, this machine has none; use cpu or auto"):

@@ -37,6 +37,22 @@ def test_x_trans_has_20_green_sites_and_all_colours_in_every_row_and_column() ->
     assert int((greens == 1).sum()) == 4, "squares of four green sites"
 
 
+@given(patterns, st.integers(4, 9), st.integers(4, 9))
+def test_demosaicing_keeps_what_was_measured_and_flat_colours(cfa: Pattern, rows: int, columns: int) -> None:
+    size = (2 * rows, 2 * columns)
+    flat = torch.tensor([0.2, 0.5, 0.9])[None, :, None, None].expand(1, 3, *size)
+    torch.testing.assert_close(cfa.demosaic(cfa.mosaic(flat)), flat)
+    raw = torch.rand(1, 1, *size, generator=torch.Generator().manual_seed(rows))
+    assert torch.equal(cfa.mosaic(cfa.demosaic(raw)), raw)
+
+
+@pytest.mark.parametrize("cfa", list(bayer.CFA))
+def test_of_bayer_s_patterns_demosaicing_is_bilinear(cfa: bayer.CFA) -> None:
+    raw = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(0))
+    ours, theirs = pattern(cfa.value).demosaic(raw), bayer.demosaic(raw, cfa)
+    torch.testing.assert_close(ours[..., 1:-1, 1:-1], theirs[..., 1:-1, 1:-1])
+
+
 @pytest.mark.parametrize("cfa", list(bayer.CFA))
 def test_quad_bayer_is_bayer_of_2_x_2_pixels(cfa: bayer.CFA) -> None:
     quad = pattern(f"QUAD-{cfa}").channels(8, 12)
@@ -147,5 +163,5 @@ def test_another_bayer_pattern_is_packed_as_ever_and_leaves_the_isp_alone(isp: D
 
 
 def test_noise_of_the_four_planes_is_refused_without_them(isp: DictionaryISP) -> None:
-    with pytest.raises(ValueError, match="differs between the planes R, Gr, Gb, B, which XTRANS has not"):
+    with pytest.raises(ValueError, match="differs between the planes R, Gr, Gb, B, which XTRANS does not have"):
         RawAugment(isp, noise=ColourBias(1e-3), cfa="XTRANS")

@@ -59,6 +59,10 @@ class Shot:
 class DemoCamera:
     """A camera with a sensor of pattern ``cfa``.
 
+    Args:
+        cfa: the pattern.
+        color_matrix: rows of M, white-balanced camera colour to linear sRGB, each summing to 1.
+
     Example:
         >>> picture = torch.randint(0, 256, (3, 64, 96), dtype=torch.uint8)
         >>> pair = DemoCamera().capture(picture, torch.Generator().manual_seed(0))
@@ -67,6 +71,7 @@ class DemoCamera:
     """
 
     cfa: CFA = CFA.GRBG
+    color_matrix: tuple[tuple[float, float, float], ...] = _COLOR_MATRIX
 
     def sample(self, generator: torch.Generator, iso: int | None = None) -> Shot:
         """Draw the parameters of a shot; the ISO too, unless it is given."""
@@ -107,7 +112,7 @@ class DemoCamera:
             raw=clean,
             cfa=self.cfa,
             white_balance=shot.white_balance,
-            color_matrix=torch.tensor(_COLOR_MATRIX),
+            color_matrix=torch.tensor(self.color_matrix),
             noisy=_digitise(shot_var * electrons + read_noise),
             shot_var=shot_var,
             read_var=read_var,
@@ -123,14 +128,14 @@ class DemoCamera:
         from kornia.filters import gaussian_blur2d
 
         scene = gaussian_blur2d(decode_srgb(picture[None].float() / 255), 5, (_BLUR, _BLUR))[0]
-        to_camera = torch.linalg.inv(torch.tensor(_COLOR_MATRIX))
+        to_camera = torch.linalg.inv(torch.tensor(self.color_matrix))
         camera = torch.einsum("ij,jhw->ihw", to_camera, scene) / _column(shot.white_balance)
         return mosaic(shot.exposure * _shading(*picture.shape[-2:]) * camera, self.cfa).clamp(min=0)
 
     def _render(self, raw: Tensor, shot: Shot) -> Tensor:
         """The camera's own picture, uint8 ``(3, H, W)``."""
         camera = demosaic_malvar(raw / _shading(*raw.shape[-2:]), self.cfa) * _column(shot.white_balance)
-        linear = torch.einsum("ij,jhw->ihw", torch.tensor(_COLOR_MATRIX), camera.clamp(0, 1)).clamp(0, 1)
+        linear = torch.einsum("ij,jhw->ihw", torch.tensor(self.color_matrix), camera.clamp(0, 1)).clamp(0, 1)
         return (_tone(linear) * 255).round().to(torch.uint8)
 
 

@@ -48,6 +48,11 @@ def demo_photographs(split: str) -> dict[str, Tensor]:
     return dict(_photographs(split))
 
 
+def demo_files() -> list[Path]:
+    """The files of all photographs."""
+    return [_folder() / file for files in (*PHOTOGRAPHS.values(), PICTURES_ONLY) for file in files]
+
+
 def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair]:
     """Shots by the demo camera, 288 x 448: crops of the split's photographs, and of dead leaves except in training.
 
@@ -146,11 +151,14 @@ def _photographs(split: str) -> dict[str, Tensor]:
 
 @cache
 def _read(files: tuple[str, ...]) -> dict[str, Tensor]:
+    return {Path(file).stem: read_picture(_folder() / file) for file in files}
+
+
+def _folder() -> Path:
     with extra("train"):
         import skimage
 
-    folder = Path(skimage.__file__).parent / "data"
-    return {Path(file).stem: read_picture(folder / file) for file in files}
+    return Path(skimage.__file__).parent / "data"
 
 
 def _require_split(split: str) -> None:

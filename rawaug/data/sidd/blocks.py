@@ -190,10 +190,11 @@ class SiddBenchmark(Sequence[NoisyBlock]):
     """The benchmark's noisy blocks, whose clean ones are not public; results go to :func:`write_submission`.
 
     Args:
-        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth.
+        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth, and ``noise_level_functions.csv`` if there is one,
+            whose (shot_var, read_var) are in ``levels`` by scene instance.
 
     Raises:
-        FileNotFoundError: if it is not there.
+        FileNotFoundError: if the blocks are not there.
 
     Example:
         >>> blocks = SiddBenchmark("SIDD_Benchmark")  # doctest: +SKIP
@@ -202,6 +203,7 @@ class SiddBenchmark(Sequence[NoisyBlock]):
 
     def __init__(self, path: str | Path) -> None:
         self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
+        self.levels = noise_level_functions(Path(path))
         self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
         self._all = Once(partial(_blocks_of_scenes, self.file))
 
@@ -277,7 +279,7 @@ def _patterns(file: Path) -> list[CFA]:
             raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
         return [CFA(name) for name in names]
     except (ValueError, csv.Error) as error:
-        raise ValueError(f"{file}: is no list of patterns, one for each frame ({error}); copy it again") from None
+        raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
 
 
 def _blocks_of_scenes(file: Path) -> Tensor:

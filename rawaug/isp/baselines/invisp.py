@@ -137,6 +137,9 @@ class InvISP(CropTrainedISP):
     def prepare(self, pairs: Sequence[FramePair]) -> None:
         self.balance.copy_(torch.tensor([pair.white_balance for pair in pairs]).log().mean(0, keepdim=True).exp())
 
+    def make(self, srgb: Tensor, setting: tuple[float, ...] | None = None, place: Tensor | None = None) -> Tensor:
+        return self.reverse(srgb, setting)
+
     def reverse(self, srgb: Tensor, white_balance: Tensor | tuple[float, ...] | None = None) -> Tensor:
         """As in the base class; ``white_balance``: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``."""
         return self.to_mosaic(self._unbalance(self.flow.inverse(checked_srgb(srgb)), white_balance))

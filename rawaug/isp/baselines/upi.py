@@ -86,6 +86,15 @@ class SmoothstepISP(BaselineISP):
             return super().apply(srgb)
         return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), params))
 
+    def balanced(self, white_balance: tuple[float, float, float]) -> UPIParams:
+        """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
+        params = self.default_params(1)
+        balance = torch.tensor(white_balance) / white_balance[1]
+        return params._replace(gains=params.gains[:, 1:2].cpu() * balance)
+
+    def make(self, srgb: Tensor, setting: UPIParams | None = None, place: Tensor | None = None) -> Tensor:
+        return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), setting or self.default_params(len(srgb))))
+
     def unprocess(self, srgb: Tensor) -> Tensor:
         return unprocess_pixels(srgb, self.default_params(len(srgb)))
 

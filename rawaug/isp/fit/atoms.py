@@ -21,13 +21,10 @@ from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
 from rawaug.seeding import derived_seed
 
-LOG_MSE_EPS = 1e-5
-"""Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
 SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
 SPREAD_EPS = 1e-6
 """Under the logarithm, as for the MSE: a frame that nothing predicts must not decide alone."""
 KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
-PRIOR_STEPS = 400
 REACH_ATOMS = 8
 
 
@@ -101,7 +98,7 @@ def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> 
     isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
 
 
-def set_priors(isp: DictionaryISP, samples: PixelSamples) -> None:
+def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> None:
     """The constant weights: all colour atoms alike, and the gains that serve the frames best."""
     colour_weights = torch.full((isp.config.colour_atoms,), 1.0 / isp.config.colour_atoms)
     with torch.no_grad():
@@ -109,19 +106,20 @@ def set_priors(isp: DictionaryISP, samples: PixelSamples) -> None:
         plain = plain._replace(gains=torch.ones(1, 3))
         x = isp.reverse_pixels(samples.srgb, plain, samples.place)
         a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
-    weights = best_constants(a, b, 1.0 / isp.gain.channel_gains().detach())
+    inverse = 1.0 / isp.gain.channel_gains().detach()
+    weights = best_constants(a, b, inverse, config.prior_steps, config.mse_floor)
     for encoders in (isp.reverse_encoders, isp.forward_encoders):
         encoders.colour.set_prior(colour_weights)
         encoders.gain.set_prior(weights)
 
 
-def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor) -> Tensor:
+def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor, steps: int = 400, mse_floor: float = 1e-5) -> Tensor:
     """Weights ``(M,)`` of atoms of inverse gains ``(M, 3)`` for frames with moments ``a, b`` ``(F, 3)``."""
     logits = torch.zeros(len(inverse_atoms), requires_grad=True)
     optimiser = torch.optim.Adam([logits], lr=0.05)
-    for _ in range(PRIOR_STEPS):
+    for _ in range(steps):
         u = logits.softmax(0) @ inverse_atoms
-        loss = (((u * a - b) ** 2 / a.clamp_min(1e-9)).sum(1) + LOG_MSE_EPS).log().sum()
+        loss = (((u * a - b) ** 2 / a.clamp_min(1e-9)).sum(1) + mse_floor).log().sum()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

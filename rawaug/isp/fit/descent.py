@@ -40,7 +40,8 @@ class Descent:
         key: what the state belongs to; a file with another key is not used.
         seed: of what the steps draw.
         progress: show progress bars.
-        report_steps: a stage reports, and is watched, this often; None is 50.
+        report_steps: a stage reports, and is watched, this often.
+        save_seconds: between two writes of the state.
 
     Attributes:
         watched: what the watched stages scored, by name.
@@ -49,9 +50,17 @@ class Descent:
         ValueError: if the file at ``path`` cannot be read.
     """
 
-    def __init__(self, path: Path | None, key: str, seed: int, progress: bool, report_steps: int | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | None,
+        key: str,
+        seed: int,
+        progress: bool,
+        report_steps: int = REPORT_STEPS,
+        save_seconds: float = SAVE_SECONDS,
+    ) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
-        self.report_steps = report_steps or REPORT_STEPS
+        self.report_steps, self.save_seconds = report_steps, save_seconds
         self.watched: dict[str, Watched] = {}
         self._steps: dict[str, int] = {}
         self._tensors: dict[str, Tensor] = {}
@@ -100,7 +109,7 @@ class Descent:
                 scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
                 bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores}", refresh=False)
                 losses.clear()
-            if self.path is not None and time.monotonic() - saved > SAVE_SECONDS:
+            if self.path is not None and time.monotonic() - saved > self.save_seconds:
                 self._keep(stage, step + 1, tensors, optimiser)
                 saved = time.monotonic()
         for tensor in tensors.values():

@@ -14,20 +14,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from rawaug.isp.fit.atoms import LOG_MSE_EPS
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.losses import apart, decibels, mean_square
 from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
-
-FEWEST_FRAMES = 12
-FOLDS = 4
-STEPS = 200
-FRAMES_A_STEP = 4
-PIXELS_A_STEP = 1024
-LEARNING_RATE = 1e-3
-CONSISTENCY = 1.0
 
 Refit = Callable[[Sequence[int], str], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
@@ -44,12 +35,12 @@ def train_encoders(
     """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` records which."""
     wanted = config.encoders
     isp.use_encoders(False)
-    if wanted == "auto" and len(shots) >= FEWEST_FRAMES:
-        gain = _gain_on_frames_left_out(samples, shots, descent, refit)
+    if wanted == "auto" and len(shots) >= config.encoder_training.fewest_frames:
+        gain = _gain_on_frames_left_out(samples, shots, config, descent, refit)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
-        _train(isp, samples, shots, list(range(len(shots))), descent, "encoders")
+        _train(isp, samples, shots, list(range(len(shots))), config, descent, "encoders")
 
 
 def _train(
@@ -57,29 +48,37 @@ def _train(
     samples: PixelSamples,
     shots: Sequence[Shot],
     frames: Sequence[int],
+    config: FitConfig,
     descent: Descent,
     stage: str,
 ) -> None:
     isp.use_encoders(True, descent.seed)
+    how = config.encoder_training
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        chosen = torch.randint(len(frames), (FRAMES_A_STEP,), generator=generator).tolist()
-        pixels = torch.randint(samples.srgb.shape[-1], (PIXELS_A_STEP,), generator=generator)
-        each = [_frame_loss(isp, samples, shots, frames[k], pixels, generator) for k in chosen]
+        chosen = torch.randint(len(frames), (how.frames,), generator=generator).tolist()
+        pixels = torch.randint(samples.srgb.shape[-1], (how.pixels,), generator=generator)
+        each = [_frame_loss(isp, samples, shots, frames[k], pixels, config, generator) for k in chosen]
         return torch.stack(each).mean()
 
-    descent.run(stage, loss, tensors, STEPS, LEARNING_RATE)
+    descent.run(stage, loss, tensors, how.steps, how.learning_rate)
 
 
 def _frame_loss(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, g: torch.Generator
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[Shot],
+    frame: int,
+    pixels: Tensor,
+    config: FitConfig,
+    g: torch.Generator,
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
     srgb, raw = _same_piece(shots[frame].srgb, shots[frame].raw, g)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
-    errors = (mean_square(isp, part, ours) + LOG_MSE_EPS).log() + (mean_square(isp, part, theirs) + LOG_MSE_EPS).log()
-    return errors.sum() + CONSISTENCY * apart(ours, theirs)
+    errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
+    return (errors[0] + errors[1]).sum() + config.consistency * apart(ours, theirs)
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -97,16 +96,18 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
     return pieces[0], pieces[1]
 
 
-def _gain_on_frames_left_out(samples: PixelSamples, shots: Sequence[Shot], descent: Descent, refit: Refit) -> float:
+def _gain_on_frames_left_out(
+    samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent, refit: Refit
+) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
-    gain = 0.0
-    for fold in range(FOLDS):
-        out = list(range(fold, len(shots), FOLDS))
+    gain, folds = 0.0, config.encoder_training.folds
+    for fold in range(folds):
+        out = list(range(fold, len(shots), folds))
         kept = [k for k in range(len(shots)) if k not in out]
-        part = f" without part {fold + 1} of {FOLDS}"
+        part = f" without part {fold + 1} of {folds}"
         isp = refit(kept, part)
         isp.use_encoders(False)
         gain -= len(out) * decibels(isp, samples, shots, out)
-        _train(isp, samples, shots, kept, descent, f"encoders{part}")
+        _train(isp, samples, shots, kept, config, descent, f"encoders{part}")
         gain += len(out) * decibels(isp, samples, shots, out)
     return gain / len(shots)

@@ -52,7 +52,7 @@ def train_jointly(
     def loss(generator: torch.Generator) -> Tensor:
         chosen = torch.randint(len(trained), (FRAMES_A_STEP,), generator=generator).tolist()
         pixels = torch.randint(samples.srgb.shape[-1], (config.batch,), generator=generator)
-        return torch.stack([_frame_loss(isp, samples, shots, trained[k], pixels, config.noisy) for k in chosen]).mean()
+        return torch.stack([_frame_loss(isp, samples, shots, trained[k], pixels, config) for k in chosen]).mean()
 
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
@@ -63,11 +63,11 @@ def train_jointly(
 
 
 def _frame_loss(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, noisy: bool
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, config: FitConfig
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
     ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(shots[frame].raw)
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
-    cycle = cycle_error(isp, part, theirs, back, noisy)
-    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * apart(ours, theirs)
+    cycle = cycle_error(isp, part, theirs, back, config)
+    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * config.consistency * apart(ours, theirs)

@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from rawaug.isp.conditioning import with_white_balance
+from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.setting import ISPParams
-
-INTERMEDIATE_WEIGHT = 0.1
 
 
 def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
@@ -27,17 +27,17 @@ def reading_error(predicted: Tensor, part: PixelSamples) -> Tensor:
 
 
 def cycle_error(
-    isp: DictionaryISP, part: PixelSamples, params: ISPParams, back: Mapping[str, Tensor], noisy: bool = False
+    isp: DictionaryISP, part: PixelSamples, params: ISPParams, back: Mapping[str, Tensor], config: FitConfig
 ) -> Tensor:
     """l2 on the sRGB of the forward pass, and on every intermediate image against ``back``, the reverse pass's.
 
-    From ``noisy`` readings the pass would learn to mend noise, so that it starts where the reverse pass ended.
+    From noisy readings the pass would learn to mend noise, so that it starts where the reverse pass ended.
     """
     ahead: dict[str, Tensor] = {}
-    start = back["raw"].detach() if noisy else part.cell_raw
+    start = back["raw"].detach() if config.noisy else part.cell_raw
     error = (isp.forward_pixels(start, params, part.place, ahead) - part.cell_srgb) ** 2
     for name in ahead:
-        error = error + INTERMEDIATE_WEIGHT * (ahead[name] - back[name]) ** 2 if name in back else error
+        error = error + config.intermediate * (ahead[name] - back[name]) ** 2 if name in back else error
     return (error * part.cell_weight).sum() / (3.0 * part.cell_weight.sum()).clamp_min(1.0)
 
 
@@ -56,8 +56,20 @@ def apart(ours: ISPParams, theirs: ISPParams) -> Tensor:
 
 
 @torch.no_grad()
-def decibels(isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frames: Sequence[int]) -> float:
-    """Mean PSNR of some frames, each under the parameters that the ISP chooses for its thumbnail."""
-    every = torch.arange(samples.srgb.shape[-1])
-    values = [mean_square(isp, samples.pick(every, torch.tensor([k])), isp.choose(shots[k].srgb)) for k in frames]
+def decibels(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frames: Sequence[int], as_shot: bool = False
+) -> float:
+    """Mean PSNR of some frames, each under the parameters that the ISP chooses for its thumbnail.
+
+    Args:
+        isp: the ISP.
+        samples, shots: all frames.
+        frames: which of them.
+        as_shot: with the gains that their files state.
+    """
+    every, values = torch.arange(samples.srgb.shape[-1]), []
+    for k in frames:
+        given = shots[k].white_balance if as_shot else None
+        params = with_white_balance(isp, isp.choose(shots[k].srgb), given, None)
+        values.append(mean_square(isp, samples.pick(every, torch.tensor([k])), params))
     return float(-10.0 * torch.cat(values).log10().mean())

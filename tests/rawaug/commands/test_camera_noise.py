@@ -16,8 +16,8 @@ from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.commands.camera_noise import measure_camera_noise
-from rawaug.commands.denoise import levels_of, stored_noise
 from rawaug.commands.fit import fit
+from rawaug.commands.frame_noise import levels_of, stored_noise
 from rawaug.data.pair import Pair
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
@@ -131,7 +131,9 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
 
 def test_two_cameras_are_not_pooled(noisy_pair: Pair) -> None:
     pairs = [at_iso(noisy_pair, 100, 2e-4), at_iso(noisy_pair, 100, 2e-4, "Other 2")]
-    with pytest.raises(ValueError, match=r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera by itself"):
+    with pytest.raises(
+        ValueError, match=r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera separately"
+    ):
         measure_camera_noise(pairs)
 
 

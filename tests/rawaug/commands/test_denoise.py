@@ -15,8 +15,9 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder, levels_of
+from rawaug.commands.denoise import denoise_file, denoise_folder
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
+from rawaug.commands.frame_noise import levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
@@ -48,12 +49,24 @@ class LocalMean(denoisers.UNet):
 
 
 @pytest.fixture
-def identity(tmp_path: Path) -> Path:
-    """The weights of an untrained network, which changes nothing."""
-    path = tmp_path / "weights" / "identity.safetensors"
-    path.parent.mkdir()
-    denoisers.save(denoisers.UNet(width=4, scales=2), path, {"cfa": "GRBG"})
-    return path
+def adding(tmp_path: Path) -> Callable[[float], Path]:
+    """``adding(x)``: the weights of an untrained network, which adds x to every value."""
+
+    def weights(value: float) -> Path:
+        network, path = denoisers.UNet(width=4, scales=2), tmp_path / "weights" / "adding.safetensors"
+        assert network.last.bias is not None
+        torch.nn.init.constant_(network.last.bias, value)
+        path.parent.mkdir(exist_ok=True)
+        denoisers.save(network, path, {"cfa": "GRBG"})
+        return path
+
+    return weights
+
+
+@pytest.fixture
+def identity(adding: Callable[[float], Path]) -> Path:
+    """The weights of a network that changes nothing."""
+    return adding(0.0)
 
 
 @pytest.mark.parametrize("own", list(CFA))
@@ -87,12 +100,9 @@ def test_a_denoiser_that_changes_nothing_gives_the_source_back(tmp_path: Path, b
     assert after.noise_profile is None
 
 
-def test_below_the_digital_number_0_is_counted(
-    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_below_the_digital_number_0_is_counted(tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]) -> None:
     source = shot(tmp_path / "a.dng", bayer_dng, black=0)
-    monkeypatch.setattr(denoisers.UNet, "forward", lambda self, noisy, variance=None: noisy - 0.1)
-    result = denoise_file(source, tmp_path / "b.dng", identity)
+    result = denoise_file(source, tmp_path / "b.dng", adding(-0.1))
     expected = (read_raw(source).mosaic < 0.1 - 0.5 / 16383).float().mean().item()
     assert result.below_zero == pytest.approx(expected, abs=1e-3) and expected > 0.01
     assert read_raw(tmp_path / "b.dng").mosaic.min() == 0
@@ -168,19 +178,18 @@ def test_the_command(tmp_path: Path, bayer_dng: Dng, identity: Path, capsys: pyt
 
 
 def test_a_strength_below_1_leaves_that_much_of_the_noise(
-    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]
 ) -> None:
-    source = shot(tmp_path / "a.dng", bayer_dng)
-    monkeypatch.setattr(denoisers.UNet, "forward", lambda self, noisy, variance=None: noisy + 0.1)
-    denoise_file(source, tmp_path / "b.dng", identity, strength=0.75)
+    source, brighter = shot(tmp_path / "a.dng", bayer_dng), adding(0.1)
+    denoise_file(source, tmp_path / "b.dng", brighter, strength=0.75)
     before, after = read_raw(source), read_raw(tmp_path / "b.dng")
     assert (after.mosaic - before.mosaic).mean().item() == pytest.approx(0.075, abs=1e-4)
     assert after.noise_profile == pytest.approx((LEVELS[0] / 16, LEVELS[1] / 16))
-    denoise_file(source, tmp_path / "c.dng", identity, strength=0.0)
+    denoise_file(source, tmp_path / "c.dng", brighter, strength=0.0)
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
     for strength in (-0.1, 1.5):
         with pytest.raises(ValueError, match=f"strength must be between 0 and 1, got {strength}"):
-            denoise_file(source, tmp_path / "d.dng", identity, strength=strength)
+            denoise_file(source, tmp_path / "d.dng", brighter, strength=strength)
 
 
 def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> None:
@@ -234,11 +243,10 @@ def test_a_folder_with_a_broken_file_is_done_and_fails(
     assert main([*command, "--strength", "0.5"]) == 0
 
 
+@pytest.mark.usefixtures("no_gpu")
 def test_wrong_wishes_are_refused_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rawaug.commands.denoise.read_raw", lambda _: pytest.fail("a file was read"))
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     monkeypatch.setitem(sys.modules, "bm3d", None)
     (tmp_path / "in").mkdir()
     for wish, message in (
@@ -250,7 +258,7 @@ def test_wrong_wishes_are_refused_before_anything_is_read(
         (["--preview", str(tmp_path / "b.gif")], "the preview is a .jpg or .png"),
         (["--preview", str(tmp_path)], "exists"),
     ):
-        assert main(["denoise", str(tmp_path / "a.dng"), str(tmp_path / "b.dng"), *wish]) == 2
+        assert main(["denoise", str(tmp_path / "missing.dng"), str(tmp_path / "b.dng"), *wish]) == 2
         assert message in capsys.readouterr().err
     assert main(["denoise", str(tmp_path / "in"), str(tmp_path / "out"), "--preview", "p.jpg"]) == 2
     assert "is for one file" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -40,9 +41,9 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
 
 
 def test_what_is_missing_is_said_in_one_line(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rawaug.commands.onnx_files.find_spec", lambda name: None)
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ValueError, match=r"export needs onnx, onnxscript, onnxruntime: pip install 'rawaug\[export\]'"):
         export(weights, tmp_path / "a.onnx")
-    monkeypatch.setattr("rawaug.commands.onnx_files.find_spec", lambda name: True)
     with pytest.raises(ValueError, match=r"ends in \.onnx"):
         export(weights, tmp_path / "a.pt")

@@ -184,6 +184,26 @@ def test_a_frame_of_unknown_colour_is_refused() -> None:
         rawaug.fit(unknown, progress=False, noise="off", steps=2, pixels=256, batch=64)
 
 
+def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders, rng = [tmp_path / "fitted", tmp_path / "held"], np.random.default_rng(0)
+    for folder in folders:
+        folder.mkdir()
+        numbers = np.kron(rng.uniform(100, 900, (12, 12)), np.ones((8, 8))).astype(np.uint16)
+        colour: dict[str, Any] = {"white_balance": [2.0, 1.0, 1.5], "color_matrix": np.eye(3)}
+        np.savez(folder / f"{folder.name}.npz", clean=numbers, noisy=numbers, **colour)
+    given = ["--cfa", "GRBG", "--black", "64", "--white", "1023"]
+    out, (fitted, held) = tmp_path / "mine.safetensors", (f"pairs:{folder}" for folder in folders)
+    isp = fit(out, fitted, "--held-out", held, *given)
+    assert isp.cfa == "GRBG" and isp.info["frames"] == ["fitted"] and "held out:" in capsys.readouterr().out
+    assert "does not state its CFA" in refused(capsys, "fit", fitted, "--out", out, *QUICK, *given[2:])
+    line = refused(capsys, "fit", "demo:train", "--out", out, *QUICK, "--cfa", "GRBG")
+    assert "cfa" in line and "demo:" in line
+    with pytest.raises(ValueError, match="cfa can only be given for pairs:PATH; each Pair has its own"):
+        rawaug.fit(rawaug.data.demo_pairs("train", count=1), cfa="GRBG")
+
+
 def test_frames_that_cannot_be_read_are_named_and_the_rest_is_fitted(
     tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -164,6 +164,24 @@ def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
         synth(tmp_path / "in", tmp_path / "none", workers=0)
 
 
+def test_one_picture_of_a_named_camera_as_other_sensors_see_it(tmp_path: Path, pictures: Path) -> None:
+    drawn = ["--camera", "Nikon D750", "--light", "4000", "--tone", "linear", "--exposure=-0.5", "--seed", "3"]
+    drawn += ["--noise", "Nikon D750", "--iso", "1600", "--workers", "0"]
+    command = ["synth", str(pictures / "sub" / "b.png"), str(tmp_path / "out"), "--cfa", "XTRANS", *drawn]
+    assert main([*command, "--format", "npz"]) == 0
+    with np.load(tmp_path / "out" / "b_0.npz") as file:
+        assert str(file["cfa"]) == "XTRANS" and file["noisy"].shape == (1, 96, 64)
+        pair = replay(tmp_path / "out" / "b_0.safetensors")
+        assert np.array_equal(file["noisy"], pair.noisy.numpy()) and np.array_equal(file["clean"], pair.clean.numpy())
+    assert main([*command, "--format", "tiff"]) == 2, "other settings than those of the folder"
+    quad = [*command[:2], str(tmp_path / "quad"), "--cfa", "QUAD-RGGB", *drawn]
+    assert main([*quad, "--format", "tiff"]) == 0
+    mosaic = torch.from_numpy(tifffile.imread(tmp_path / "quad" / "b_0_clean.tif"))
+    assert torch.equal(mosaic[None], replay(tmp_path / "quad" / "b_0.safetensors").clean)
+    with pytest.raises(ValueError, match="format dng holds Bayer mosaics, not XTRANS"):
+        synth(pictures, tmp_path / "dng", cfa="XTRANS", workers=0)
+
+
 def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) -> None:
     (tmp_path / "in").mkdir()
     picture = tmp_path / "in" / "c.png"

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
+from rawaug.commands.frame_denoisers import Frame
+from rawaug.commands.submit import submit_dnd
 from rawaug.data import Dnd, check_dnd_submission, open_pairs, write_dnd_submission
 from rawaug.data.mat import read_value
 
@@ -73,6 +75,29 @@ def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:
     cells = read_value(out / "0022.mat", "Idenoised")
     assert np.array_equal(cells[7], dnd[21 * 20 + 7].noisy[0].numpy() * 0.5) and cells[7].dtype == np.float32
     assert int(read_value(out / "0022.mat", "israw")) == 1 and read_value(out / "0022.mat", "eval_version") == "1.0"
+
+
+class Halved:
+    """Halves a mosaic, and notes what it was given."""
+
+    reads_levels = True
+
+    def __init__(self) -> None:
+        self.settings: dict[str, Any] = {}
+        self.seen: list[tuple[float, float]] = []
+
+    def __call__(self, frame: Frame, levels: tuple[float, float]) -> torch.Tensor:
+        self.seen.append(levels)
+        return frame.mosaic * 0.5 - 0.01
+
+
+def test_the_command_denoises_every_box_by_its_frames_levels_and_clips(folder: Path, tmp_path: Path) -> None:
+    method = Halved()
+    assert submit_dnd(str(folder), str(tmp_path / "out"), method) == 1000
+    assert method.seen[0] == (1e-3, 1e-6) and method.seen[21 * 20] == (0.022, 1e-6)
+    box = read_value(tmp_path / "out" / "0022.mat", "Idenoised")[7]
+    expected = (Dnd(folder)[21 * 20 + 7].noisy[0].numpy() * 0.5 - 0.01).clip(0.0)
+    assert np.allclose(box, expected, atol=1e-7)
 
 
 def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:

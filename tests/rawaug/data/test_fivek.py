@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from rawaug.data import check, fivek_pairs, open_pairs
 from rawaug.data.fivek import CAMERAS, fivek_numbers
+from rawaug.io import develop
+from rawaug.io.jpeg import through_jpeg
 
 SPLITS = {("canon", "train"): 650, ("canon", "test"): 127, ("nikon", "train"): 414, ("nikon", "test"): 73}
 
@@ -42,6 +45,21 @@ def test_a_split_is_found_by_number_and_developed(folder: Path) -> None:
         assert pair.raw[0, 0, 0].item() == pytest.approx((500 + 10 * place) / 4095)
         assert str(pair.cfa) == "RGGB" and pair.white_balance == pytest.approx((2, 1, 1.6), rel=1e-4)
         assert pair.srgb.shape == (3, 32, 48)
+
+
+def test_invisps_pictures_are_scaled_by_the_frames_maximum_and_stored_as_jpegs(
+    folder: Path, bayer_dng: Callable[..., Path]
+) -> None:
+    number = fivek_numbers("nikon", "test")[72]
+    (file,) = folder.rglob(f"a{number}-*.dng")
+    cell = np.tile(np.array([[1700, 3400], [3400, 2600]], np.uint16), (16, 24))  # brightest at 0.83 of white
+    cell[:, 24:] //= 3
+    bayer_dng(file, cell)
+    pair, plain = (open_pairs(f"{kind}_nikon:{folder}", split="test")[72] for kind in ("invisp", "fivek"))
+    assert torch.equal(pair.raw, plain.raw) and pair.name == plain.name == file.stem
+    assert torch.equal(plain.srgb, develop(file))
+    assert torch.equal(pair.srgb, through_jpeg(develop(file, 0.75), 90))
+    assert pair.srgb.float().mean() > plain.srgb.float().mean() + 2, "the brightest becomes white"
 
 
 def test_missing_frames_are_reported(folder: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA, pack
-from rawaug.data import Rawir, check, open_pairs
+from rawaug.data import Rawir, Rgb2Raw, check, open_pairs
 from rawaug.io import write_picture
 
 PLANES = (100, 200, 300, 400)
@@ -43,8 +43,38 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
     assert [pair.name for pair in open_pairs(f"rawir:{tmp_path / 'data-p20'}", "train")] == ["a"]
     (pair,) = open_pairs(f"rawir:{tmp_path / 'data-p20'}", "validation")
     assert pair.name == "b" and not pair.registered
-    with pytest.raises(ValueError, match=r"test: contains no \.npy file"):
+    with pytest.raises(ValueError, match=r"test: contains no \.npy or \.npz file"):
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
+
+
+def test_an_archive_states_its_white_level(tmp_path: Path) -> None:
+    write_pair(tmp_path, "a", "png")
+    packed = np.load(tmp_path / "a.npy")
+    (tmp_path / "a.npy").unlink()
+    np.savez(tmp_path / "a.npz", raw=packed, max_val=2**14 - 1)
+    (pair,) = Rawir(tmp_path)
+    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / (2**14 - 1))
+    np.savez(tmp_path / "a.npz", raw=packed)
+    with pytest.raises(OSError, match=r"a\.npz: cannot be read as raw and max_val"):
+        Rawir(tmp_path)[0]
+
+
+def test_rgb2raw_keeps_whole_raws_of_every_phone_aside(tmp_path: Path) -> None:
+    for phone in ("iphone-x", "samsung-s9"):
+        for shot in range(10, 22):
+            for crop in range(2):
+                write_pair(tmp_path / phone, f"{shot}_{crop}", "png")
+    splits = {split: Rgb2Raw(tmp_path, split) for split in ("train", "validation", "test")}
+    assert {split: len(pairs) for split, pairs in splits.items()} == {"train": 32, "validation": 8, "test": 8}
+    shots = {split: {name.rpartition("_")[0] for name in pairs.names} for split, pairs in splits.items()}
+    assert shots["test"] == {f"{phone}/{shot}" for phone in ("iphone-x", "samsung-s9") for shot in (10, 20)}
+    assert not (shots["train"] & shots["test"] or shots["train"] & shots["validation"])
+    pair = open_pairs(f"rgb2raw:{tmp_path}", "test")[2]
+    assert (pair.name, pair.camera, pair.balance_known) == ("iphone-x/20_0", "iphone-x", False)
+    assert pair.raw[0, 0, 3].item() == pytest.approx(200 / 4095)
+    with pytest.raises(ValueError, match="has no pair of RGB2RAW for train; it needs files of 10 RAWs"):
+        write_pair(tmp_path / "one", "1_0", "png")
+        Rgb2Raw(tmp_path / "one", "train")
 
 
 def test_what_is_wrong_is_reported(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from rawaug.experiment import denoising
 from rawaug.experiment.early_checks import require_runnable
-from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.extras import MissingExtra
 from rawaug.training.train_config import TrainConfig
 
@@ -33,12 +33,12 @@ def recipe(tmp_path: Path) -> Recipe:
         ({"out": "/dev/null"}, "/dev/null/mine: cannot be written"),
     ],
 )
+@pytest.mark.usefixtures("no_gpu")
 def test_it_is_found_before_any_work(
-    recipe: Recipe, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], message: str
+    recipe: Recipe, unread: str, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], message: str
 ) -> None:
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
     monkeypatch.setitem(__import__("sys").modules, "pywt", None)
-    monkeypatch.setattr(denoising, "planned", lambda *_: pytest.fail("data was read"))
+    recipe = replace(recipe, data=DataConfig(pairs=unread, validation=unread, test=unread))
     with pytest.raises((ValueError, OSError), match=message):
         denoising.run(replace(recipe, **change))
     assert not list(Path(recipe.out).iterdir())

@@ -14,7 +14,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
-from rawaug.experiment import methods
+from rawaug.experiment import methods, oracle
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -26,7 +26,7 @@ from rawaug.experiment.methods import (
     mosaic_only_psnr,
     score_rows,
 )
-from rawaug.isp.baselines import BASELINES, UPI
+from rawaug.isp.baselines import BASELINES, UPI, InvISP, TunedUPI
 from rawaug.isp.baselines.plain_unet import UNetISP
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig
@@ -34,11 +34,11 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import PATCH
 
 FrameOf = Callable[..., Pair]
-LAMPS = (1.2, 1.0, 2.6)
+DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 
 def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
-    frame = frame_of("one")
+    frame = frame_of("one", size=(64, 96))
     universal = DictionaryISP.from_pretrained("universal-small")
     universal.save(tmp_path / "own.safetensors")
     for name in ("universal-small", str(tmp_path / "own.safetensors")):
@@ -61,7 +61,7 @@ def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, flo
 @pytest.fixture
 def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(oracle, "STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
@@ -69,17 +69,38 @@ def test_the_true_camera_scores_highest(known_camera: DictionaryISP, frame_of: F
     pair = frame_of("daylight", size=(256, 512))  # two patches: the fall-off is that of the frame
     rows = rows_of(known_camera, pair)
     upi = rows_of(UPI(pair.cfa), pair)
-    assert set(rows) == {"blind", *ROWS} and set(upi) == {"blind"}
+    assert set(rows) == {"blind", *ROWS} and set(upi) == {"blind", "as-shot"}
     assert min(rows["blind"], rows["as-shot"]) > 75.0  # the 12 bits alone
     with torch.no_grad():
         known_camera.colour.matrices.copy_(torch.eye(3)[None])
     assert upi["blind"] < rows_of(known_camera, pair)["blind"] < 40.0
 
 
+@pytest.mark.parametrize("method", [UPI, TunedUPI, InvISP])
+def test_the_shots_gains_take_the_place_of_the_methods_own(method: Any, frame_of: FrameOf) -> None:
+    settings = {"blocks": 2, "growth": 4} if method is InvISP else {}
+    model = method(CFA.GRBG, **settings)
+    if isinstance(model, TunedUPI):
+        model.gains.copy_(torch.tensor([2.4, 1.2, 1.8]))
+    daylight, lamps = (bayer.pack(made(model, frame_of("a", light), light), CFA.GRBG) for light in (DAYLIGHT, LAMPS))
+    red, blue = ((daylight[0, k] / daylight[0, 1]).median() / (lamps[0, k] / lamps[0, 1]).median() for k in (0, 3))
+    assert red.item() == pytest.approx(LAMPS[0] / DAYLIGHT[0], rel=0.02)
+    assert blue.item() == pytest.approx(LAMPS[2] / DAYLIGHT[2], rel=0.02)
+    unknown = replace(frame_of("a"), white_balance=(1.0, 1.0, 1.0))
+    assert set(rows_of(model, unknown, 1)) == {"blind"}, "no gains are known"
+
+
+def made(model: Any, pair: Pair, light: tuple[float, float, float]) -> torch.Tensor:
+    """The mosaic of a dim grey picture in the as-shot row of a frame of this light."""
+    with torch.no_grad():
+        mosaic: torch.Tensor = model.make(torch.full((1, 3, 8, 8), 0.5), methods.settings(model, pair)["as-shot"])
+    return mosaic
+
+
 def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
     known_camera: DictionaryISP, frame_of: FrameOf
 ) -> None:
-    rows = rows_of(known_camera, frame_of("lamps", LAMPS))
+    rows = rows_of(known_camera, frame_of("lamps", LAMPS, size=(64, 96)))
     assert rows["blind"] < 32.0
     assert rows["as-shot"] > 75.0 and rows["samples"] > 60.0  # what was given is exact, or 64 readings of 12 bits
     assert rows["oracle"] > rows["blind"] + 20.0  # the light is one of the atoms
@@ -105,9 +126,9 @@ def test_the_speed_counts_every_row_and_every_pixel(
 ) -> None:
     pair = frame_of("wide", size=(256, 768))
     for model, rows, patches, pixels in (
-        (UPI(pair.cfa), 1, 2, PATCH**2),
+        (UPI(pair.cfa), 2, 2, PATCH**2),
         (known_camera, 4, None, PATCH**2),
-        (UPI(pair.cfa), 1, 8, 64 * 96),
+        (UPI(pair.cfa), 2, 8, 64 * 96),
     ):
         frame = pair if pixels == PATCH**2 else frame_of("small", size=(64, 96))
         ticks = iter((10.0, 12.0))

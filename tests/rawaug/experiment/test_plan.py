@@ -118,7 +118,7 @@ def test_a_single_pair_is_trained_on_and_nothing_is_held_out(data: DataConfig) -
     recipe = Recipe(arms=ARMS, data=data)
     plan = plan_of(recipe, pairs=demo_pairs("train", count=1))
     assert len(plan.pairs) == 1 and not plan.validation
-    assert "last weights are kept" in plan.lines(recipe)[1]
+    assert "final weights are kept" in plan.lines(recipe)[1]
 
 
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
@@ -174,7 +174,7 @@ def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
 ) -> None:
     monkeypatch.setattr("rawaug.experiment.rehearsal.READ_SECONDS", 1e6)
     command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test]
-    command += ["--data.pictures", data.pictures, "--dry-run", "--out", str(tmp_path / "runs")]
+    command += ["--data.pictures", str(data.pictures), "--dry-run", "--out", str(tmp_path / "runs")]
     assert main([*command, *ONE_ARM, *BARE]) == 0
     said = capsys.readouterr().out
     assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said

@@ -22,7 +22,7 @@ from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig
 
 FrameOf = Callable[..., Pair]
-TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64)
+TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64, prior_steps=20)
 
 
 class Laboratory:
@@ -36,7 +36,8 @@ class Laboratory:
         self.denoisers: list[Path] = []
         self.stop_after = 10**6
         self.cameras = self.min_side = 0
-        for name in ("open_pairs", "open_pictures", "fit_family", "score_rows", "cycle_psnr", "psnr_d"):
+        stands_in = ("open_pairs", "open_pictures", "fit_family", "score_rows", "balanced_rows", "cycle_psnr", "psnr_d")
+        for name in stands_in:
             monkeypatch.setattr(reconstruction, name, getattr(self, name))
 
     def open_pairs(self, spec: str, split: str) -> list[Pair]:
@@ -67,6 +68,9 @@ class Laboratory:
     def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
         return {"rows": {"blind": value, "as-shot": value + 1}, "mpix_s": 2.0 ** int(pair.name[1:])}
+
+    def balanced_rows(self, fitted: Any, pair: Pair) -> dict[str, float]:
+        return {"blind": 30.0 + int(pair.name[1:])}
 
     def cycle_psnr(self, fitted: Any, pictures: Sequence[torch.Tensor]) -> dict[str, float]:
         return {"cycle": 33.0}
@@ -100,26 +104,28 @@ def test_every_figure_is_the_mean_that_its_name_says(laboratory: Laboratory, tmp
 
 
 def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
-    laboratory: Laboratory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train, scored = laboratory.open_pairs("", ""), list[Pair]()
+    scored: list[Pair] = []
     test = [
         Pair(f"t{k}", torch.zeros(3, 6, 6, dtype=torch.uint8), torch.zeros(1, 6, 6), cfa)
         for k, cfa in enumerate((CFA.RGGB, CFA.BGGR, CFA.GRBG))
     ]
 
-    def score(fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        scored.append(pair)
-        return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0}
+    class Split(Laboratory):
+        def open_pairs(self, spec: str, split: str) -> list[Pair]:
+            return test if spec == "blocks" else super().open_pairs(spec, split)
 
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: test if split == "test" else train)
-    monkeypatch.setattr(reconstruction, "score_rows", score)
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+            scored.append(pair)
+            return {"rows": {"blind": 40.0 + int(pair.name[1:])}, "mpix_s": 1.0}
+
+    laboratory = Split(monkeypatch)
     rows = compare(settings(tmp_path, test="blocks", methods=["dictionary"], seeds=1))
     assert laboratory.folds == [] and laboratory.wholes == [("dictionary", 0)] * 2, "one fit for all test frames"
     assert rows["dictionary"]["frames"] == {"t0": [40.0], "t1": [41.0], "t2": [42.0]}
     assert {pair.cfa for pair in scored} == {CFA.RGGB} and scored[1].raw.shape == (1, 4, 4)
     assert "3 frames of blocks" in capsys.readouterr().out
-    monkeypatch.setattr(reconstruction, "open_pairs", lambda spec, split: train)
     with pytest.raises(ValueError, match="test: f0 is also in data; score on unseen frames"):
         compare(settings(tmp_path, test="known", name="other"))
 
@@ -136,6 +142,31 @@ def test_table_and_file_say_the_same(
     for figure in ("45.50 ± 0.71", "15.50 ± 0.71", "75.50 ± 0.71", "33.00", "40.50 ± 0.71", "one of 8 frames left out"):
         assert figure in said
     assert f"{stored['mosaic_only_psnr']:.2f} dB (ceiling" in said
+
+
+def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Altered(Laboratory):
+        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
+            bright = 0.0 if pair is clean[pair.name] else 7.0
+            return {"rows": {"blind": 40.0 - bright, "as-shot": 50.0 - bright}, "mpix_s": 1.0}
+
+    laboratory = Altered(monkeypatch)
+    laboratory.frames = 3
+    pairs = laboratory.pairs = laboratory.open_pairs("", "")
+    clean = {pair.name: pair for pair in pairs}
+    rows = compare(settings(tmp_path, balanced=True, altered=["overexposed", "retouched"]))
+    bare = ["dictionary", "dictionary, as-shot gains"]
+    assert list(rows) == [*bare, *(f"{row}, {kind}" for kind in ("overexposed", "retouched") for row in bare)]
+    assert rows["dictionary, as-shot gains, overexposed"]["psnr_r"] == [43.0, 43.0]
+    assert rows["dictionary"]["balanced"] == [31.0, 31.0] and "balanced" not in rows["dictionary, retouched"]
+    said = capsys.readouterr().out
+    assert "balanced" in said and "31.00" in said
+    plain = compare(settings(tmp_path, name="plain"))
+    assert list(plain) == bare and "balanced" not in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"altered: \['blurred'\]; choose from overexposed, retouched"):
+        settings(tmp_path, altered=["blurred"])
 
 
 def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_path: Path) -> None:

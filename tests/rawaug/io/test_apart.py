@@ -134,6 +134,6 @@ def test_where_no_helper_can_start_files_are_read_here(tmp_path: Path, monkeypat
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
     monkeypatch.delenv("RAWAUG_READERS", raising=False)
     prepare()
-    with pytest.warns(UserWarning, match="files are read in this process, which a damaged one may end"):
+    with pytest.warns(UserWarning, match="files are read in this process, so a damaged one may crash it"):
         assert apart(os.getpid) == os.getpid()
     assert apart(os.getpid) == os.getpid()  # once is enough

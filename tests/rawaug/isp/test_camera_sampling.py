@@ -8,7 +8,7 @@ import torch
 from rawaug.isp.camera_sampling import PLAUSIBLE_GAINS, CameraSampler
 from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
-from rawaug.isp.light import D65, white_point
+from rawaug.isp.light import D65, LightRange, sample_lights, white_point
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone_curves import STEPS
 from rawaug.isp.universal import of_cameras
@@ -55,6 +55,14 @@ def test_gains_follow_the_light(universal: DictionaryISP) -> None:
     assert torch.corrcoef(torch.stack([red, blue]))[0, 1] < -0.5
 
 
+def test_the_balance_in_a_light_is_that_of_the_matrix_from_xyz(universal: DictionaryISP) -> None:
+    sampler = universal.camera_sampler()
+    assert sampler is not None and isinstance(universal.colour, CameraDictionary)
+    weights, light = universal.colour.known[::100], sample_lights(7, generator())
+    expected = white_balance(universal.colour.xyz_to_camera(weights), torch.from_numpy(light))
+    torch.testing.assert_close(torch.from_numpy(sampler.balance(weights.double().numpy(), light)), expected)
+
+
 def test_independent_gains_are_those_of_other_light(universal: DictionaryISP) -> None:
     """The same cameras as in a consistent draw, and the same spread of gains, in no relation to each other."""
     assert isinstance(universal.colour, CameraDictionary)
@@ -62,7 +70,7 @@ def test_independent_gains_are_those_of_other_light(universal: DictionaryISP) ->
     assert isinstance(camera, CameraDictionary)
 
     def error(consistent: bool) -> torch.Tensor:
-        sampler = CameraSampler(camera, 0, 1, 1, kelvin=(6504.0, 6504.0), lamps=0.0, consistent=consistent)
+        sampler = CameraSampler(camera, 0, 1, 1, LightRange((6504.0, 6504.0), lamps=0.0), consistent=consistent)
         setting = sampler.sample(64, generator())
         balance = white_balance(camera.xyz_to_camera(setting.colour_weights), white_point(D65))
         own = balance / balance.amin(dim=1, keepdim=True)
@@ -93,7 +101,7 @@ def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryIS
     torch.testing.assert_close(back, own, atol=1e-4, rtol=0)
     with pytest.raises(ValueError, match="not listed"):
         of_cameras(universal, "Box Brownie")
-    with pytest.raises(ValueError, match="by name for an ISP of published cameras"):
+    with pytest.raises(ValueError, match="by name needs an ISP of published cameras"):
         of_cameras(DictionaryISP(), "Nikon D750")
 
 

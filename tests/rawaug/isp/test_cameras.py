@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,7 +14,7 @@ def test_white_stays_white_and_the_gains_make_its_raw_grey() -> None:
     cameras = published_cameras().xyz_to_camera
     white = torch.ones(3, dtype=torch.float64)
     torch.testing.assert_close(colour_matrix(cameras) @ white, torch.ones(len(cameras), 3, dtype=torch.float64))
-    light = white_point(tuple(planckian(torch.tensor(3200.0)).tolist()))
+    light = white_point(planckian(np.array(3200.0)))
     balance = white_balance(cameras[:5], light)
     grey = balance * responses(cameras[:5], light)
     torch.testing.assert_close(grey, grey[:, 1:2].expand(5, 3))

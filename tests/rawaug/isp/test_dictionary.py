@@ -6,7 +6,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rawaug.isp.dictionary import ColourDictionary, GainDictionary, convex_weights, perturb, project_to_simplex
+from rawaug.isp.dictionary import (
+    ColourDictionary,
+    GainDictionary,
+    ToneDictionary,
+    convex_weights,
+    perturb,
+    project_to_simplex,
+)
 
 
 def test_colour_atoms_have_rows_of_l1_norm_one() -> None:
@@ -98,3 +105,16 @@ def test_convex_weights_are_uniform_on_the_simplex() -> None:
     # a flat Dirichlet of three has mean 1/3 and variance 1/18
     torch.testing.assert_close(weights.mean(0), torch.full((3,), 1 / 3), atol=0.006, rtol=0)
     torch.testing.assert_close(weights.var(0), torch.full((3,), 1 / 18), atol=0.002, rtol=0)
+
+
+def test_a_mixture_of_curves_has_the_same_bits_in_any_batch_with_and_without_zeros() -> None:
+    tone = ToneDictionary(5)
+    tone.curves.copy_(torch.rand(5, tone.curves.shape[1], generator=torch.Generator().manual_seed(0)))
+    weights = torch.tensor([[0.0, 0.3, 0.0, 0.7, 0.0], [0.1, 0.2, 0.3, 0.15, 0.25], [0.0, 0.0, 0.0, 0.0, 1.0]])
+    mixed = tone.combine(weights)
+    torch.testing.assert_close(mixed, weights @ tone.curves)
+    assert all(torch.equal(tone.combine(row[None])[0], table) for row, table in zip(weights, mixed, strict=True))
+    fitted = weights.clone().requires_grad_()
+    assert torch.equal(tone.combine(fitted), mixed)
+    tone.combine(fitted)[:, 500].sum().backward()
+    torch.testing.assert_close(fitted.grad, tone.curves[:, 500].expand(3, 5))

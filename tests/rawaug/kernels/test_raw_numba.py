@@ -114,11 +114,10 @@ def test_floats_beyond_the_cube_are_held_to_it_and_strides_do_not_matter() -> No
     raw_numba.unprocess(torch.full((1, 3, 4, 4), float("nan")), setting, 1.0)  # must not read outside the table
 
 
-def test_bands_in_pytorch_are_the_picture_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_in_pytorch_are_the_picture_in_one() -> None:
     srgb, setting = pictures(2, 3, 20, 16), camera(2, True, True)
     whole = unprocess(srgb, setting, 1.0)
-    monkeypatch.setattr("rawaug.kernels.raw_torch._BAND", 6 * 16)
-    torch.testing.assert_close(unprocess(srgb, setting, 1.0), whole, atol=1e-6, rtol=0)
+    torch.testing.assert_close(unprocess(srgb, setting, 1.0, band=6 * 16), whole, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (65, 130), (40, 33), (7, 9)])

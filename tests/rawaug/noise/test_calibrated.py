@@ -61,3 +61,17 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
             CalibratedNoise(41.18, signal)
     with pytest.raises(ValueError, match="have no noise"):
         CalibratedNoise(41.18, 0.1, (0.0, 0.0))
+
+
+def test_recipes_name_it_by_the_figure_alone() -> None:
+    bare, full = (
+        noise_model(spec)
+        for spec in (
+            {"pair_psnr": 41.18, "levels": "upi"},
+            {"name": "CalibratedNoise", "settings": {"pair_psnr": 41.18, "levels": "upi"}},
+        )
+    )
+    drawn = [model.sample(3, torch.Generator().manual_seed(0)) for model in (bare, full)]
+    assert isinstance(bare, CalibratedNoise) and torch.equal(drawn[0]["shot_var"], drawn[1]["shot_var"])
+    with pytest.raises(ValueError, match="signl"):
+        noise_model({"pair_psnr": 41.18, "signl": 0.1})

@@ -5,23 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, atoms, descent, fit_isp
+from rawaug.isp.fit import FitConfig, descent, fit_isp
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP
 
-TINY = FitConfig(steps=12, curve_steps=12, pixels=512, batch=128)
-
-
-@pytest.fixture(autouse=True)
-def save_and_report_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(descent, "SAVE_SECONDS", -1.0)
-    monkeypatch.setattr(descent, "REPORT_STEPS", 5)
-    monkeypatch.setattr(atoms, "PRIOR_STEPS", 20)
+TINY = FitConfig(steps=12, curve_steps=12, pixels=512, batch=128, prior_steps=20)
+OFTEN: dict[str, Any] = {"report_steps": 5, "save_seconds": -1.0}
 
 
 def stopped_at(step: int) -> Callable[[torch.Tensor], Callable[[torch.Generator], torch.Tensor]]:
@@ -46,7 +41,7 @@ def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False,
     x = torch.zeros(3)
     loss = stopped_at(stop)(x)
     score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None
-    Descent(path, key, 0, False, report_steps=5).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
+    Descent(path, key, 0, False, **OFTEN).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
     return x
 
 
@@ -98,12 +93,12 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
         return ""
 
     with pytest.raises(KeyboardInterrupt):
-        fit_isp(exact_pairs, TINY, progress=False, state=state, report=report)
+        fit_isp(exact_pairs, TINY, progress=False, state=state, report=report, **OFTEN)
     stopped = state.read_bytes()
-    resumed = fit_isp(exact_pairs, TINY, progress=False, state=state, report=report).state_dict()
+    resumed = fit_isp(exact_pairs, TINY, progress=False, state=state, report=report, **OFTEN).state_dict()
     assert calls == 4  # after 5 and 10 steps, then after 10 and 12
     assert list(tmp_path.iterdir()) == []
-    whole = fit_isp(exact_pairs, TINY, progress=False).state_dict()
+    whole = fit_isp(exact_pairs, TINY, progress=False, **OFTEN).state_dict()
     assert all(torch.equal(resumed[key], whole[key]) for key in whole)
 
     # of other settings, or of frames about which the files say something else, it is not used
@@ -112,7 +107,7 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
         state.write_bytes(stopped)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Descent, "_restore", _refusing(Descent._restore))
-            fit_isp(pairs, config, progress=False, state=state)
+            fit_isp(pairs, config, progress=False, state=state, **OFTEN)
 
 
 def _refusing(restore: Callable[..., int]) -> Callable[..., int]:

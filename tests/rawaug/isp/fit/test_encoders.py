@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, atoms, encoders, fit_isp, pipeline
+from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
+from rawaug.isp.fit.fit_config import EncoderTraining
 from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoders, "STEPS", 40)
-    monkeypatch.setattr(encoders, "FOLDS", 2)
-    monkeypatch.setattr(encoders, "FRAMES_A_STEP", 2)
-    monkeypatch.setattr(encoders, "PIXELS_A_STEP", 64)
-    monkeypatch.setattr(encoders, "LEARNING_RATE", 1.5e-2)
-    for module in (atoms, encoders):  # constants that are a compromise between the two lights, not one of them
-        monkeypatch.setattr(module, "LOG_MSE_EPS", 1e-3)
+QUICK = EncoderTraining(steps=40, frames=2, pixels=64, learning_rate=1.5e-2, folds=2)
 
 
-def config(wanted: str) -> FitConfig:
-    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64}
-    return FitConfig(atoms=2, reach=1.0, **few, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
+def config(wanted: str, quick: EncoderTraining = QUICK) -> FitConfig:
+    """With ``mse_floor`` the constants are a compromise between the two lights, not one of them."""
+    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "prior_steps": 100}
+    settings: dict[str, Any] = {**few, "encoder_training": quick, "encoders": wanted}
+    return FitConfig(atoms=2, reach=1.0, shading="off", isp=SETTINGS, **settings)
 
 
 def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:
@@ -82,8 +78,7 @@ def test_pieces_of_both_thumbnails_show_the_same() -> None:
 def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encoders, "STEPS", 1)
-    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
+    settings = config("auto", replace(QUICK, steps=1, fewest_frames=4))
     fitted: list[set[str]] = []
     judged: list[tuple[set[str], set[str]]] = []
 
@@ -100,7 +95,7 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
 
     monkeypatch.setattr(pipeline, "_Fit", Noted)
     monkeypatch.setattr(encoders, "decibels", decibels)
-    fit_isp(frames(exact_pair, 4, informative=True), config("auto"), progress=False)
+    fit_isp(frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
     for seen, scored in judged:

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from rawaug.data.pair import Pair
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import encoders, joint
+from rawaug.isp.fit import FitConfig, encoders, joint
 from rawaug.isp.fit.losses import apart, cycle_error, mean_square, reading_error
 from rawaug.isp.fit.samples import PixelSamples, Shot, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 PIXELS = torch.arange(64)
+CLEAN, NOISY = FitConfig(), FitConfig(noisy=True)
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +61,13 @@ def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(
     expected = ((srgb - part.cell_srgb) ** 2 * weight).sum()
     for name in ahead:
         expected = expected + 0.1 * ((ahead[name] - back[name]) ** 2 * weight).sum()
-    error = cycle_error(isp, part, isp.choose(part.srgb), back)
+    error = cycle_error(isp, part, isp.choose(part.srgb), back, CLEAN)
     assert error.item() == pytest.approx(expected.item(), rel=1e-5)
     for name in ahead:
         shifted = {**back, name: ahead[name] + 0.5}
         without = {**back, name: ahead[name]}
-        rise = cycle_error(isp, part, isp.choose(part.srgb), shifted) - cycle_error(
-            isp, part, isp.choose(part.srgb), without
+        rise = cycle_error(isp, part, isp.choose(part.srgb), shifted, CLEAN) - cycle_error(
+            isp, part, isp.choose(part.srgb), without, CLEAN
         )
         assert rise.item() == pytest.approx(0.1 * 0.5**2, rel=1e-4), name
 
@@ -78,8 +79,8 @@ def test_from_noisy_readings_the_way_back_starts_where_the_reverse_pass_ended(
     back, _, _ = both_passes(isp, part)
     params = isp.choose(part.srgb)
     other = part._replace(cell_raw=part.cell_raw + 0.3)
-    assert torch.equal(cycle_error(isp, part, params, back, noisy=True), cycle_error(isp, other, params, back, True))
-    assert not torch.equal(cycle_error(isp, part, params, back), cycle_error(isp, other, params, back))
+    assert torch.equal(cycle_error(isp, part, params, back, NOISY), cycle_error(isp, other, params, back, NOISY))
+    assert not torch.equal(cycle_error(isp, part, params, back, CLEAN), cycle_error(isp, other, params, back, CLEAN))
 
 
 def test_weights_apart_add_up_over_both_dictionaries(isp: DictionaryISP) -> None:
@@ -94,7 +95,7 @@ def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
     first, second = ((mean_square(isp, part, params) + 1e-5).log().sum().item() for params in (ours, theirs))
-    loss = encoders._frame_loss(isp, part, shots, 0, PIXELS, torch.Generator().manual_seed(0))
+    loss = encoders._frame_loss(isp, part, shots, 0, PIXELS, FitConfig(), torch.Generator().manual_seed(0))
     assert abs(first - second) > 1e-3
     assert loss.item() == pytest.approx(first + second + 1.0 * APART, rel=1e-5)
 
@@ -106,9 +107,9 @@ def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consi
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
-    cycle = cycle_error(isp, part, theirs, back).item()
-    assert abs(cycle - cycle_error(isp, part, ours, back).item()) > 1e-6
-    loss = joint._frame_loss(isp, part, shots, 0, PIXELS, noisy=False)
+    cycle = cycle_error(isp, part, theirs, back, CLEAN).item()
+    assert abs(cycle - cycle_error(isp, part, ours, back, CLEAN).item()) > 1e-6
+    loss = joint._frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
     expected = mean_square(isp, part, ours)[0].item() + cycle + 0.01 * APART
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     loss.backward()

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from rawaug.data.pair import Pair
-from rawaug.isp.fit import FitConfig, descent, fit_isp
+from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
-TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off")
+TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off", prior_steps=50)
 
 
 def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
@@ -88,17 +88,14 @@ def test_a_seed_gives_one_isp_and_another_seed_another(exact_pairs: list[Pair]) 
     assert not torch.equal(first["colour.matrices"], other["colour.matrices"])
 
 
-def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(
-    exact_pairs: list[Pair], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(descent, "REPORT_STEPS", 2)
+def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(exact_pairs: list[Pair]) -> None:
     scores = []
 
     def report(isp: DictionaryISP) -> str:
         scores.append(error_db(isp, exact_pairs[0], exact_pairs[0].white_balance))
         return f"{scores[-1]:.1f} dB"
 
-    last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report)
+    last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report, report_steps=2)
     assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=1e-3)
     seen = last.state_dict()
     unseen = fit_isp(exact_pairs[:1], TINY, progress=False).state_dict()

@@ -1,0 +1,47 @@
+"""``rawaug explore``: a page on your own machine that shows what pictures become as RAW of a camera."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from rawaug.data.demo.demo_pairs import demo_files
+from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.explore.gradio_page import address, build, listening, server_of
+from rawaug.registry import COMMANDS
+
+
+@COMMANDS.register("explore")
+def run(pictures: str | None = None, *, host: str = "127.0.0.1", port: int = 7860) -> None:
+    """Show in a browser what pictures become as RAW: stages, noise, draws; needs rawaug[explore].
+
+    Args:
+        pictures: a picture, or a folder of them; built-in ones by default.
+        host: address to listen on; by default this machine alone can open the page.
+        port: of the page.
+    """
+    page = build(*choices(pictures))
+    with listening(host, port) as open_, suppress(KeyboardInterrupt):
+        print(f"{address(open_)} (Ctrl-C stops it)", flush=True)
+        server_of(page).run(sockets=[open_])
+
+
+def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
+    """The files that can be chosen, and their names on the page.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        ValueError: if the folder contains no picture.
+    """
+    if pictures is None:
+        files = demo_files()
+        return files, [f"{file.stem} (built in)" for file in files]
+    source = Path(pictures)
+    if source.is_file():
+        return [source], [source.name]
+    if not source.is_dir():
+        raise FileNotFoundError(f"{source}: no such picture, and no such folder of pictures")
+    files = sorted(file for file in source.rglob("*") if file.suffix.lower() in EXTENSIONS)
+    if not files:
+        raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
+    return files, [file.relative_to(source).as_posix() for file in files]

@@ -1,0 +1,115 @@
+"""``rawaug submit``: the noisy blocks of a benchmark whose clean ones are kept, denoised and written as it takes them.
+
+Noise levels are those that the dataset publishes for a frame, else estimated from all of its noisy blocks together.
+Results are cut to [0, 1], and the written file is read back and checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
+from rawaug.data import (
+    Dnd,
+    SiddBenchmark,
+    check_dnd_submission,
+    check_submission,
+    write_dnd_submission,
+    write_submission,
+)
+from rawaug.data.sidd.blocks import BLOCKS, NoisyBlock
+from rawaug.files import require_writable
+from rawaug.noise import estimate_noise
+from rawaug.progress import progress
+from rawaug.registry import COMMANDS
+
+_UNUSED = (0.0, 0.0)
+
+
+class Block(NamedTuple):
+    """The mosaic ``(1, H, W)`` of a block, with its pattern."""
+
+    mosaic: Tensor
+    cfa: CFA
+
+
+@COMMANDS.register("submit")
+def run(
+    benchmark: str,
+    out: str,
+    *,
+    denoiser: str | None = None,
+    classical: str | dict[str, Any] | None = None,
+    self_ensemble: bool = False,
+    device: str = "auto",
+) -> None:
+    """Denoise the benchmark blocks of SIDD or DND and write the file to submit.
+
+    Args:
+        benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat, or dnd:PATH with info.mat.
+        out: SubmitRaw.csv or .mat for SIDD, a folder for DND.
+        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
+        classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
+        self_ensemble: average eight views of a network, at eight times the cost.
+        device: where a network runs: auto, cpu, cuda, cuda:1, mps.
+
+    Raises:
+        ValueError: if there is no such benchmark, or the noise of a frame is neither published nor can be estimated.
+    """
+    kind, _, path = benchmark.partition(":")
+    if kind not in SUBMISSIONS or not path:
+        raise ValueError(f"{benchmark}: no benchmark; use sidd:PATH or dnd:PATH")
+    require_writable(Path(out), folder=kind == "dnd")
+    count = SUBMISSIONS[kind](path, out, frame_denoiser(denoiser, classical, self_ensemble, device))
+    print(f"{count} blocks, checked: {out}")
+
+
+def submit_sidd(path: str, out: str, method: FrameDenoiser) -> int:
+    """Write and check SIDD's submission; the number of blocks."""
+    blocks = SiddBenchmark(path)
+    side = blocks[0].noisy.shape[-1]
+    write_submission(out, _sidd_denoised(blocks, method), side)
+    return len(check_submission(out, side))
+
+
+def _sidd_denoised(benchmark: SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
+    for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
+        blocks = [benchmark[k] for k in range(first, first + BLOCKS)]
+        levels = _sidd_levels(benchmark, blocks) if method.reads_levels else _UNUSED
+        for block in blocks:
+            yield method(Block(block.noisy, block.cfa), levels).clamp(0.0, 1.0)
+
+
+def _sidd_levels(benchmark: SiddBenchmark, blocks: list[NoisyBlock]) -> tuple[float, float]:
+    """The frame's noise levels: published, else estimated from its noisy blocks."""
+    scene = blocks[0].name.rpartition("_")[0]
+    if scene in benchmark.levels:
+        return benchmark.levels[scene]
+    try:
+        estimate = estimate_noise(torch.cat([block.noisy for block in blocks], dim=-1), blocks[0].cfa)
+    except ValueError as error:
+        raise ValueError(
+            f"{scene}: its noise cannot be estimated ({error}); put noise_level_functions.csv beside the blocks"
+        ) from error
+    return estimate.shot_var, estimate.read_var
+
+
+def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
+    """Write and check DND's submission; the number of boxes."""
+    boxes = Dnd(path)
+    denoised = (
+        method(Block(box.noisy, box.cfa), (box.shot_var, box.read_var)).clamp(0.0, 1.0)
+        for box in progress(boxes, label="benchmark", unit="box")
+    )
+    write_dnd_submission(out, denoised)
+    check_dnd_submission(out, boxes)
+    return len(boxes)
+
+
+SUBMISSIONS: dict[str, Callable[[str, str, FrameDenoiser], int]] = {"sidd": submit_sidd, "dnd": submit_dnd}

@@ -1,0 +1,152 @@
+"""Figures of one pair: histograms of RAW, the drawn tone curve and matrix over the ISP's atoms, noise and its law."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.explore.look import Drawn
+from rawaug.explore.quick_development import grey_curve
+from rawaug.extras import extra
+from rawaug.io import encode_srgb
+from rawaug.isp.tone_curves import STEPS
+from rawaug.patterns import pattern
+
+COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
+_ATOMS = 60
+"""As many colour atoms are drawn, at most."""
+_BINS = 24
+_FEWEST = 50
+"""Values in a bin of the signal, for its variance to mean something."""
+
+
+def histograms(drawn: Drawn) -> np.ndarray:
+    """How often RAW has each value, by colour: clean as a line, noisy as an area."""
+    figure, (axis,) = _figure(1)
+    clean, noisy = (_by_colour(drawn, raw) for raw in (drawn.pair.clean, drawn.pair.noisy))
+    edges = torch.linspace(-0.05, 1.0, 106)
+    for (name, colour), a, b in zip(COLOURS.items(), clean, noisy, strict=True):
+        for values, style in ((b, {"fill": True, "alpha": 0.25, "linewidth": 0}), (a, {"linewidth": 1.2})):
+            share = torch.histc(values, len(edges) - 1, -0.05, 1.0) / values.numel()
+            axis.stairs(share.numpy(), edges.numpy(), color=colour, **style)
+        axis.plot([], [], color=colour, label=name)
+    axis.set(
+        yscale="log", ylim=(1e-6, 1), xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0)
+    )
+    axis.minorticks_off()
+    axis.legend(title="line: clean, area: noisy", fontsize=8, title_fontsize=8, ncols=3)
+    return _pixels(figure)
+
+
+def camera(drawn: Drawn) -> np.ndarray:
+    """The drawn tone curve over the tone atoms, and what the drawn matrix makes of colours over the colour atoms."""
+    figure, (tone, colour) = _figure(2)
+    isp, setting = drawn.augment.isp, drawn.pair.params.isp
+    code = np.arange(256)
+    if isp.tone is not None:
+        tone.plot(code, isp.tone.curves[:, ::STEPS].T.numpy(), color="0.8", linewidth=0.8)
+    tone.plot(code, grey_curve(isp, setting).numpy(), color="tab:blue", linewidth=2)
+    title = "learned tone curve" if isp.tone is None else f"tone curve over {len(isp.tone.curves)} atoms"
+    tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
+    atoms = isp.colour.atoms()
+    patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
+    for matrix, size, alpha in [(matrix, 12, 0.35) for matrix in atoms[:_ATOMS]] + [(setting.matrix, 110, 1.0)]:
+        seen = patches @ matrix.T
+        share = seen / seen.sum(dim=1, keepdim=True)
+        edge = "black" if alpha == 1.0 else "none"
+        colour.scatter(share[:, 0], share[:, 1], s=size, c=_shown(patches), alpha=alpha, edgecolors=edge)
+    colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
+    count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
+    colour.set(title=f"colours by the matrix over {count} atoms")
+    return _pixels(figure)
+
+
+def noise(drawn: Drawn) -> np.ndarray:
+    """Variance of noisy minus clean against the clean signal, by colour, and the law that was drawn."""
+    figure, axes = _figure(2)
+    pair = drawn.pair
+    ramp = torch.logspace(-4, 0, 100)
+    params = {name: value[None] for name, value in pair.params.noise.items()}
+    law = drawn.augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
+    expected = _from_planes(drawn, drawn.augment.noise.variance(_as_planes(drawn, pair.clean), params))
+    sites = (_by_colour(drawn, raw) for raw in (pair.clean, pair.noisy, expected))
+    measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
+    highest = max([float(variance.max()) for _, variance in measured if len(variance)], default=float(law[-1]))
+    lowest = float(law[0])
+    for axis, scale in zip(axes, ("linear", "log"), strict=True):
+        for (name, colour), (signal, variance) in zip(COLOURS.items(), measured, strict=True):
+            axis.scatter(signal, variance, s=14, color=colour, label=f"{name}, measured")
+        axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
+        axis.set(xscale=scale, yscale=scale, xlabel="clean signal", ylabel="variance of the noise")
+        if scale == "linear":
+            axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
+            axis.legend(fontsize=8)
+        else:
+            axis.minorticks_off()
+            axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
+    return _pixels(figure)
+
+
+def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of the signal in logarithmic bins, and the mean squares of the noise there.
+
+    Args:
+        clean, noisy: values ``(N,)`` of the same sites.
+        expected: variance of the noise there, ``(N,)``: sites that it may clip, within three deviations, are left out.
+    """
+    seen = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
+    signal, square = clean[seen], (noisy[seen] - clean[seen]).square()
+    where = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)
+    count = torch.bincount(where, minlength=_BINS)
+    sums = [torch.bincount(where, values.double(), minlength=_BINS) for values in (signal, square)]
+    enough = count >= _FEWEST
+    mean, variance = (total[enough] / count[enough] for total in sums)
+    return mean, variance
+
+
+def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
+    """Values of red, green and blue sites, each ``(N,)``."""
+    mosaic = drawn.augment.mosaic(raw)[0]
+    channels = pattern(drawn.augment.cfa).channels(*mosaic.shape)
+    return [mosaic[channels == index] for index in range(3)]
+
+
+def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
+    """RAW as noise models take it, four planes ``(1, 4, h, w)``."""
+    return raw[None] if drawn.augment.pattern is None else bayer.pack(raw[None], CFA.RGGB)
+
+
+def _from_planes(drawn: Drawn, planes: Tensor) -> Tensor:
+    return planes[0] if drawn.augment.pattern is None else bayer.unpack(planes[0], CFA.RGGB)
+
+
+def _shown(linear: Tensor) -> np.ndarray:
+    shown: np.ndarray = encode_srgb(linear.clamp(0, 1)).numpy()
+    return shown
+
+
+def _figure(columns: int) -> tuple[Any, Any]:
+    with extra("train"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.8 * columns, 3.4), dpi=100)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    figure.subplots_adjust(left=0.14 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
+    for axis in axes:
+        axis.grid(color="0.92")
+        axis.set_axisbelow(True)
+        axis.title.set_fontsize(10)
+    return figure, axes
+
+
+def _pixels(figure: Any) -> np.ndarray:
+    """The drawn figure, uint8 ``(H, W, 3)``."""
+    figure.canvas.draw()
+    return np.array(figure.canvas.buffer_rgba())[..., :3]

@@ -1,0 +1,229 @@
+"""What the page shows: pure functions from a :class:`Look` to titled pictures, in :data:`VIEWS` by the tab's name.
+
+Noisy and clean are shown pixel by pixel, of large pictures the central part. The eight draws are developed alike, by
+the setting of the first, so that cameras, lights and exposures can be seen to differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from denoisers.network import Denoiser
+from denoisers.pretrained import DEFAULT, find
+from denoisers.weight_files import load
+from rawaug.bayer import CFA
+from rawaug.data.sample import Sample
+from rawaug.evaluation.scores import denoise
+from rawaug.explore import figures
+from rawaug.explore.look import Drawn, Look, drawn
+from rawaug.explore.quick_development import Development
+from rawaug.io import encode_srgb
+from rawaug.isp.setting import ISPParams
+from rawaug.metrics import psnr
+from rawaug.patterns import pattern
+from rawaug.plugin.drawing import draw_key
+from rawaug.plugin.pictures import even_sided
+
+DRAWS = 8
+HEIGHT, WIDTH = 512, 768
+"""Of the largest part of a picture that is shown pixel by pixel."""
+_WHOLE_CELLS = 12
+"""Parts begin at multiples of it, where the cells of all patterns do."""
+_THUMBNAIL = 384
+_ZOOM = (24, 36)
+_SCALE = 8
+
+
+class Panel(NamedTuple):
+    """A picture, uint8 ``(H, W, 3)``, and its title."""
+
+    title: str
+    image: np.ndarray
+
+
+def pair(look: Look) -> list[Panel]:
+    """Noisy and clean RAW, developed."""
+    made = drawn(look)
+    noisy, clean = _developed(made, made.pair.noisy, made.pair.clean)
+    quality = psnr(made.pair.noisy[None], made.pair.clean[None]).item()
+    return [Panel(f"noisy: {_levels(made)}, {quality:.1f} dB", noisy), Panel(f"clean: {_setting(made)}", clean)]
+
+
+@torch.no_grad()
+def stages(look: Look) -> list[Panel]:
+    """The picture between the stages of the ISP, small; linear images through the sRGB curve."""
+    made = drawn(look)
+    isp, small = made.augment.isp, even_sided(_thumbnail(made.srgb))
+    setting = ISPParams(*(value[None] for value in made.pair.params.isp))
+    result = isp.reverse(small[None], setting, intermediates=True)
+    names = {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
+    panels = [Panel("sRGB x", _to_uint8(small / 255.0))]
+    image = small[None]
+    for name, image in result.intermediates.items():
+        shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
+        panels.append(Panel(f"{name}: {names[name]}", _to_uint8(shown)))
+    sensor = pattern(made.augment.cfa)
+    raw = sensor.demosaic(sensor.mosaic(image))[0]
+    return [*panels, Panel(f"RAW y: {sensor.name}, demosaiced", _to_uint8(encode_srgb(raw.clamp(0, 1))))]
+
+
+def raw(look: Look) -> list[Panel]:
+    """The mosaic from nearby, its planes, and histograms."""
+    made = drawn(look)
+    mosaic = made.augment.mosaic(made.pair.noisy)
+    sensor = pattern(made.augment.cfa)
+    top, left, *_ = _centre(mosaic, *_ZOOM)
+    near = mosaic[..., top : top + _ZOOM[0], left : left + _ZOOM[1]]
+    values = made.pair.clean.flatten()
+    gains = 1.0 / values[:: max(1, len(values) // 2**14)].quantile(0.99).clamp_min(1e-3)
+    coloured = sensor.planes(*near.shape[-2:]) * encode_srgb((near * gains).clamp(0, 1))
+    panels = [
+        Panel(f"{sensor.name}: {near.shape[-2]} x {near.shape[-1]} sites, each in its colour", _enlarged(coloured)),
+        Panel("histograms", figures.histograms(made)),
+    ]
+    if made.augment.pattern is None:
+        for name, plane in zip(("R", "Gr", "Gb", "B"), _cropped(made.pair.noisy, 2), strict=True):
+            panels.append(
+                Panel(f"packed {name}", _to_uint8(encode_srgb((plane * gains).clamp(0, 1)).expand(3, -1, -1)))
+            )
+    return panels
+
+
+def camera(look: Look) -> list[Panel]:
+    """Tone curve and colour matrix of the draw over those of the ISP."""
+    made = drawn(look)
+    return [Panel(f"{_setting(made)}; large: red, green, blue, skin and sky by the drawn matrix", figures.camera(made))]
+
+
+def noise(look: Look) -> list[Panel]:
+    """The noise of the pair against the law that it was drawn from."""
+    made = drawn(look)
+    return [Panel(f"noise of the pair and its law: {_levels(made)}", figures.noise(made))]
+
+
+@torch.no_grad()
+def draws(look: Look) -> list[Panel]:
+    """Eight noisy draws of the picture's central part, at half size."""
+    first = drawn(look)
+    develop = Development(first.augment.isp, first.pair.params.isp)
+    sensor, part = pattern(first.augment.cfa), _crop(first.srgb, HEIGHT, WIDTH)
+    top, left, *_ = _centre(first.srgb, HEIGHT, WIDTH)
+    place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
+    frame = (top // 2, left // 2, first.srgb.shape[-2] // 2, first.srgb.shape[-1] // 2)
+    augment, panels = first.augment, []
+    for number in range(DRAWS):
+        params = augment.sample(part[None], draw_key(look.seed, Path(look.picture).name, number), place)
+        made = augment.apply(part[None], params).map(lambda tensor: tensor[0])
+        half = F.avg_pool2d(sensor.demosaic(augment.mosaic(made.noisy)[None]), 2)[0]
+        one = Drawn(part, augment, made)
+        panels.append(Panel(f"draw {number}: {_setting(one)}; {_levels(one)}", develop(half, frame)))
+    return panels
+
+
+def denoised(look: Look) -> list[Panel]:
+    """Noisy, and denoised by the shipped network, developed.
+
+    Raises:
+        ValueError: if the pattern is not Bayer's.
+    """
+    made = drawn(look)
+    if made.augment.pattern is not None:
+        raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
+    cfa = CFA(made.augment.cfa)
+    noisy, clean, variance = (_cropped(x, 2)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
+    model, own = _network()
+    result = denoise(model, Sample(noisy, clean, variance), cfa, own=own).clamp(max=1.0)
+    before, after = (psnr(x, clean).item() for x in (noisy, result))
+    shown = [_developed_part(made, x[0]) for x in (noisy, result)]
+    return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
+
+
+VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
+    "Pair": pair,
+    "Stages": stages,
+    "RAW": raw,
+    "Camera": camera,
+    "Noise": noise,
+    "Eight draws": draws,
+}
+"""The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
+
+
+@lru_cache(maxsize=1)
+def _network() -> tuple[Denoiser, CFA]:
+    model, info = load(find(DEFAULT))
+    return model, CFA(info.get("cfa", "RGGB"))
+
+
+def _setting(made: Drawn) -> str:
+    """Gains of the draw: white balance and exposure."""
+    red, green, blue = (made.pair.params.isp.gains / made.pair.params.isp.gains[1]).tolist()
+    return f"white balance {red:.2f} {green:.0f} {blue:.2f}, mean {made.pair.clean.mean().item():.3f}"
+
+
+def _levels(made: Drawn) -> str:
+    levels = made.pair.params.noise
+    if not {"shot_var", "read_var"} <= levels.keys():
+        return "noise without levels"
+    return f"shot_var {levels['shot_var'].item():.2e}, read_var {levels['read_var'].item():.2e}"
+
+
+def _developed(made: Drawn, *packed: Tensor) -> list[np.ndarray]:
+    """The central part of RAW ``(4, h, w)``, or of mosaics, developed by its own setting."""
+    factor = 2 if made.augment.pattern is None else 1
+    return [_developed_part(made, _cropped(part, factor)) for part in packed]
+
+
+def _developed_part(made: Drawn, part: Tensor) -> np.ndarray:
+    rgb = pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
+    top, left, *_ = _centre(made.srgb, HEIGHT, WIDTH)
+    place = (top, left, made.srgb.shape[-2], made.srgb.shape[-1])
+    return Development(made.augment.isp, made.pair.params.isp)(rgb, place)
+
+
+def _centre(image: Tensor, height: int, width: int) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the central part of at most this size."""
+    sides = tuple(image.shape[-2:])
+    size = [min(side, most) for side, most in zip(sides, (height, width), strict=True)]
+    step = 2 * _WHOLE_CELLS
+    top, left = ((side - part) // step * _WHOLE_CELLS for side, part in zip(sides, size, strict=True))
+    return top, left, size[0], size[1]
+
+
+def _crop(image: Tensor, height: int, width: int) -> Tensor:
+    top, left, height, width = _centre(image, height, width)
+    return image[..., top : top + height, left : left + width]
+
+
+def _cropped(raw: Tensor, factor: int) -> Tensor:
+    """The central part of RAW whose sites are ``factor`` pixels apart in a plane."""
+    height, width = (factor * side for side in raw.shape[-2:])
+    top, left, height, width = _centre(torch.empty(height, width, device="meta"), HEIGHT, WIDTH)
+    rows, columns = slice(top // factor, (top + height) // factor), slice(left // factor, (left + width) // factor)
+    return raw[..., rows, columns]
+
+
+def _thumbnail(srgb: Tensor) -> Tensor:
+    """uint8 ``(3, H, W)``, reduced by a whole factor to about :data:`_THUMBNAIL`."""
+    factor = max(1, max(srgb.shape[-2:]) // _THUMBNAIL)
+    if factor == 1:
+        return srgb
+    return F.avg_pool2d(srgb[None].float(), factor)[0].round().to(torch.uint8)
+
+
+def _to_uint8(image: Tensor) -> np.ndarray:
+    """Floats ``(3, H, W)`` in [0, 1] to uint8 ``(H, W, 3)``."""
+    shown: np.ndarray = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    return np.ascontiguousarray(shown)
+
+
+def _enlarged(image: Tensor) -> np.ndarray:
+    return _to_uint8(image).repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)

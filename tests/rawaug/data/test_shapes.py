@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from rawaug.data import Shapes, open_pictures
+from rawaug.data.picture_folder import reports
+from rawaug.data.remembered import Remembered
+from rawaug.data.shapes import KINDS
+
+
+def test_a_picture_depends_on_seed_and_index_alone() -> None:
+    first, again = Shapes(3, side=48), Shapes(2, side=48)
+    assert first[1].shape == (3, 48, 48) and first[1].dtype == torch.uint8
+    assert torch.equal(first[1], again[1])
+    assert not torch.equal(first[1], first[0])
+    assert not torch.equal(first[1], Shapes(3, side=48, seed=1)[1])
+    assert torch.equal(first[-1], first[2])
+    with pytest.raises(IndexError):
+        first[3]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_shape_lies_around_its_centre_in_few_colours(kind: str) -> None:
+    canvas = Image.new("RGB", (400, 400), (7, 7, 7))
+    KINDS[kind](canvas, np.array([200.0, 180.0]), 40.0, np.random.default_rng(5))
+    changed = (np.asarray(canvas) != 7).any(-1)
+    rows, columns = np.nonzero(changed)
+    assert abs((rows.min() + rows.max()) / 2 - 180) < 30 and abs((columns.min() + columns.max()) / 2 - 200) < 30
+    colours = np.unique(np.asarray(canvas)[changed], axis=0)
+    assert len(colours) <= {"stripes": 2, "lettering": 256}.get(kind, 1)
+
+
+def test_upright_boxes_have_edges_along_the_axes() -> None:
+    canvas = Image.new("L", (400, 400), 0).convert("RGB")
+    KINDS["upright box"](canvas, np.array([200.0, 200.0]), 60.0, np.random.default_rng(0))
+    grey = np.asarray(canvas, np.float32).sum(-1)
+    down, across = np.abs(np.diff(grey, axis=0)).sum(1), np.abs(np.diff(grey, axis=1)).sum(0)
+    for edges in (down, across):  # two lines hold nearly all of the change
+        assert np.sort(edges)[-12:].sum() > 0.95 * edges.sum()
+
+
+def test_the_power_spectrum_falls_as_that_of_photographs() -> None:
+    pictures = torch.stack([Shapes(4, side=128)[k].float().mean(0) for k in range(4)])
+    window = torch.hann_window(128)
+    tiles = (pictures - pictures.mean((1, 2), keepdim=True)) * window[:, None] * window
+    power = torch.fft.fft2(tiles).abs().square().mean(0)
+    place = torch.fft.fftfreq(128)
+    radius = (place[:, None] ** 2 + place**2).sqrt()
+    low, high = (power[(radius >= a) & (radius < 2 * a)].mean().log2() for a in (0.03, 0.24))
+    assert -3.2 < (high - low).item() / 3 < -1.4  # octaves
+
+
+def test_sources_come_one_after_the_other(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        Image.new("RGB", (40, 30), (9, 9, 9)).save(tmp_path / name)
+    pictures = open_pictures([str(tmp_path), "shapes:3"], min_side=8)
+    assert len(pictures) == 5
+    assert pictures[1].shape == (3, 30, 40)
+    assert torch.equal(pictures[3], Shapes(2)[1])
+    assert open_pictures("shapes:1", min_side=700).side == 700
+
+
+def test_a_damaged_file_is_reported_behind_a_cache_and_among_others(tmp_path: Path) -> None:
+    for k in range(30):
+        Image.new("RGB", (40, 30), (9, 9, 9)).save(tmp_path / f"{k:02}.png")
+    (tmp_path / "07.png").write_bytes(b"no picture")
+    pictures = Remembered(open_pictures(["shapes:1", str(tmp_path)]), megabytes=1)
+    assert reports(pictures) == []
+    assert pictures[8].shape == (3, 30, 40)
+    (report,) = reports(pictures)
+    assert "1 of 30 pictures skipped" in report and "07.png" in report
+
+
+@pytest.mark.parametrize("spec", ["shapes:", "shapes:many", "shapes:0", "shapes:-1"])
+def test_a_number_of_pictures_is_required(spec: str) -> None:
+    with pytest.raises(ValueError, match=r"shapes:"):
+        open_pictures(spec)

@@ -1,0 +1,92 @@
+"""``--dry-run`` of comparisons, ablations and sweeps: what it says, what it finds, and that it writes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rawaug.cli import main
+from rawaug.data.pair import Pair
+from rawaug.experiment import ablation, reconstruction, tables_rehearsed
+from rawaug.experiment.ablation import Ablation
+from rawaug.experiment.denoiser_sweep import DenoiserSweep
+from rawaug.experiment.downstream import DownstreamConfig
+from rawaug.experiment.reconstruction import Comparison
+from rawaug.experiment.tables_rehearsed import rehearse_ablation, rehearse_comparison, rehearse_sweep
+
+FrameOf = Callable[..., Pair]
+
+
+@pytest.fixture
+def frames(frame_of: FrameOf, monkeypatch: pytest.MonkeyPatch) -> list[Pair]:
+    """Three frames, which every dataset consists of but the demo's."""
+    made = [frame_of(name) for name in "abc"]
+    for module in (reconstruction, ablation, tables_rehearsed):
+        monkeypatch.setattr(module, "open_pairs", lambda spec, split: made)
+    return made
+
+
+def test_a_comparison_tries_every_method_and_writes_nothing(
+    frames: list[Pair], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    downstream = DownstreamConfig(methods=["upi"]).smoke()
+    comparison = Comparison(
+        data="mine", methods=["dictionary", "upi", "unet"], downstream=downstream, out=str(tmp_path)
+    )
+    rehearse_comparison(comparison)
+    said = capsys.readouterr().out
+    assert "data      3 of 3 of mine: a, b, c" in said and "methods   dictionary, upi, unet" in said
+    assert "frames read: 3 of 3" in said and "nothing wrong found" in said and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="b has a different CFA"):
+        frames[1] = frames[1].in_pattern("RGGB")
+        rehearse_comparison(comparison)
+
+
+def test_a_comparison_reads_only_what_time_allows(frames: list[Pair], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(reconstruction.PreparedComparison(Comparison(data="mine"), seconds=0.0).pairs) == 2
+    with pytest.raises(ValueError, match="test: a is also in data"):
+        rehearse_comparison(Comparison(data="mine", test="theirs"))
+
+
+def test_an_ablation_leaves_a_frame_and_every_stage_out(
+    frames: list[Pair], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = Ablation(data="mine", out=str(tmp_path))
+    rehearse_ablation(settings)
+    assert "every stage left out once; frames read: 3 of 3" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    del frames[1:]
+    with pytest.raises(ValueError, match="mine has 1 frame; leave-one-out needs two or more"):
+        rehearse_ablation(settings)
+
+
+def test_a_sweep_tries_every_denoiser(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = DenoiserSweep(data=["demo:test"], count=2, crop=32, denoisers=[], isos=[100, 800], out=str(tmp_path))
+    rehearse_sweep(settings)
+    said = capsys.readouterr().out
+    assert "2 of 2 of demo:test" in said and "noise     Sony ILCE-7M3 at ISO 100, 800" in said
+    assert "noisy input, NonLocalMeans" in said and not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="ISO 1 "):
+        rehearse_sweep(replace(settings, isos=[1]))
+
+
+def test_the_command_line_asks_for_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [
+        "run",
+        "denoisers",
+        "--dry-run",
+        "--out",
+        str(tmp_path),
+        "--isos",
+        "[100]",
+        "--crop",
+        "32",
+        "--count",
+        "1",
+    ]
+    assert main([*command, "--denoisers", "[]"]) == 0
+    assert "nothing wrong found" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    assert main([*command, "--denoisers", "[gone]"]) == 2
+    assert "gone" in capsys.readouterr().err

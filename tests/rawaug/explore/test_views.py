@@ -1,0 +1,143 @@
+"""The views of the page without a page: pictures of settings, and code that makes the same pair."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rawaug.cli import main
+from rawaug.data import demo_pictures
+from rawaug.explore import views
+from rawaug.explore.figures import variance_by_signal
+from rawaug.explore.look import Look, command, drawn, iso_range, noises_of, possible, python
+from rawaug.explore.markup import as_html, data_url, message
+from rawaug.io import read_picture, write_picture
+from rawaug.plugin.drawing import Drawing
+
+LEVELS = (1e-4, 1e-6)
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A photograph of 97 x 145, in a folder whose name needs quoting."""
+    file = tmp_path_factory.mktemp("my pictures") / "cat's.png"
+    write_picture(file, demo_pictures(1)[0][:, 100:197, 120:265])
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    "drawing",
+    [
+        Drawing(),
+        Drawing("universal", "Nikon D750", 4000.0, "Nikon D750", -0.5, "Nikon D750", 1600.0, cfa="GRBG"),
+        Drawing(light="LED-B3", noise=LEVELS, cfa="XTRANS"),
+        Drawing("canon-powershot", exposure=0.25, noise="any camera"),
+    ],
+)
+def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: Drawing, tmp_path: Path) -> None:
+    look = Look(picture, drawing, seed=5)
+    pair = drawn(look).pair
+    words = shlex.split(command(look, str(tmp_path)))
+    assert words[0] == "rawaug" and main([*words[1:], "--workers", "0"]) == 0
+    with np.load(tmp_path / "cat's_0.npz") as file:
+        assert np.array_equal(file["noisy"], pair.noisy.numpy()) and np.array_equal(file["clean"], pair.clean.numpy())
+    made: dict[str, Any] = {}
+    exec(python(look), made)
+    assert torch.equal(made["pair"].noisy, pair.noisy) and torch.equal(made["pair"].clean, pair.clean)
+
+
+def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
+    for isp, most in (("universal", 2), ("gopro-hero", 6)):  # of a learned tone network the curve of greys alone
+        look = Look(picture, Drawing(isp, exposure=0.0, noise=(1e-12, 1e-12)))
+        noisy, clean = views.pair(look)
+        truth = read_picture(picture)[:, :96, :144].permute(1, 2, 0).numpy().astype(float)
+        for panel in (noisy, clean):
+            assert panel.image.shape == truth.shape
+            error = np.abs(panel.image.astype(float) - truth)
+            assert np.median(error) <= most, f"{isp}: {panel.title}"  # edges are those of bilinear demosaicing
+
+
+def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> None:
+    look = Look(picture, Drawing(noise=LEVELS))
+    panels = {name: view(look) for name, view in views.VIEWS.items()}
+    assert {name: len(found) for name, found in panels.items()} == {
+        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 1, "Noise": 1, "Eight draws": 8
+    }  # fmt: skip
+    for panel in (panel for found in panels.values() for panel in found):
+        assert panel.title and panel.image.dtype == np.uint8 and panel.image.shape[2] == 3 and panel.image.std() > 3
+    means = {tuple(panel.image.mean(axis=(0, 1)).round(1)) for panel in panels["Eight draws"]}
+    assert len(means) == 8, "eight cameras in eight lights"
+    fixed = replace(look.drawing, camera="Nikon D750", light=5500.0, tone="linear", exposure=0.0)
+    same = np.stack([panel.image.mean(axis=(0, 1)) for panel in views.draws(replace(look, drawing=fixed))])
+    assert same.std(axis=0).max() < 5, "what is fixed does not vary"
+
+
+@pytest.mark.parametrize("cfa", ["XTRANS", "QUAD-BGGR"])
+def test_other_patterns_have_no_packed_planes_and_no_network(picture: str, cfa: str) -> None:
+    look = Look(picture, Drawing(cfa=cfa))
+    assert [panel.title.partition(":")[0] for panel in views.raw(look)] == [cfa, "histograms"]
+    assert views.pair(look)[0].image.shape == (96, 144, 3)
+    with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
+        views.denoised(look)
+
+
+def test_the_shipped_network_removes_noise(picture: str) -> None:
+    look = Look(picture, Drawing(noise=(5e-3, 1e-4), exposure=0.0, light=5500.0, cfa="BGGR"))
+    noisy, denoised = views.denoised(look)
+    before, after = (float(panel.title.split()[-2]) for panel in (noisy, denoised))
+    assert after > before + 3
+    clean = views.pair(look)[1].image.astype(float)
+    assert np.square(denoised.image - clean).mean() < np.square(noisy.image - clean).mean() / 2
+
+
+def test_large_pictures_are_shown_in_part(tmp_path: Path) -> None:
+    write_picture(tmp_path / "large.png", demo_pictures(1)[0].repeat(1, 2, 2))
+    look = Look(str(tmp_path / "large.png"), Drawing())
+    assert drawn(look).srgb.shape == (3, 1024, 1024)
+    assert [panel.image.shape for panel in views.pair(look)] == [(512, 768, 3)] * 2
+    assert {max(panel.image.shape) for panel in views.stages(look)} == {512}
+    whole, part = drawn(look).pair.clean, views._cropped(drawn(look).pair.clean, 2)
+    assert part.shape == (4, 256, 384) and torch.equal(part, whole[:, 126:382, 60:444])
+
+
+def test_measured_variance_follows_the_law() -> None:
+    generator = torch.Generator().manual_seed(0)
+    clean = torch.rand(400_000, generator=generator)
+    law = 1e-3 * clean + 1e-5
+    noisy = (clean + torch.randn(clean.shape, generator=generator) * law.sqrt()).clamp(max=1.0)
+    signal, variance = variance_by_signal(clean, noisy, law)
+    assert len(signal) > 8
+    torch.testing.assert_close(variance, 1e-3 * signal + 1e-5, rtol=0.2, atol=0)
+
+
+def test_what_does_not_apply_is_left_out() -> None:
+    assert possible(Drawing("gopro-hero", "Nikon D750", 5500.0, "linear")) == Drawing("gopro-hero")
+    assert possible(Drawing("universal-small", tone="nokia like", noise="upi", iso=800.0)) == Drawing(
+        "universal-small", noise="upi"
+    )
+    kept = Drawing(noise="Nikon D750", iso=800.0, tone="linear")
+    assert possible(kept) == kept
+    assert "camera" in noises_of("gopro-hero") and "camera" not in noises_of("universal")
+    assert iso_range("any camera") is not None and iso_range("camera") is None
+
+
+def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
+    look = Look(str(tmp_path / "a.png"))
+    means = []
+    for value in (50, 200):
+        write_picture(look.picture, torch.full((3, 16, 16), value, dtype=torch.uint8))
+        means.append(drawn(look).pair.clean.mean())
+    assert means[0] < means[1]
+
+
+def test_titles_and_messages_are_text_and_pictures_are_data() -> None:
+    panel = views.Panel("<b>&", np.full((4, 4, 3), 7, np.uint8))
+    assert "&lt;b&gt;&amp;" in as_html([panel]) and "<b>" not in as_html([panel])
+    assert data_url(panel.image).startswith("data:image/jpeg;base64,/9j/")
+    assert "&lt;x" in message("<x.png: no picture") and message("") == ""
