@@ -1,11 +1,14 @@
 """What the hulls of colour, light and tone atoms hold, and whether it holds for cameras and curves not looked at.
 
     python benchmarks/hulls.py [--photographs FOLDER] [--atoms 10] [--halves 5]
+    python benchmarks/hulls.py --figure docs/coverage.png
 
 Cameras: the error is that of linear colour on photographs, between a camera's own sRGB-to-camera matrix and the nearest
 mixture of the atoms; a camera is held within 45 dB. Atoms are chosen greedily from a random half of the matrices and
-judged on the other half, and from all. Gains: the RAW of a white surface under random cameras and lights. Tones: each
-curve left out in turn, PSNR of linear light over all codes under the nearest mixture of the others.
+judged on the other half, and from all. Gains: the RAW of a white surface, of halves of the cameras likewise, each in
+lights of its own. Tones: each
+curve left out in turn, PSNR of linear light over all codes under the nearest mixture of the others. The figure shows
+the shipped ISPs instead: nothing is chosen for it.
 """
 
 from __future__ import annotations
@@ -18,9 +21,20 @@ from torch import Tensor
 
 from rawaug.io.picture_files import decode_srgb, read_picture
 from rawaug.isp.cameras import colour_matrix, published_cameras
+from rawaug.isp.dictionary import CameraDictionary
 from rawaug.isp.hull import colour_coordinates, nearest_in_hull, psnr, second_moment
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone_curves import tone_names, tone_tables
-from rawaug.isp.universal import COLOURS, chosen_atoms, held, inverse_gains_in_any_light, tone_points
+from rawaug.isp.universal import (
+    COLOURS,
+    DECIBEL,
+    camera_points,
+    chosen_atoms,
+    chosen_gains,
+    held,
+    inverse_gains_in_any_light,
+    tone_points,
+)
 
 
 def halves(points: Tensor, atoms: int, count: int) -> list[float]:
@@ -30,6 +44,17 @@ def halves(points: Tensor, atoms: int, count: int) -> list[float]:
         order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
         seen, unseen = points[order[::2]], points[order[1::2]]
         shares.append(held(unseen, seen[chosen_atoms(seen, atoms).atoms]))
+    return shares
+
+
+def lights_of_halves(cameras: Tensor, atoms: int, count: int) -> list[float]:
+    """The same for gains: atoms of one half of the cameras in random lights, and the other half in other lights."""
+    shares = []
+    for seed in range(count):
+        order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(seed))
+        seen = inverse_gains_in_any_light(cameras[order[::2]], f"seen {seed}")
+        unseen = inverse_gains_in_any_light(cameras[order[1::2]], f"unseen {seed}")
+        shares.append(held(unseen / 3**0.5, seen[chosen_gains(seen, atoms).atoms] / 3**0.5))
     return shares
 
 
@@ -43,13 +68,62 @@ def left_out_tones() -> dict[str, float]:
     return errors
 
 
+@torch.no_grad()
+def draw(path: Path) -> None:
+    """Cameras and gains under the hulls of the shipped ISPs, and every tone curve under the others."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    by_camera, by_light, by_tone = figure.subplots(1, 3, width_ratios=(1, 1, 1.25))
+    cameras = camera_points(published_cameras().xyz_to_camera)
+    shares = torch.linspace(100.0, 0.0, len(cameras))
+    for name in ("universal", "universal-small"):
+        isp = DictionaryISP.from_pretrained(name)
+        assert isinstance(isp.colour, CameraDictionary)
+        atoms = camera_points(isp.colour.xyz_to_camera(torch.eye(isp.config.colour_atoms)))
+        by_camera.plot(
+            psnr(nearest_in_hull(cameras, atoms)[1]).sort().values, shares, label=f"{name}, {len(atoms)} atoms"
+        )
+    by_camera.set(xlim=(35, 70), xlabel="PSNR of linear colour (dB)", ylabel=f"% of {len(cameras)} cameras above it")
+    isp = DictionaryISP.from_pretrained("universal")
+    inverse, atoms = (
+        inverse_gains_in_any_light(published_cameras().distinct(), "figure", 400),
+        1.0 / isp.gain.channel_gains().double(),
+    )
+    kept = psnr(nearest_in_hull(inverse / 3**0.5, atoms / 3**0.5)[1]) >= DECIBEL
+    for points, style, label in (
+        (1.0 / inverse[kept], "o", f"{int(kept.sum())} draws held"),
+        (1.0 / inverse[~kept], "rx", f"{int((~kept).sum())} not"),
+        (1.0 / atoms, "k^", f"{len(atoms)} atoms"),
+    ):
+        red, _, blue = (points / points[:, 1:2]).unbind(1)
+        by_light.loglog(red, blue, style, markersize=4, alpha=0.6, label=label)
+    by_light.set(xlabel="red gain over green", ylabel="blue gain over green")
+    for axis, ticks in ((by_light.xaxis, (0.5, 1, 2, 4)), (by_light.yaxis, (0.5, 1, 2, 4))):
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        axis.set_ticks([], minor=True)
+    tones = left_out_tones()
+    by_tone.barh(range(len(tones)), list(tones.values()), color="0.6")
+    by_tone.set_yticks(range(len(tones)), list(tones), fontsize=6)
+    by_tone.set(xlim=(20, 60), xlabel="PSNR under a mixture of the other curves (dB)")
+    for axis in (by_camera, by_tone):
+        axis.axvline(DECIBEL, color="0.3", linestyle=":")
+    for axis in (by_camera, by_light):
+        axis.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photographs", type=Path, help="folder of JPEG files; those of the package by default")
     parser.add_argument("--atoms", type=int, default=10)
     parser.add_argument("--gains", type=int, default=16)
     parser.add_argument("--halves", type=int, default=5)
+    parser.add_argument("--figure", type=Path, help="draw this figure, and do nothing else")
     options = parser.parse_args()
+    if options.figure is not None:
+        draw(options.figure)
+        return
     for name, value in left_out_tones().items():
         print(f"tone {name}: {value:.1f} dB under the others")
     moment = torch.tensor(COLOURS) if options.photographs is None else _moment(options.photographs)
@@ -58,9 +132,8 @@ def main() -> None:
     print(f"{len(points)} distinct matrices, {options.atoms} atoms", flush=True)
     for seed, share in enumerate(halves(points, options.atoms, options.halves)):
         print(f"half {seed}: {share:.1%} of the other half", flush=True)
-    gains = inverse_gains_in_any_light(cameras) / 3**0.5
-    for seed, share in enumerate(halves(gains, options.gains, options.halves)):
-        print(f"gains, half {seed}: {share:.1%} of the other half", flush=True)
+    for seed, share in enumerate(lights_of_halves(cameras, options.gains, options.halves)):
+        print(f"gains, half {seed}: {share:.1%} of the other half's", flush=True)
     print(f"all matrices: {held(points, points[chosen_atoms(points, options.atoms).atoms]):.1%}")
 
 

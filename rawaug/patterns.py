@@ -77,10 +77,8 @@ class Pattern:
         The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
         convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
         """
-        height, width = raw.shape[-2:]
-        planes = self.planes(height, width).to(raw)
-        means = _tent(raw * planes, self.period) / _tent_of(self.name, height, width).to(raw)
-        return torch.where(planes > 0, raw, means)
+        planes, inverse = (kept.to(raw) for kept in _sites(self.name, *raw.shape[-2:]))
+        return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
 
     def crop(self, raw: X, top: int, left: int, height: int, width: int) -> Tensor:
         """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size.
@@ -132,17 +130,22 @@ class Pattern:
 def _tent(image: Tensor, period: int) -> Tensor:
     """``(B, C, H, W)`` through a separable tent that reaches half a cell to each side; 0 beyond the edges."""
     reach = period // 2
-    tent = (1.0 + reach - torch.arange(-reach, reach + 1).abs()).to(image)
-    channels = image.shape[1]
-    rows = F.conv2d(image, tent.view(1, 1, -1, 1).expand(channels, 1, -1, 1), padding=(reach, 0), groups=channels)
-    return F.conv2d(rows, tent.view(1, 1, 1, -1).expand(channels, 1, 1, -1), padding=(0, reach), groups=channels)
+    for axis in (-2, -1):
+        side = image.shape[axis]
+        padded = F.pad(image, (0, 0, reach, reach) if axis == -2 else (reach, reach))
+        image = padded.narrow(axis, reach, side) * (reach + 1.0)
+        for step in range(1, reach + 1):
+            for start in (reach - step, reach + step):
+                image.add_(padded.narrow(axis, start, side), alpha=reach + 1.0 - step)
+    return image
 
 
 @lru_cache(maxsize=4)
-def _tent_of(name: str, height: int, width: int) -> Tensor:
-    """The sum of the tent's weights on the sites of each colour, ``(1, 3, H, W)``."""
+def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """The planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
     known = pattern(name)
-    return _tent(known.planes(height, width)[None], known.period)
+    planes = known.planes(height, width)[None]
+    return planes, 1.0 / _tent(planes, known.period)
 
 
 def _quad(cfa: CFA) -> Pattern:

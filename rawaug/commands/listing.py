@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,13 @@ def command(name: str) -> Callable[..., Any]:
     return function
 
 
-def _in_source() -> Iterator[tuple[str, str, str]]:
+@cache
+def _in_source() -> tuple[tuple[str, str, str], ...]:
     """Name, module and summary of each command of this package, by file."""
+    return tuple(_registered())
+
+
+def _registered() -> Iterator[tuple[str, str, str]]:
     for file in sorted(Path(__file__).parent.glob("*.py")):
         body = ast.parse(file.read_text(encoding="utf-8")).body
         for function in (statement for statement in body if isinstance(statement, ast.FunctionDef)):

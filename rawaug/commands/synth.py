@@ -71,7 +71,7 @@ def run(
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    rest = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
+    rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
     print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **vars(drawing)))
 
 

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from rawaug.data.raw_folder import RawFolder
 from rawaug.registry import DATASETS
@@ -68,7 +69,7 @@ def fivek_pairs(
     return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
-AS_INVISP = {"adjust_maximum_thr": 0.75, "jpeg_quality": 90}
+AS_INVISP: dict[str, Any] = {"adjust_maximum_thr": 0.75, "jpeg_quality": 90}
 """How InvISP's published script makes the pictures."""
 
 for _camera in CAMERAS:

@@ -1,8 +1,8 @@
 """The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
 A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best possible weights (oracle), the limit of the dictionaries. A shipped ISP, or the file of one,
-is a method that is not fitted.
+samples, and with the best setting that can be found (oracle, :mod:`rawaug.experiment.oracle`), the limit of the
+dictionaries. A shipped ISP, or the file of one, is a method that is not fitted.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
 from rawaug.evaluation.balanced_psnr import balanced_psnr
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
+from rawaug.experiment.oracle import oracle
 from rawaug.files import find_weights
 from rawaug.isp import conditioning
 from rawaug.isp.baselines import BASELINES, InvISP, fit_baseline
 from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.baselines.upi import SmoothstepISP
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.samples import block_averages, sample_pixels
+from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.reverse import ReverseISP
 from rawaug.isp.setting import ISPParams
@@ -38,7 +39,6 @@ from rawaug.seeding import keyed_generator
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
-ORACLE_STEPS = 300
 
 Maker = Callable[[Tensor, Tensor], Tensor]
 """An sRGB patch and its place in the frame to a mosaic."""
@@ -158,12 +158,12 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     with torch.no_grad():
         blind = isp.choose(pair.srgb[None])
         as_shot = conditioning.with_white_balance(isp, blind, pair.white_balance, None)
-        return {
+        known = {
             "blind": blind,
             **({"as-shot": as_shot} if pair.balance_known else {}),
             "samples": _from_samples(isp, pair, blind),
-            "oracle": _oracle(isp, pair),
         }
+        return known | {"oracle": oracle(isp, pair, list(known.values()))}
 
 
 def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams:
@@ -173,23 +173,6 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
     return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
-
-
-@torch.enable_grad()
-def _oracle(isp: DictionaryISP, pair: Pair) -> ISPParams:
-    """The weights that come closest to the frame's RAW, by descent on its logarithmic error."""
-    pixels, _ = sample_pixels([pair], 16384, seed=0)
-    atoms = (isp.config.colour_atoms, isp.config.gain_atoms, isp.config.tone_atoms)
-    logits = [torch.zeros(1, n, requires_grad=True) for n in atoms if n]
-    optimiser = torch.optim.Adam(logits, lr=0.1)
-    for _ in range(ORACLE_STEPS):
-        params = isp.params_from_weights(*(value.softmax(1) for value in logits))
-        error = (isp.reverse_pixels(pixels.srgb, params, pixels.place) - pixels.target) ** 2 * pixels.known
-        optimiser.zero_grad()
-        (error.mean() + 1e-9).log().backward()
-        optimiser.step()
-    with torch.no_grad():
-        return isp.params_from_weights(*(value.softmax(1) for value in logits))
 
 
 @torch.no_grad()

@@ -48,8 +48,9 @@ def varied_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int,
 
 
 def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, name: str) -> Pair:
-    lights = white_balance(xyz_to_camera, sample_lights(LIGHTS_TRIED, generator))
-    red, green, blue = lights[plausible(lights)][0].tolist()
+    lights = torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))
+    balances = white_balance(xyz_to_camera.double(), lights).numpy()
+    red, green, blue = balances[plausible(balances)][0].tolist()
     least = min(red, green, blue)
     to_srgb = torch.linalg.inv(colour_matrix(xyz_to_camera)).tolist()
     camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))

@@ -32,10 +32,13 @@ def histograms(drawn: Drawn) -> np.ndarray:
     edges = torch.linspace(-0.05, 1.0, 106)
     for (name, colour), a, b in zip(COLOURS.items(), clean, noisy, strict=True):
         for values, style in ((b, {"fill": True, "alpha": 0.25, "linewidth": 0}), (a, {"linewidth": 1.2})):
-            share = torch.histogram(values.clamp(-0.05, 1.0), edges).hist / values.numel()
+            share = torch.histc(values, len(edges) - 1, -0.05, 1.0) / values.numel()
             axis.stairs(share.numpy(), edges.numpy(), color=colour, **style)
         axis.plot([], [], color=colour, label=name)
-    axis.set(yscale="log", xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0))
+    axis.set(
+        yscale="log", ylim=(1e-6, 1), xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0)
+    )
+    axis.minorticks_off()
     axis.legend(title="line: clean, area: noisy", fontsize=8, title_fontsize=8, ncols=3)
     return _pixels(figure)
 
@@ -84,6 +87,7 @@ def noise(drawn: Drawn) -> np.ndarray:
             axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
             axis.legend(fontsize=8)
         else:
+            axis.minorticks_off()
             axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
     return _pixels(figure)
 

@@ -121,7 +121,7 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
         exposure = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False, elem_id="exposure")
     with gr.Group():
         noise = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", elem_id="noise")
-        iso = gr.Number(0, label="ISO", info=_about_iso(usual.noise), interactive=False, elem_id="iso")
+        iso = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False, elem_id="iso")
         cfa = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA", elem_id="cfa")
         seed = gr.Number(0, label="Seed", precision=0, minimum=0, elem_id="seed")
     made = locals()

@@ -83,7 +83,7 @@ def raw(look: Look) -> list[Panel]:
     top, left, *_ = _centre(mosaic, *_ZOOM)
     near = mosaic[..., top : top + _ZOOM[0], left : left + _ZOOM[1]]
     values = made.pair.clean.flatten()
-    gains = 1.0 / values[:: max(1, len(values) // 2**20)].quantile(0.99).clamp_min(1e-3)
+    gains = 1.0 / values[:: max(1, len(values) // 2**14)].quantile(0.99).clamp_min(1e-3)
     coloured = sensor.planes(*near.shape[-2:]) * encode_srgb((near * gains).clamp(0, 1))
     panels = [
         Panel(f"{sensor.name}: {near.shape[-2]} x {near.shape[-1]} sites, each in its colour", _enlarged(coloured)),

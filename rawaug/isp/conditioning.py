@@ -98,7 +98,22 @@ def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: 
     where = place.expand(len(x), -1, -1, -1)[batch, :, rows, columns].transpose(1, 2)[:, :, None]
     channel = torch.tensor(isp.cfa.channels, device=x.device)[rows % 2, columns % 2]
     own = F.one_hot(channel, 3).transpose(1, 2).to(x)
-    value = raw_samples[..., 2]
+    return with_readings(isp, pixels, where, own, raw_samples[..., 2], params)
+
+
+def with_readings(
+    isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
+) -> ISPParams:
+    """As :func:`with_raw_samples`, for pixels that are at hand.
+
+    Args:
+        isp: whose reverse pass is used.
+        pixels: sRGB ``(B, 3, 1, K)``, float.
+        where: their coordinates ``(1 or B, 2, 1, K)``.
+        own: ``(B, 3, K)`` 1 in the channel that is read, else 0.
+        value: the readings ``(B, K)``.
+        params: chosen parameters.
+    """
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):

@@ -32,24 +32,24 @@ def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
 
 
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest convex combinations of ``atoms`` ``(N, D)`` to ``points`` ``(P, D)``.
+    """The nearest convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, to ``points`` ``(P, D)``.
 
     Returns:
-        Weights ``(P, N)`` on the simplex, and squared distances ``(P,)``.
+        Weights ``(..., P, N)`` on the simplex, and squared distances ``(..., P)``.
     """
-    gram, correlation = atoms @ atoms.T, points @ atoms.T
-    rate = 1.0 / torch.linalg.eigvalsh(gram)[-1]
-    weights = torch.full((len(points), len(atoms)), 1.0 / len(atoms), dtype=points.dtype)
-    ahead, momentum = weights, torch.ones(len(points), 1, dtype=points.dtype)
+    gram, correlation = atoms @ atoms.mT, points @ atoms.mT
+    rate = 1.0 / torch.linalg.eigvalsh(gram)[..., -1:, None]
+    weights = torch.full_like(correlation, 1.0 / atoms.shape[-2])
+    ahead, momentum = weights, torch.ones_like(correlation[..., :1])
     for _ in range(_STEPS):
         gradient = ahead @ gram - correlation
-        new = project_to_simplex(ahead - rate * gradient)
-        uphill = (gradient * (new - weights)).sum(dim=1, keepdim=True) > 0
+        new = project_to_simplex((ahead - rate * gradient).flatten(0, -2)).reshape(weights.shape)
+        uphill = (gradient * (new - weights)).sum(dim=-1, keepdim=True) > 0
         momentum = torch.where(uphill, torch.ones_like(momentum), momentum)
         later = 0.5 * (1.0 + (1.0 + 4.0 * momentum**2).sqrt())
         ahead = new + (momentum - 1.0) / later * (new - weights)
         weights, momentum = new, later
-    return weights, (weights @ atoms - points).square().sum(dim=1)
+    return weights, (weights @ atoms - points).square().sum(dim=-1)
 
 
 def psnr(squared_error: Tensor) -> Tensor:
@@ -71,6 +71,13 @@ def greedy_atoms(points: Tensor, count: int, decibel: float = 45.0) -> list[int]
         open_ = psnr(errors) < decibel
         if not open_.any():
             open_ = torch.ones_like(open_)
-        remaining = [nearest_in_hull(points[open_], points[[*chosen, new]])[1].sum() for new in candidates]
-        chosen.append(candidates[int(torch.stack(remaining).argmin())])
+        hulls = points[torch.tensor([[*chosen, new] for new in candidates])]
+        chosen.append(candidates[int(nearest_in_hull(points[open_], hulls)[1].sum(dim=1).argmin())])
     return chosen
+
+
+def extreme_points(points: Tensor) -> Tensor:
+    """Indices of the points ``(P, D)``, D small, that are corners of the hull of all: only these make it wide."""
+    from scipy.spatial import ConvexHull  # slow to import, and needed by nothing else
+
+    return torch.from_numpy(ConvexHull(points.numpy()).vertices).long().sort().values

@@ -21,7 +21,7 @@ from rawaug.isp.camera_sampling import plausible
 from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary
-from rawaug.isp.hull import colour_coordinates, greedy_atoms, nearest_in_hull, psnr
+from rawaug.isp.hull import colour_coordinates, extreme_points, greedy_atoms, nearest_in_hull, psnr
 from rawaug.isp.light import sample_lights
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone_curves import STEPS, tone_names, tone_tables
@@ -29,8 +29,10 @@ from rawaug.seeding import keyed_generator
 
 COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 0.0503))
 """Second moment of linear sRGB: mean of the six photographs of :mod:`rawaug.data.demo`, every fourth row and column."""
-LIGHTS = 400
-"""Draws of camera and light that the gain atoms are chosen for."""
+LIGHTS = 4000
+"""Draws of camera and light that the gain atoms are chosen for: of 400, the corners of the hull are too few."""
+DECIBEL = 45.0
+"""A point this near to a hull is held by it."""
 STAGES = ("curve", "colour", "gains")
 
 
@@ -55,7 +57,7 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     colour = chosen_atoms(points, colour_atoms)
     tone = chosen_atoms(tone_points(tables), len(names) if tone_atoms is None else tone_atoms)
     inverse = inverse_gains_in_any_light(distinct)
-    gain = chosen_atoms(inverse / 3**0.5, gain_atoms)
+    gain = chosen_gains(inverse, gain_atoms)
     isp = DictionaryISP(
         ISPConfig(
             colour_atoms=len(colour.atoms),
@@ -122,11 +124,11 @@ def tone_points(tables: Tensor) -> Tensor:
     return tables[:, ::STEPS].double() / 16.0
 
 
-def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gains") -> Tensor:
-    """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``."""
+def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gains", draws: int = LIGHTS) -> Tensor:
+    """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``, P <= ``draws``."""
     generator = keyed_generator(key)
-    camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (LIGHTS,), generator=generator)]
-    balance = white_balance(camera, torch.from_numpy(sample_lights(LIGHTS, generator)))
+    camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (draws,), generator=generator)]
+    balance = white_balance(camera, torch.from_numpy(sample_lights(draws, generator)))
     balance = balance[torch.from_numpy(plausible(balance.numpy()))]
     return balance.amin(dim=1, keepdim=True) / balance
 
@@ -138,7 +140,15 @@ def chosen_atoms(points: Tensor, count: int) -> Choice:
     return Choice(atoms, typical.float())
 
 
-def held(points: Tensor, atoms: Tensor, decibel: float = 45.0) -> float:
+def chosen_gains(inverse: Tensor, count: int) -> Choice:
+    """As many atoms of inverse gains ``(P, 3)``, as :func:`chosen_atoms` of the corners of their hull."""
+    points = inverse / 3**0.5
+    corners = extreme_points(points)
+    chosen = corners[chosen_atoms(points[corners], count).atoms]
+    return Choice(chosen.tolist(), nearest_in_hull(points.mean(dim=0, keepdim=True), points[chosen])[0][0].float())
+
+
+def held(points: Tensor, atoms: Tensor, decibel: float = DECIBEL) -> float:
     """Share of ``points`` within ``decibel`` of the hull of ``atoms``, to four digits."""
     return round((psnr(nearest_in_hull(points, atoms)[1]) >= decibel).double().mean().item(), 4)
 

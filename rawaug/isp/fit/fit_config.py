@@ -43,6 +43,7 @@ class EncoderTraining:
 
 _LATER = {
     "curve_steps": None,
+    "tone": "learned",
     "intermediate": 0.1,
     "consistency": 1.0,
     "prior_steps": 400,
@@ -68,6 +69,9 @@ class FitConfig:
         learning_rate: initial learning rate of Adam, with cosine decay to 0.
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
+        tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
+            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
+            as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
@@ -93,6 +97,7 @@ class FitConfig:
     batch: int = 4096
     learning_rate: float = 2e-3
     shading: Literal["auto", "on", "off"] = "auto"
+    tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
     encoder_training: EncoderTraining = field(default_factory=EncoderTraining)
@@ -117,7 +122,8 @@ class FitConfig:
 
     def smoke(self) -> FitConfig:
         """In a second."""
-        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128)
+        few = replace(self.encoder_training, steps=4)
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
 
     def __post_init__(self) -> None:
         for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():

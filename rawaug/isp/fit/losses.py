@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.samples import PixelSamples, Shot
 from rawaug.isp.model import DictionaryISP
@@ -55,8 +56,20 @@ def apart(ours: ISPParams, theirs: ISPParams) -> Tensor:
 
 
 @torch.no_grad()
-def decibels(isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frames: Sequence[int]) -> float:
-    """Mean PSNR of some frames, each under the parameters that the ISP chooses for its thumbnail."""
-    every = torch.arange(samples.srgb.shape[-1])
-    values = [mean_square(isp, samples.pick(every, torch.tensor([k])), isp.choose(shots[k].srgb)) for k in frames]
+def decibels(
+    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frames: Sequence[int], as_shot: bool = False
+) -> float:
+    """Mean PSNR of some frames, each under the parameters that the ISP chooses for its thumbnail.
+
+    Args:
+        isp: the ISP.
+        samples, shots: all frames.
+        frames: which of them.
+        as_shot: with the gains that their files state.
+    """
+    every, values = torch.arange(samples.srgb.shape[-1]), []
+    for k in frames:
+        given = shots[k].white_balance if as_shot else None
+        params = with_white_balance(isp, isp.choose(shots[k].srgb), given, None)
+        values.append(mean_square(isp, samples.pick(every, torch.tensor([k])), params))
     return float(-10.0 * torch.cat(values).log10().mean())

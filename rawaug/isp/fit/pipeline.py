@@ -2,7 +2,8 @@ r"""The stages of a fit, in order.
 
 1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
    and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
-2. Tone. The tone network starts as that curve and is refined together with all of stage 1.
+2. Tone. The tone network starts as that curve and is refined together with all of stage 1; or the curve itself is
+   bent (:mod:`rawaug.isp.curve_stage`), where this is asked for or better (:mod:`rawaug.isp.fit.tone_choice`).
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
 4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from torch import Tensor
 from rawaug._version import __version__
 from rawaug.files import digest
 from rawaug.isp import stages
-from rawaug.isp.config import SMALL, ISPConfig
+from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
 from rawaug.isp.fit.colour_fit import FrameColour, Tie, fall_off, least_squares
 from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent
@@ -36,6 +38,7 @@ from rawaug.isp.fit.fit_config import FitConfig
 from rawaug.isp.fit.joint import train_jointly
 from rawaug.isp.fit.losses import cycle_error, reading_error
 from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
+from rawaug.isp.fit.tone_choice import with_better_tone
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.paper_stages import LensShading
 from rawaug.isp.stage import Stage
@@ -82,19 +85,21 @@ def fit_isp(
     samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
     key = _key(config, samples, shots)
     descent = Descent(_path(state), key, config.seed, progress, report_steps, save_seconds)
-    fit = _Fit(samples, shots, config, descent)
 
-    def refit(frames: Sequence[int], part: str) -> DictionaryISP:
+    def refit(frames: Sequence[int], part: str, config: FitConfig) -> DictionaryISP:
         index = torch.tensor(frames)
         some = PixelSamples(*(value[index] for value in samples))
-        return _Fit(some, [shots[k] for k in frames], config, fit.descent, part).reversed_only()
+        return _Fit(some, [shots[k] for k in frames], config, descent, part).reversed_only()
 
     with one_thread():
+        config, gain = with_better_tone(samples, shots, config, refit)
+        fit = _Fit(samples, shots, config, descent)
         fit.reversed_only(report)
-        train_encoders(fit.isp, samples, shots, config, fit.descent, refit)
+        train_encoders(fit.isp, samples, shots, config, descent, partial(refit, config=config))
         fit.forward()
-        train_jointly(fit.isp, samples, shots, config, fit.descent)
-    fit.descent.finish()
+        train_jointly(fit.isp, samples, shots, config, descent)
+    descent.finish()
+    fit.isp.info |= {} if gain is None else {"curve_gain_db": round(gain, 2)}
     fit.isp.info["registered"] = sum(shot.registered for shot in shots)
     fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
@@ -116,7 +121,9 @@ def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
     more = REACH_ATOMS if config.reach > 1.0 else 0
+    tone: dict[str, Any] = {"stages": ("curve", *POINTWISE_STAGES[2:]), "tone_atoms": 1}
     settings: dict[str, Any] = {
+        **(tone if config.tone == "curve" else {}),
         "colour_atoms": count,
         "gain_atoms": min(config.most_atoms, count + more),
         "encoder_widths": (SMALL if config.size == "small" else ISPConfig()).encoder_widths,
@@ -282,7 +289,8 @@ class _Fit:
                 back["raw"] = isp.reverse_pixels(part.cell_srgb, params, part.place, back)
             return cycle_error(isp, part, params, back, self.config)
 
-        self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
+        if tensors:
+            self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 
 
 def takes_light(mean: Tensor, precision: Tensor) -> bool:

@@ -189,7 +189,7 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
     for strength in (-0.1, 1.5):
         with pytest.raises(ValueError, match=f"strength must be between 0 and 1, got {strength}"):
-            denoise_file(source, tmp_path / "d.dng", identity, strength=strength)
+            denoise_file(source, tmp_path / "d.dng", brighter, strength=strength)
 
 
 def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> None:

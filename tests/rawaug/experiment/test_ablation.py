@@ -23,7 +23,7 @@ from rawaug.isp.model import DictionaryISP
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)
-TINY = FitConfig(steps=2, curve_steps=8, pixels=1024, batch=256, encoders="off")
+TINY = FitConfig(steps=2, curve_steps=8, pixels=1024, batch=256, encoders="off", prior_steps=50)
 
 
 def test_every_stage_of_the_true_camera_brings_the_image_nearer(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
@@ -142,4 +142,4 @@ def test_one_frame_leaves_none_to_fit(given: list[Pair], frame_of: FrameOf) -> N
 def test_the_smoke_form_keeps_what_is_fitted() -> None:
     quick = smoke_ablation(Ablation(name="a", fit=FitConfig(atoms=3, shading="on"), seed=7))
     assert (quick.name, quick.data, quick.count, quick.seed) == ("a-smoke", "demo:validation", 2, 7)
-    assert quick.fit == FitConfig(atoms=3, shading="on", steps=2, curve_steps=10, pixels=512, batch=128)
+    assert quick.fit == FitConfig(atoms=3, shading="on").smoke()

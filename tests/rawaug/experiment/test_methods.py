@@ -14,7 +14,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pair import Pair
-from rawaug.experiment import methods
+from rawaug.experiment import methods, oracle
 from rawaug.experiment.methods import (
     FAMILIES,
     ROWS,
@@ -38,7 +38,7 @@ DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 
 def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
-    frame = frame_of("one")
+    frame = frame_of("one", size=(64, 96))
     universal = DictionaryISP.from_pretrained("universal-small")
     universal.save(tmp_path / "own.safetensors")
     for name in ("universal-small", str(tmp_path / "own.safetensors")):
@@ -61,7 +61,7 @@ def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, flo
 @pytest.fixture
 def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(methods, "ORACLE_STEPS", 1)
+    monkeypatch.setattr(oracle, "STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
@@ -100,7 +100,7 @@ def made(model: Any, pair: Pair, light: tuple[float, float, float]) -> torch.Ten
 def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
     known_camera: DictionaryISP, frame_of: FrameOf
 ) -> None:
-    rows = rows_of(known_camera, frame_of("lamps", LAMPS))
+    rows = rows_of(known_camera, frame_of("lamps", LAMPS, size=(64, 96)))
     assert rows["blind"] < 32.0
     assert rows["as-shot"] > 75.0 and rows["samples"] > 60.0  # what was given is exact, or 64 readings of 12 bits
     assert rows["oracle"] > rows["blind"] + 20.0  # the light is one of the atoms

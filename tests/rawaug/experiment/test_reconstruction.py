@@ -22,7 +22,7 @@ from rawaug.isp.baselines.base import CropTrainedISP
 from rawaug.isp.fit import FitConfig
 
 FrameOf = Callable[..., Pair]
-TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64)
+TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64, prior_steps=20)
 
 
 class Laboratory:

@@ -25,7 +25,8 @@ def test_an_arm_is_trained_for_every_value_and_others_stay() -> None:
 def test_what_is_no_setting_is_refused_before_anything_runs() -> None:
     with pytest.raises(ValueError, match="gama"):
         Recipe(arms={"n2n": searching(gama=[2.0])})
-    for search in ({"gamma": []}, {"gamma": [1.0], "delta": [2.0]}):
+    searches: list[dict[str, list[float]]] = [{"gamma": []}, {"gamma": [1.0], "delta": [2.0]}]
+    for search in searches:
         with pytest.raises(ValueError, match=r"arms: n2n: search needs one setting with values"):
             Recipe(arms={"n2n": searching(**search)})
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import importlib.util
 import io
 import shutil
-import threading
-import time
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ import torch
 from rawaug.commands.explore import choices
 from rawaug.data import demo_pictures
 from rawaug.explore import look as looks
-from rawaug.explore.gradio_page import address, build, listening, server_of
+from rawaug.explore.gradio_page import listening
 from rawaug.explore.views import pair as view
 from rawaug.io import write_picture
 from rawaug.plugin.drawing import Drawing
@@ -40,28 +42,36 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def served(pictures: Path) -> Iterator[str]:
-    """The address of a running page."""
-    pytest.importorskip("gradio", reason="pip install 'rawaug[explore]'")
-    server = server_of(build(*choices(str(pictures / "in"))))
-    with listening("127.0.0.1", 0) as open_:
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [open_]}, daemon=True)
-        thread.start()
-        while not server.started and thread.is_alive():
-            time.sleep(0.05)
-        yield address(open_)
-        server.should_exit = True
-        thread.join(60)
+def chromium() -> str:
+    """The browser, if all that the tests need is there."""
+    for module, install in (("gradio", "rawaug[explore]"), ("playwright", "rawaug[test]")):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed: pip install '{install}'")
+    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if found is None:
+        pytest.skip("no Chromium on this machine: apt install chromium")
+    return found
 
 
 @pytest.fixture(scope="module")
-def browser(served: str) -> Iterator[Any]:
+def served(pictures: Path, chromium: str) -> Iterator[str]:
+    """The address of the page, in a process of its own: Gradio leaves event loops and sockets to Python."""
+    command = [sys.executable, "-m", "rawaug", "explore", str(pictures / "in"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address, _, hint = process.stdout.readline().partition(" ")
+        assert hint == "(Ctrl-C stops it)\n"
+        yield address
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
+@pytest.fixture(scope="module")
+def browser(served: str, chromium: str) -> Iterator[Any]:
     """A tab of a headless Chromium that shows the page."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no Chromium on this machine: apt install chromium")
-    with playwright.sync_playwright() as started:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
         launched = started.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         tab = launched.new_page(viewport={"width": 1280, "height": 900})
         tab.set_default_timeout(WAIT)

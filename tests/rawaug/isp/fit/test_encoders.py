@@ -23,8 +23,9 @@ QUICK = EncoderTraining(steps=40, frames=2, pixels=64, learning_rate=1.5e-2, fol
 
 def config(wanted: str, quick: EncoderTraining = QUICK) -> FitConfig:
     """With ``mse_floor`` the constants are a compromise between the two lights, not one of them."""
-    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "encoder_training": quick}
-    return FitConfig(atoms=2, reach=1.0, **few, shading="off", encoders=wanted, isp=SETTINGS)  # type: ignore[arg-type]
+    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "prior_steps": 100}
+    settings: dict[str, Any] = {**few, "encoder_training": quick, "encoders": wanted}
+    return FitConfig(atoms=2, reach=1.0, shading="off", isp=SETTINGS, **settings)
 
 
 def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:

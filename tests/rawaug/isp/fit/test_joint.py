@@ -16,7 +16,7 @@ from rawaug.isp.fit.losses import decibels
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 
-CONFIG = FitConfig(steps=5, curve_steps=20, pixels=512, batch=128, shading="off", joint_steps=0)
+CONFIG = FitConfig(steps=5, curve_steps=20, pixels=512, batch=128, shading="off", joint_steps=0, prior_steps=50)
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,7 @@ def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
     first, second = ((mean_square(isp, part, params) + 1e-5).log().sum().item() for params in (ours, theirs))
-    loss = encoders._frame_loss(isp, part, shots, 0, PIXELS, 1.0, torch.Generator().manual_seed(0))
+    loss = encoders._frame_loss(isp, part, shots, 0, PIXELS, FitConfig(), torch.Generator().manual_seed(0))
     assert abs(first - second) > 1e-3
     assert loss.item() == pytest.approx(first + second + 1.0 * APART, rel=1e-5)
 

@@ -15,7 +15,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
-TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off")
+TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off", prior_steps=50)
 
 
 def error_db(isp: DictionaryISP, pair: Pair, white_balance: tuple[float, ...] | None = None) -> float:
