@@ -45,9 +45,9 @@ def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPPa
 
 
 def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) -> Tensor:
-    """Mean over the readings, clipped ones too; as in PSNR_r what is made is held to [0, 1]."""
+    """Mean over the readings that are not clipped: a few that are would outweigh all others. Held to [0, 1]."""
     made = isp.reverse_pixels(pixels.srgb, setting, pixels.place).clamp(0.0, 1.0)
-    return ((made - pixels.target) ** 2 * pixels.site).sum() / pixels.site.sum()
+    return ((made - pixels.target) ** 2 * pixels.known).sum() / pixels.known.sum()
 
 
 @torch.enable_grad()

@@ -49,6 +49,7 @@ def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path
     assert not is_method("universal-tiny")
     rows = rows_of(fitted.model, replace(frame, cfa=CFA.RGGB), 1)
     assert rows["oracle"] > rows["blind"], "the oracle weighs tone curves as well"
+    assert rows["oracle"] == max(rows.values())
     with pytest.raises(ValueError, match="makes RGGB RAW, but the frames are GRBG"):
         fit_family("universal-small", [frame], FitConfig(), (1.0, 64, 2), 0)
 
