@@ -56,11 +56,11 @@ def camera(drawn: Drawn) -> np.ndarray:
     tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
     atoms = isp.colour.atoms()
     patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
-    for matrix, size, alpha in [(matrix, 12, 0.35) for matrix in atoms[:_ATOMS]] + [(setting.matrix, 110, 1.0)]:
-        seen = patches @ matrix.T
+    for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
+        seen = (patches @ matrices.mT).flatten(0, 1)
         share = seen / seen.sum(dim=1, keepdim=True)
-        edge = "black" if alpha == 1.0 else "none"
-        colour.scatter(share[:, 0], share[:, 1], s=size, c=_shown(patches), alpha=alpha, edgecolors=edge)
+        colours = _shown(patches.repeat(len(matrices), 1))
+        colour.scatter(share[:, 0], share[:, 1], s=size, c=colours, alpha=alpha, edgecolors=edge)
     colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
     colour.set(title=f"colours by the matrix over {count} atoms")
