@@ -1,7 +1,8 @@
 """One thread a process, for two processes test at once (``make test``); which tests need a GPU; and where real camera
 files lie, if any do.
 
-Processes that tests start through multiprocessing's forkserver have what takes seconds to import already.
+No test fails because the machine is slow: hypothesis has neither a deadline nor a limit for its inputs. Processes that
+tests start through multiprocessing's forkserver have what takes seconds to import already.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from rawaug import registry
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pair import Pair
 
 torch.set_num_threads(1)
+settings.register_profile("rawaug", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
 
 

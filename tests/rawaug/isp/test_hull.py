@@ -31,9 +31,9 @@ def test_a_mixture_is_found_and_a_point_outside_is_projected() -> None:
 def test_greedy_atoms_of_some_cameras_reach_the_others() -> None:
     photographs = torch.tensor([[0.130, 0.122, 0.118], [0.122, 0.128, 0.130], [0.118, 0.130, 0.148]])
     points = colour_coordinates(colour_matrix(published_cameras().distinct()), photographs)
-    seen, unseen = points[0::4], points[1::4]
-    greedy = psnr(nearest_in_hull(unseen, seen[greedy_atoms(seen, 7)])[1])
+    seen, unseen = points[0::8], points[4::8]
+    greedy = psnr(nearest_in_hull(unseen, seen[greedy_atoms(seen, 4)])[1])
     order = torch.randperm(len(seen), generator=torch.Generator().manual_seed(0))
-    by_chance = psnr(nearest_in_hull(unseen, seen[order[:7]])[1])
-    assert (greedy >= 45).double().mean() > (by_chance >= 45).double().mean() + 0.1
-    assert (greedy >= 45).double().mean() > 0.8
+    by_chance = psnr(nearest_in_hull(unseen, seen[order[:4]])[1])
+    assert (greedy >= 45).double().mean() > (by_chance >= 45).double().mean() + 0.4
+    assert (greedy >= 45).double().mean() > 0.65
