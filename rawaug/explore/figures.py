@@ -85,7 +85,8 @@ def noise(drawn: Drawn) -> np.ndarray:
         axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
         axis.set(xscale=scale, yscale=scale, xlabel="clean signal", ylabel="variance of the noise")
         if scale == "linear":
-            axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
+            brightest = max([float(signal.max()) for signal, _ in measured if len(signal)], default=1.0)
+            axis.set(xlim=(0, 1.1 * brightest), ylim=(0, 1.3 * max(highest, lowest)))
             axis.legend(fontsize=8)
         else:
             _plain_numbers(axis, axis.xaxis, axis.yaxis)
@@ -142,7 +143,7 @@ def _figure(columns: int) -> tuple[Any, Any]:
     figure = Figure(figsize=(4.8 * columns, 3.4), dpi=100)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, columns, squeeze=False)[0]
-    figure.subplots_adjust(left=0.14 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
+    figure.subplots_adjust(left=0.17 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
     for axis in axes:
         axis.grid(color="0.92")
         axis.set_axisbelow(True)
