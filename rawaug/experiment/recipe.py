@@ -256,6 +256,7 @@ def smoke(recipe: Recipe) -> Recipe:
         train=replace(few, loss=recipe.train.loss),
         arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
         untouched=[],
+        views=4,
         steps=None,
         seeds=1,
         device="cpu",

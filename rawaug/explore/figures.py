@@ -56,11 +56,11 @@ def camera(drawn: Drawn) -> np.ndarray:
     tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
     atoms = isp.colour.atoms()
     patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
-    for matrix, size, alpha in [(matrix, 12, 0.35) for matrix in atoms[:_ATOMS]] + [(setting.matrix, 110, 1.0)]:
-        seen = patches @ matrix.T
+    for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
+        seen = (patches @ matrices.mT).flatten(0, 1)
         share = seen / seen.sum(dim=1, keepdim=True)
-        edge = "black" if alpha == 1.0 else "none"
-        colour.scatter(share[:, 0], share[:, 1], s=size, c=_shown(patches), alpha=alpha, edgecolors=edge)
+        colours = _shown(patches.repeat(len(matrices), 1))
+        colour.scatter(share[:, 0], share[:, 1], s=size, c=colours, alpha=alpha, edgecolors=edge)
     colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
     colour.set(title=f"colours by the matrix over {count} atoms")
@@ -85,7 +85,8 @@ def noise(drawn: Drawn) -> np.ndarray:
         axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
         axis.set(xscale=scale, yscale=scale, xlabel="clean signal", ylabel="variance of the noise")
         if scale == "linear":
-            axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
+            brightest = max([float(signal.max()) for signal, _ in measured if len(signal)], default=1.0)
+            axis.set(xlim=(0, 1.1 * brightest), ylim=(0, 1.3 * max(highest, lowest)))
             axis.legend(fontsize=8)
         else:
             _plain_numbers(axis, axis.xaxis, axis.yaxis)
@@ -142,7 +143,7 @@ def _figure(columns: int) -> tuple[Any, Any]:
     figure = Figure(figsize=(4.8 * columns, 3.4), dpi=100)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, columns, squeeze=False)[0]
-    figure.subplots_adjust(left=0.14 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
+    figure.subplots_adjust(left=0.17 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
     for axis in axes:
         axis.grid(color="0.92")
         axis.set_axisbelow(True)
