@@ -40,17 +40,17 @@ SECONDS, WAITING_SECONDS, MEBIBYTES = 10.0, 120.0, 2048.0
 """Of a processor for a file, of a wait for it, and of memory."""
 START_SECONDS = 600.0
 DECODERS = {
-    "raw": "LibRaw",
-    "dng": "LibRaw",
-    "jpeg": "OpenImageIO",
     "picture": "OpenImageIO",
+    "jpeg": "OpenImageIO",
+    "npy": "NumPy",
     "mat5": "SciPy",
     "mat73": "HDF5",
     "safetensors": "safetensors",
-    "npy": "NumPy",
     "recipe": "PyYAML",
+    "dng": "LibRaw",
+    "raw": "LibRaw",
 }
-"""What reads each kind for us."""
+"""What reads each kind for us, the cheapest first."""
 
 BY_COMMANDS, COMMANDS_COST = 8, 6
 """Of so many files one is read by the commands as well, and then has so many times the seconds."""

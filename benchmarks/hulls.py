@@ -109,7 +109,7 @@ def draw(path: Path) -> None:
     for axis in (by_camera, by_tone):
         axis.axvline(DECIBEL, color="0.3", linestyle=":")
     for axis in (by_camera, by_light):
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, loc="lower left")
     figure.savefig(path, dpi=110)
 
 

@@ -6,8 +6,9 @@
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
 The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first. All are timed
 in turn, and the fastest run of each counts. ``--reading`` times PictureFolder alone: with decoders in a helper process
-of each worker (rawaug.io.apart), and without. ``--memory`` prints the resident memory of the process and its persistent
-workers after each epoch. Pictures are those of PICTURES, or the built-in ones written to a folder.
+of each worker (rawaug.io.apart), one by one and by batches, and without. ``--memory`` prints the resident memory of the
+process and its persistent workers after each epoch. Pictures are those of PICTURES, or the built-in ones written to a
+folder.
 """
 
 from __future__ import annotations
@@ -45,8 +46,19 @@ class Crops(Dataset[Tensor]):
         return len(self.pictures)
 
     def __getitem__(self, index: int) -> Tensor:
-        cropped: Tensor = self.crop(self.pictures[index], keyed_generator("crops", index)).clone()
-        return cropped
+        return self.cropped(self.pictures[index], index)
+
+    def cropped(self, picture: Tensor, index: int) -> Tensor:
+        part: Tensor = self.crop(picture, keyed_generator("crops", index)).clone()
+        return part
+
+
+class BatchesOfCrops(Crops):
+    """The same, with the pictures of a batch read at once."""
+
+    def __getitems__(self, indices: list[int]) -> list[Tensor]:
+        pictures = self.pictures.__getitems__(indices)
+        return [self.cropped(picture, index) for picture, index in zip(pictures, indices, strict=True)]
 
 
 def fastest(runs: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
@@ -80,12 +92,14 @@ def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
 
 
 def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, float]:
-    """Seconds of an epoch that decodes in the loader's workers, and of one whose workers have helpers for it."""
+    """Seconds of an epoch that decodes in the loader's workers, and of those whose workers have helpers for it."""
     runs: dict[str, Callable[[], object]] = {}
-    for name, limit in (("without", "0"), ("apart", "60")):
+    kinds: tuple[tuple[str, str, type[Crops]], ...]
+    kinds = (("without", "0", Crops), ("apart", "60", Crops), ("apart, by batches", "60", BatchesOfCrops))
+    for name, limit, kind in kinds:
         os.environ["RAWAUG_READ_SECONDS"] = limit
         loader = DataLoader(
-            Crops(PictureFolder(folder), args.crop), args.batch, num_workers=args.workers,
+            kind(PictureFolder(folder), args.crop), args.batch, num_workers=args.workers,
             persistent_workers=args.workers > 0,
         )  # fmt: skip
 

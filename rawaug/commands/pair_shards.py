@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -127,7 +128,7 @@ def shard_settings(
     pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
 ) -> dict[str, object]:
     """What else all shards of a folder have in common: a picture more, and all that follow would move."""
-    listed = "\n".join(_names(pictures, source)).encode()
+    listed = os.fsencode("\n".join(_names(pictures, source)))  # names need not be UTF-8
     return {
         "pictures": len(pictures),
         "names_sha256": hashlib.sha256(listed).hexdigest(),

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from rawaug.data.raw_folder import RawFolder
 from rawaug.registry import DATASETS
@@ -69,12 +68,12 @@ def fivek_pairs(
     return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
-AS_INVISP: dict[str, Any] = {"adjust_maximum_thr": 0.75, "jpeg_quality": 90}
-"""How InvISP's published script makes the pictures."""
+_as_invisp = partial(fivek_pairs, adjust_maximum_thr=0.75, jpeg_quality=90)
+"""As its published script makes the pictures."""
 
 for _camera in CAMERAS:
     DATASETS.register(f"fivek_{_camera}")(partial(fivek_pairs, cameras=[_camera]))
-    DATASETS.register(f"invisp_{_camera}")(partial(fivek_pairs, cameras=[_camera], **AS_INVISP))
+    DATASETS.register(f"invisp_{_camera}")(partial(_as_invisp, cameras=[_camera]))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 
-from rawaug.io.apart import apart, prepare
+from rawaug.io.apart import apart, apart_each, prepare
 from rawaug.io.picture_files import MAX_PIXELS, read_picture
 from rawaug.printable import printable
 
@@ -75,11 +75,22 @@ class PictureFolder(Dataset[Tensor]):
         return len(self.names)
 
     def __getitem__(self, index: int) -> Tensor:
-        first = range(len(self))[index]
+        return self._picture(range(len(self))[index], {})
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Tensor]:
+        """Those of a batch, as a DataLoader asks for them: read by many in one message, which is cheaper."""
+        wanted = [range(len(self))[index] for index in indices]
+        todo = [index for index in dict.fromkeys(wanted) if not self._bad[index]]
+        files = [self.path / self.names[index] for index in todo]
+        known = dict(zip(todo, apart_each(read_picture, files, self.max_pixels), strict=True))
+        return [self._picture(index, known) for index in wanted]
+
+    def _picture(self, first: int, known: dict[int, Tensor | Exception]) -> Tensor:
+        """The picture of a file, or of the next that can be used; ``known`` are files that have been read."""
         for candidate in chain(range(first, len(self)), range(first)):
             if self._bad[candidate]:
                 continue
-            picture = self._judged(candidate)
+            picture = self._judged(candidate, known.pop(candidate, None))
             if picture is not None:
                 self._count()
                 return picture
@@ -91,8 +102,10 @@ class PictureFolder(Dataset[Tensor]):
         Raises:
             FileNotFoundError, OSError, ValueError: if it cannot be used.
         """
+        return self._required(index, apart(read_picture, self.path / self.names[index], self.max_pixels))
+
+    def _required(self, index: int, picture: Tensor) -> Tensor:
         file = self.path / self.names[index]
-        picture = apart(read_picture, file, self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
             raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
@@ -118,10 +131,12 @@ class PictureFolder(Dataset[Tensor]):
         lines = map(printable, skipped.values())
         return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
 
-    def _judged(self, index: int) -> Tensor | None:
-        """The picture, or None and a mark where it is damaged."""
+    def _judged(self, index: int, known: Tensor | Exception | None) -> Tensor | None:
+        """The picture, or None and a mark where it is damaged; ``known`` is what came of reading it, None if unread."""
         try:
-            return self.read(index)
+            if isinstance(known, Exception):
+                raise known
+            return self.read(index) if known is None else self._required(index, known)
         except (OSError, ValueError) as error:
             self._reasons[index] = str(error)
         self._bad[index] = 1

@@ -83,10 +83,18 @@ class LearnedParts:
     def __post_init__(self) -> None:
         if min(self.frames, self.left_out, self.seeds, len(self.variants), len(self.cameras)) < 1:
             raise ValueError("frames, left_out, seeds, variants and cameras must each be at least one")
+        self.variants = {name: _switches_as_words(changes) for name, changes in self.variants.items()}
         for name, changes in self.variants.items():
             if unknown := set(changes) - set(asdict(self.fit)) | {"seed"} & set(changes):
                 raise ValueError(f"variants: {name}: {sorted(unknown)} are no keys of fit that a variant can change")
             replace(self.fit, **changes)
+
+
+def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
+    """YAML reads ``on`` and ``off`` as truth values."""
+    words = {True: "on", False: "off"}
+    switches = {key: words[changes[key]] for key in ("encoders", "shading") if isinstance(changes.get(key), bool)}
+    return changes | switches
 
 
 def smoke_learned(learned: LearnedParts) -> LearnedParts:

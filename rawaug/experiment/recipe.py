@@ -140,12 +140,12 @@ class ArmConfig:
         if self.search is None:
             return {label: self}
         name, settings = name_and_settings(self.estimator)
-        ((key, values),) = self.search.items() if len(self.search) == 1 else [("", [])]
-        if not values:
+        if len(self.search) != 1 or not all(self.search.values()):
             raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
+        key, values = next(iter(self.search.items()))
         found = {}
         for value in values:
-            estimator = {"name": name, "settings": {**settings, key: value}}
+            estimator: dict[str, Any] = {"name": name, "settings": {**settings, key: value}}
             found[f"{label}_{key}{value:g}"] = replace(self, estimator=estimator, search=None, candidate_of=label)
         return found
 

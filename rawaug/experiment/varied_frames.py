@@ -8,6 +8,7 @@ are those of :class:`rawaug.data.DemoCamera`, which shares no code with the ISPs
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -48,14 +49,12 @@ def varied_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int,
 
 
 def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, name: str) -> Pair:
-    lights = torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))
-    balances = white_balance(xyz_to_camera.double(), lights).numpy()
+    balances = white_balance(xyz_to_camera, torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))).numpy()
     red, green, blue = balances[plausible(balances)][0].tolist()
     least = min(red, green, blue)
     to_srgb = torch.linalg.inv(colour_matrix(xyz_to_camera)).tolist()
     camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))
-    shot = camera.sample(generator, iso=100)
-    shot = type(shot)((red / least, green / least, blue / least), shot.exposure, shot.iso, shot.noise_seed)
+    shot = replace(camera.sample(generator, iso=100), white_balance=(red / least, green / least, blue / least))
     return camera.apply(_scene(picture, generator, name), shot, name)
 
 

@@ -15,12 +15,13 @@ from rawaug.explore.quick_development import grey_curve
 from rawaug.extras import extra
 from rawaug.io import encode_srgb
 from rawaug.isp.tone_curves import STEPS
-from rawaug.patterns import pattern
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
 _ATOMS = 60
 """As many colour atoms are drawn, at most."""
 _BINS = 24
+_MOST = 2**16
+"""Values of a colour."""
 _FEWEST = 50
 """Values in a bin of the signal, for its variance to mean something."""
 
@@ -38,7 +39,7 @@ def histograms(drawn: Drawn) -> np.ndarray:
     axis.set(
         yscale="log", ylim=(1e-6, 1), xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0)
     )
-    axis.minorticks_off()
+    _plain_numbers(axis, axis.yaxis)
     axis.legend(title="line: clean, area: noisy", fontsize=8, title_fontsize=8, ncols=3)
     return _pixels(figure)
 
@@ -55,11 +56,11 @@ def camera(drawn: Drawn) -> np.ndarray:
     tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
     atoms = isp.colour.atoms()
     patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
-    for matrix, size, alpha in [(matrix, 12, 0.35) for matrix in atoms[:_ATOMS]] + [(setting.matrix, 110, 1.0)]:
-        seen = patches @ matrix.T
+    for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
+        seen = (patches @ matrices.mT).flatten(0, 1)
         share = seen / seen.sum(dim=1, keepdim=True)
-        edge = "black" if alpha == 1.0 else "none"
-        colour.scatter(share[:, 0], share[:, 1], s=size, c=_shown(patches), alpha=alpha, edgecolors=edge)
+        colours = _shown(patches.repeat(len(matrices), 1))
+        colour.scatter(share[:, 0], share[:, 1], s=size, c=colours, alpha=alpha, edgecolors=edge)
     colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
     colour.set(title=f"colours by the matrix over {count} atoms")
@@ -84,10 +85,11 @@ def noise(drawn: Drawn) -> np.ndarray:
         axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
         axis.set(xscale=scale, yscale=scale, xlabel="clean signal", ylabel="variance of the noise")
         if scale == "linear":
-            axis.set(xlim=(0, 1), ylim=(0, 1.3 * max(highest, lowest)))
+            brightest = max([float(signal.max()) for signal, _ in measured if len(signal)], default=1.0)
+            axis.set(xlim=(0, 1.1 * brightest), ylim=(0, 1.3 * max(highest, lowest)))
             axis.legend(fontsize=8)
         else:
-            axis.minorticks_off()
+            _plain_numbers(axis, axis.xaxis, axis.yaxis)
             axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
     return _pixels(figure)
 
@@ -110,10 +112,13 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 
 def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
-    """Values of red, green and blue sites, each ``(N,)``."""
-    mosaic = drawn.augment.mosaic(raw)[0]
-    channels = pattern(drawn.augment.cfa).channels(*mosaic.shape)
-    return [mosaic[channels == index] for index in range(3)]
+    """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
+    if drawn.augment.pattern is None:
+        values = [raw[0].flatten(), raw[1:3].flatten(), raw[3].flatten()]
+    else:
+        planes = drawn.augment.pattern.planes(*raw.shape[-2:]) > 0
+        values = [raw[0][plane] for plane in planes]
+    return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
 
 
 def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
@@ -138,12 +143,19 @@ def _figure(columns: int) -> tuple[Any, Any]:
     figure = Figure(figsize=(4.8 * columns, 3.4), dpi=100)
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, columns, squeeze=False)[0]
-    figure.subplots_adjust(left=0.14 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
+    figure.subplots_adjust(left=0.17 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
     for axis in axes:
         axis.grid(color="0.92")
         axis.set_axisbelow(True)
         axis.title.set_fontsize(10)
     return figure, axes
+
+
+def _plain_numbers(axis: Any, *scales: Any) -> None:
+    """Powers of ten as 0.01, without ticks between them: typeset ones take longer than the rest of the figure."""
+    axis.minorticks_off()
+    for scale in scales:
+        scale.set_major_formatter("{x:g}")
 
 
 def _pixels(figure: Any) -> np.ndarray:

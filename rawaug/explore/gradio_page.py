@@ -109,12 +109,13 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
     isps, usual = shipped_isps(), Drawing()
+    cameras = sorted(set(published_cameras().names), key=str.casefold)
     with gr.Group():
         picture = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", elem_id="picture")
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
     with gr.Group():
         isp = gr.Dropdown(isps, value=usual.isp, label="ISP", elem_id="isp")
-        camera = gr.Dropdown([ANY, *published_cameras().names], value=ANY, label="Camera", elem_id="camera")
+        camera = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", elem_id="camera")
         light = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", elem_id="light")
         tone = gr.Dropdown([ANY, *tones_of(usual.isp)], value=ANY, label="Tone curve", elem_id="tone")
         draw_exposure = gr.Checkbox(True, label="Draw the exposure at random", elem_id="draw_exposure")

@@ -114,7 +114,7 @@ def draws(look: Look) -> list[Panel]:
     """Eight noisy draws of the picture's central part, at half size."""
     first = drawn(look)
     develop = Development(first.augment.isp, first.pair.params.isp)
-    sensor, part = pattern(first.augment.cfa), _crop(first.srgb, HEIGHT, WIDTH)
+    part = _crop(first.srgb, HEIGHT, WIDTH)
     top, left, *_ = _centre(first.srgb, HEIGHT, WIDTH)
     place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
     frame = (top // 2, left // 2, first.srgb.shape[-2] // 2, first.srgb.shape[-1] // 2)
@@ -122,9 +122,8 @@ def draws(look: Look) -> list[Panel]:
     for number in range(DRAWS):
         params = augment.sample(part[None], draw_key(look.seed, Path(look.picture).name, number), place)
         made = augment.apply(part[None], params).map(lambda tensor: tensor[0])
-        half = F.avg_pool2d(sensor.demosaic(augment.mosaic(made.noisy)[None]), 2)[0]
         one = Drawn(part, augment, made)
-        panels.append(Panel(f"draw {number}: {_setting(one)}; {_levels(one)}", develop(half, frame)))
+        panels.append(Panel(f"draw {number}: {_setting(one)}; {_levels(one)}", develop(_half(one), frame)))
     return panels
 
 
@@ -161,6 +160,14 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
 def _network() -> tuple[Denoiser, CFA]:
     model, info = load(find(DEFAULT))
     return model, CFA(info.get("cfa", "RGGB"))
+
+
+def _half(made: Drawn) -> Tensor:
+    """Noisy RAW in three colours at half the size, ``(3, H/2, W/2)``: of Bayer patterns a pixel a cell."""
+    noisy = made.pair.noisy
+    if made.augment.pattern is None:
+        return torch.stack([noisy[0], (noisy[1] + noisy[2]) / 2, noisy[3]])
+    return F.avg_pool2d(made.augment.pattern.demosaic(noisy[None]), 2)[0]
 
 
 def _setting(made: Drawn) -> str:

@@ -16,7 +16,8 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import import_module
 from io import BytesIO
@@ -27,6 +28,8 @@ import torch
 from torch import Tensor
 
 _LIBRARIES = ("h5py", "OpenImageIO", "PIL.Image", "PIL.ImageCms", "rawpy", "scipy.io", "tifffile")
+FULL = 2**24
+"""Bytes of values, of pixels above all, beyond which an answer takes no more calls."""
 _CLOSED = select.POLLHUP | select.POLLERR | getattr(select, "POLLRDHUP", 0)
 
 
@@ -85,7 +88,7 @@ def _ended(links: dict[int, tuple[int, socket.socket]]) -> Iterator[int]:
             if not helper:
                 return
             with suppress(OSError):
-                _send(links[by_helper[helper]][1].fileno(), ("died", status, ()))
+                _send(links[by_helper[helper]][1].fileno(), (None, status, ()))
             yield by_helper[helper]
 
 
@@ -142,25 +145,37 @@ class _Memory:
 
 
 def _answer(connection: Connection, memory: _Memory) -> None:
-    folder, read, arguments = pickle.loads(connection.recv_bytes())
+    """The processor's seconds so far, and what came of the first calls: of one, or as many as FULL holds."""
+    folder, read, calls = pickle.loads(connection.recv_bytes())
+    answers, buffers = list[bytes](), list[memoryview]()
+    for arguments in calls:
+        content, more = _pickled(_attempt(folder, read, arguments))
+        answers.append(content)
+        buffers += more
+        if sum(map(len, buffers)) >= FULL:
+            break
+    memory.put(buffers)
+    connection.send_bytes(pickle.dumps((time.process_time(), answers, tuple(map(len, buffers)))))
+
+
+def _attempt(folder: str | None, read: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+    """Whether there is a value, and the value or the error."""
     try:
         if folder is not None:
             os.chdir(folder)
-        kind, value = "value", read(*arguments)
+        return True, read(*arguments)
     except Exception as error:
-        kind, value = "error", error
-    content, buffers = _pickled(value)
-    memory.put(buffers)
-    connection.send_bytes(pickle.dumps((kind, content, tuple(map(len, buffers)))))
+        return False, error
 
 
-def _pickled(value: Any) -> tuple[bytes, list[memoryview]]:
-    """The value, with the content of its arrays apart."""
+def _pickled(answer: tuple[bool, Any]) -> tuple[bytes, list[memoryview]]:
+    """An answer, with the content of its arrays apart."""
     file, buffers = BytesIO(), list[memoryview]()
     try:
-        _Pickler(file, protocol=5, buffer_callback=lambda buffer: buffers.append(buffer.raw())).dump(value)
+        _Pickler(file, protocol=5, buffer_callback=lambda buffer: buffers.append(buffer.raw())).dump(answer)
     except (pickle.PicklingError, TypeError, AttributeError):  # an exception of an extension
-        return pickle.dumps(RuntimeError(f"{type(value).__name__}: {value}")), []
+        _, value = answer
+        return pickle.dumps((False, RuntimeError(f"{type(value).__name__}: {value}"))), []
     return file.getvalue(), buffers
 
 

@@ -121,9 +121,10 @@ def test_a_file_has_the_rights_of_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_json({}, tmp_path / "a.json")
+        write_tensors({"a": torch.ones(1)}, {"format": "rawaug"}, tmp_path / "a.safetensors")
     finally:
         os.umask(before)
-    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o640
+    assert [file.stat().st_mode & 0o777 for file in tmp_path.iterdir()] == [0o640] * 2
 
 
 def test_numbers_of_others_are_finite_and_ours_are_written_so(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -37,6 +37,7 @@ def test_x_trans_has_20_green_sites_and_all_colours_in_every_row_and_column() ->
     assert int((greens == 1).sum()) == 4, "squares of four green sites"
 
 
+@settings(deadline=None)
 @given(patterns, st.integers(4, 9), st.integers(4, 9))
 def test_demosaicing_keeps_what_was_measured_and_flat_colours(cfa: Pattern, rows: int, columns: int) -> None:
     size = (2 * rows, 2 * columns)

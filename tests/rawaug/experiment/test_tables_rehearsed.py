@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,8 +15,15 @@ from rawaug.experiment import ablation, reconstruction, tables_rehearsed
 from rawaug.experiment.ablation import Ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep
 from rawaug.experiment.downstream import DownstreamConfig
+from rawaug.experiment.learned_parts import LearnedParts
 from rawaug.experiment.reconstruction import Comparison
-from rawaug.experiment.tables_rehearsed import rehearse_ablation, rehearse_comparison, rehearse_sweep
+from rawaug.experiment.tables_rehearsed import (
+    rehearse_ablation,
+    rehearse_comparison,
+    rehearse_learned,
+    rehearse_sweep,
+)
+from rawaug.isp.fit import FitConfig
 
 FrameOf = Callable[..., Pair]
 
@@ -60,6 +68,24 @@ def test_an_ablation_leaves_a_frame_and_every_stage_out(
     del frames[1:]
     with pytest.raises(ValueError, match="mine has 1 frame; leave-one-out needs two or more"):
         rehearse_ablation(settings)
+
+
+def test_every_variant_of_the_learned_parts_is_fitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted: list[tuple[str, int, int]] = []
+
+    def scores(place: Path, config: FitConfig, frames: list[Pair], left_out: list[Pair]) -> None:
+        fitted.append((config.encoders, len(frames), len(left_out)))
+
+    monkeypatch.setattr(tables_rehearsed, "variant_scores", scores)
+    variants: dict[str, dict[str, Any]] = {"all parts": {}, "without encoders": {"encoders": "off"}}
+    settings = LearnedParts(frames=3, left_out=2, variants=variants, out=str(tmp_path))
+    rehearse_learned(settings)
+    assert fitted == [("on", 2, 1), ("off", 2, 1)] and not list(tmp_path.iterdir())
+    assert "variants  all parts, without encoders" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="give a larger folder or smaller numbers"):
+        rehearse_learned(replace(settings, frames=1000))
 
 
 def test_a_sweep_tries_every_denoiser(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

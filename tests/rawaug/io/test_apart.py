@@ -19,7 +19,8 @@ from torch.utils.data import DataLoader
 from rawaug.data import PictureFolder
 from rawaug.io import apart as reading
 from rawaug.io import read_picture, write_picture
-from rawaug.io.apart import apart, prepare, time_limit
+from rawaug.io.apart import apart, apart_each, prepare, time_limit
+from rawaug.io.reading_process import FULL
 
 pytestmark = pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
 
@@ -61,6 +62,29 @@ def test_a_crash_and_a_hang_end_one_file(monkeypatch: pytest.MonkeyPatch) -> Non
     assert apart(os.getpid) == os.getpid()
 
 
+def _crash_at_three(number: int, size: int) -> np.ndarray:
+    if number == 3:
+        ctypes.string_at(0)
+    if number == 5:
+        raise ValueError("five")
+    return np.full(size, number)
+
+
+@pytest.mark.parametrize("size", [4, FULL // 16])  # of the second, a message holds two
+def test_files_by_many_are_those_one_by_one(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def found(numbers: list[int]) -> list[int | str]:
+        values = apart_each(_crash_at_three, numbers, size)
+        return [f"{value}" if isinstance(value, Exception) else int(value[-1]) for value in values]
+
+    assert found([]) == [] and found([1]) == [1]
+    assert found([0, 1, 2, 5, 4]) == [0, 1, 2, "five", 4]
+    helper = apart(os.getpid)
+    assert found(list(range(6)))[:3] == [0, 1, 2] and apart(os.getpid) != helper
+    assert "3: crashes the decoder (killed by SIGSEGV)" in str(found([3, 4])[0]) and found([3, 4])[1] == 4
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")
+    assert found([0, 5]) == [0, "five"]
+
+
 def test_a_helper_ends_with_whoever_it_helps() -> None:
     prepare()
     receiving, sending = multiprocessing.Pipe(duplex=False)
@@ -89,15 +113,17 @@ def _crash_on_marked(path: Path, max_pixels: int) -> torch.Tensor:
     return read_picture(path, max_pixels)
 
 
+@pytest.mark.parametrize("batch", [None, 3])
 def test_a_folder_names_the_file_that_crashed_in_a_worker_and_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    batch: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for k in range(4):
         write_picture(tmp_path / f"{k}.png", torch.full((3, 8, 8), k, dtype=torch.uint8))
     monkeypatch.setattr("rawaug.data.picture_folder.read_picture", _crash_on_marked)
     pictures = PictureFolder(tmp_path, allowed_share=0.5)
-    loader = DataLoader(pictures, None, num_workers=1, multiprocessing_context="fork")
-    assert [int(picture[0, 0, 0]) for picture in loader] == [0, 1, 3, 3]
+    loader = DataLoader(pictures, batch, num_workers=1, multiprocessing_context="fork")
+    found = torch.cat([batch_of.reshape(-1, 3, 8, 8) for batch_of in loader])
+    assert found[:, 0, 0, 0].tolist() == [0, 1, 3, 3]
     assert [path.name for path in pictures.skipped] == ["2.png"]
     assert "2.png: crashes the decoder (killed by SIGSEGV)" in pictures.report()
 

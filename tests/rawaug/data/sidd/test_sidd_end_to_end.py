@@ -70,8 +70,8 @@ def blocks_of(pair: Pair) -> Iterator[tuple[Tensor, Tensor]]:
     assert pair.noisy is not None
     for k in range(32):
         top, left = SIDE * (k // 8), SIDE * (k % 8)
-        clean, noisy = (x[0, top : top + SIDE, left : left + SIDE].clamp(0.0, 1.0) for x in (pair.raw, pair.noisy))
-        yield clean, noisy
+        window = (0, slice(top, top + SIDE), slice(left, left + SIDE))
+        yield pair.raw[window].clamp(0.0, 1.0), pair.noisy[window].clamp(0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
