@@ -75,7 +75,7 @@ def _frame_loss(
     g: torch.Generator,
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
-    srgb, raw = _same_piece(shots[frame].srgb, shots[frame].raw, g)
+    srgb, raw = _same_piece(shots[frame].srgb, isp.unshaded(shots[frame].raw, None), g)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
     return (errors[0] + errors[1]).sum() + config.consistency * apart(ours, theirs)

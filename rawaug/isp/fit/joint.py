@@ -66,7 +66,7 @@ def _frame_loss(
     isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, config: FitConfig
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
-    ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(shots[frame].raw)
+    ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(isp.unshaded(shots[frame].raw, None))
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, config)

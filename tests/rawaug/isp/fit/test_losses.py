@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, cast
 
 import pytest
 import torch
@@ -116,6 +118,27 @@ def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consi
     for direction in ("reverse", "forward"):
         gradients = [p.grad for name, p in isp.named_parameters() if f"{direction}_network" in name]
         assert gradients and any(g is not None and g.abs().max() > 0 for g in gradients), direction
+
+
+@pytest.mark.parametrize("stage", ["encoders", "joint"])
+def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
+    stage: str, exact_pair: Callable[..., Pair]
+) -> None:
+    """Of a flat frame under strong shading: the same light everywhere."""
+    isp = DictionaryISP(ISPConfig(colour_atoms=2, gain_atoms=2, attention=False))
+    with torch.no_grad():
+        cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), 3.0 * torch.eye(2))
+    flat = isp.reverse(torch.full((1, 3, 32, 40), 0.5)).raw[0]
+    part, shots = sample_pixels([replace(exact_pair("shot", (1.6, 1.0, 1.7), 0, size=(32, 40)), raw=flat)], 64, 0)
+    seen: list[Tensor] = []
+    isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    if stage == "encoders":
+        encoders._frame_loss(isp, part, shots, 0, PIXELS, CLEAN, torch.Generator().manual_seed(0))
+    else:
+        joint._frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
+    shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))
+    corrected = seen[0].std((3, 4)) / seen[0].mean((3, 4)).abs()
+    assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain
 
 
 def test_readings_weigh_as_shot_noise_has_it(frame: tuple[PixelSamples, list[Shot]]) -> None:
