@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -75,7 +76,7 @@ class FitConfig:
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
-        encoder_training: how that is done.
+        encoder_training: how that is done, as an :class:`EncoderTraining` or its settings by name.
         joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; None is 150.
@@ -126,6 +127,8 @@ class FitConfig:
         return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
 
     def __post_init__(self) -> None:
+        if isinstance(self.encoder_training, Mapping):
+            object.__setattr__(self, "encoder_training", EncoderTraining(**self.encoder_training))
         for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():
             if getattr(self, key) is not None:
                 require_between(key, getattr(self, key), least, MOST)

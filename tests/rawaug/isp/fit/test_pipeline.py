@@ -119,6 +119,12 @@ def test_no_frame_and_a_white_frame_are_refused(exact_pairs: list[Pair], camera_
         fit_isp([white], TINY, progress=False)
 
 
+def test_settings_come_back_from_their_key() -> None:
+    for config in (FitConfig(), FitConfig(atoms=3).smoke(), replace(TINY, mse_floor=1e-3)):
+        assert FitConfig(**config.key()) == config
+    assert "encoder_training" not in FitConfig().key(), "older fits stay what they are"
+
+
 def test_settings_that_cannot_be_are_refused(exact_pairs: list[Pair]) -> None:
     settings: dict[str, Any]
     for settings in ({"atoms": 0}, {"pixels": 0}, {"steps": -1}, {"reach": 0.9}):
