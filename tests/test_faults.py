@@ -122,11 +122,12 @@ def test_a_folder_that_was_only_made_for_the_lock_is_taken_away(tmp_path: Path, 
     assert not out.exists()
 
 
-@pytest.mark.parametrize("command", ["synth", "denoise", "fit"])
+@pytest.mark.parametrize("command", ["synth", "denoise", "fit", "run"])
 def test_two_at_once(command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fitted = tmp_path / "camera.safetensors"
     arguments = {
         "fit": ["fit", str(inputs / "shots"), "--out", str(fitted)],
+        "run": ["run", str(inputs / "recipe.yaml"), "--out", str(tmp_path.parent), "--name", tmp_path.name],
         "synth": ["synth", str(inputs / "pictures"), str(tmp_path), "--workers", "0"],
         "denoise": [
             "denoise",
