@@ -98,7 +98,7 @@ def iso_range(noise: str) -> tuple[float, float] | None:
 
     Example:
         >>> iso_range("Google Pixel"), iso_range("upi")
-        ((50.0, 10000.0), None)
+        ((100.0, 3200.0), None)
     """
     if noise == "camera":
         return None
