@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -25,6 +26,9 @@ OWN = {
 }
 """Commands that need the parser itself, beside those of ``rawaug.commands``."""
 SHELLS = ("bash", "zsh", "fish")
+WHOLE_FRAMES = ("denoise", "evaluate")
+"""Commands that put whole frames through a network. Their large blocks of memory are taken in huge pages, where Linux has
+them: a third of the time went into page faults. PyTorch reads the variable when it first takes memory."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,6 +71,8 @@ def _dispatch(argv: list[str]) -> int:
     argv, kind, recipe = _recipe_of(argv)
     names = [*OWN, *listed()]
     chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
+    if chosen in WHOLE_FRAMES:
+        os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     parser, leaves = _parser(kind, names if chosen == "completion" else [chosen])
     if not argv:
         parser.print_help()

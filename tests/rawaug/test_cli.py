@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -213,3 +214,15 @@ def test_weights_of_no_use_are_named(tmp_path: Path, capsys: pytest.CaptureFixtu
     bad.write_bytes(b"not weights")
     assert "bad.safetensors" in refused(capsys, "evaluate", str(bad), "--data", "demo:test")
     assert "gone.safetensors" in refused(capsys, "info", str(tmp_path / "gone.safetensors"))
+
+
+def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command, given, expected in (("denoise", None, "1"), ("evaluate", "0", "0"), ("info", None, None)):
+        monkeypatch.setenv("THP_MEM_ALLOC_ENABLE", given or "")
+        if given is None:
+            monkeypatch.delenv("THP_MEM_ALLOC_ENABLE")
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert os.environ.get("THP_MEM_ALLOC_ENABLE") == expected, command
