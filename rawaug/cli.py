@@ -27,8 +27,8 @@ OWN = {
 """Commands that need the parser itself, beside those of ``rawaug.commands``."""
 SHELLS = ("bash", "zsh", "fish")
 WHOLE_FRAMES = ("denoise", "evaluate")
-"""Commands that put whole frames through a network. They take memory in huge pages, where Linux has them: a third of the
-time went into page faults. PyTorch reads the variable when it first takes memory."""
+"""Commands that put whole frames through a network. They take memory in huge pages, where Linux has them: a third of
+their time went into page faults. PyTorch reads the variable when it first takes memory."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
