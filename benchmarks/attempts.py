@@ -69,28 +69,32 @@ def _set_up(path: Path) -> None:
     import torch
     from jsonargparse import ArgumentError
 
+    from rawaug.commands.spelling import require_known_keys
     from rawaug.experiment.kinds import KINDS, kind_of
+    from rawaug.experiment.plain_yaml import read_yaml
     from rawaug.experiment.recipe import Recipe
     from rawaug.training.start import first_network
 
     try:
-        kind, parser = KINDS[kind_of(path)], _run_parser(kind_of(path))
+        kind, (parser, run) = KINDS[kind_of(path)], _run_parser(kind_of(path))
+        require_known_keys(path, read_yaml(path), run)
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
         recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:
                     first_network(recipe.network_of(arm), seed=0)
-    except (ArgumentError, ValueError) as error:  # the command line has named the file already
+    except (ArgumentError, ValueError, FileNotFoundError) as error:  # the command line has named the file already
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 @cache
-def _run_parser(kind: str) -> Any:
-    """Built once: it takes longer than to read a recipe."""
+def _run_parser(kind: str) -> tuple[Any, Any]:
+    """The parser and that of ``run``, built once: it takes longer than to read a recipe."""
     from rawaug.cli import _parser
 
-    return _parser(kind, ["run"])[0]
+    parser, parsers = _parser(kind, ["run"])
+    return parser, parsers["run"]
 
 
 def attempt(kind: str, path: Path) -> tuple[str, str]:

@@ -53,7 +53,7 @@ def given_keys(arguments: Sequence[str]) -> set[str]:
 
 
 def require_known_keys(file: object, content: Any, parser: Any) -> None:
-    """Refuse a key of a recipe that the parser does not have.
+    """Refuse a key of a recipe that the parser does not have, and a section that is not one.
 
     Args:
         file: names the recipe in messages.
@@ -61,15 +61,18 @@ def require_known_keys(file: object, content: Any, parser: Any) -> None:
         parser: of the command that reads it.
 
     Raises:
-        ValueError: naming the key, and the one that is nearly spelt so.
+        ValueError: naming the key, and the one that is nearly spelt so, or the keys that belong below it.
     """
     known = {action.dest for action in parser._actions if not action.dest.endswith(".help")}
 
     def walk(part: Mapping[str, Any], above: str) -> None:
         for name, value in part.items():
             key = f"{above}{name}"
-            if isinstance(value, Mapping) and any(other.startswith(f"{key}.") for other in known):
+            below = sorted(other for other in known if other.startswith(f"{key}."))
+            if below and isinstance(value, Mapping):
                 walk(value, f"{key}.")
+            elif below:
+                raise ValueError(f"{file}: {key}: must have keys below it, such as {below[0]}, got {value!r}")
             elif key not in known:
                 raise ValueError(f"{file}: {key}: no such key{nearest(key, known)}")
 

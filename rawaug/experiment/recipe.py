@@ -116,7 +116,7 @@ class ArmConfig:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.augmented <= 1.0:
+        if self.augmented is None or not 0.0 <= self.augmented <= 1.0:
             raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps must be at least 1, or null for train.steps, got {self.steps}")

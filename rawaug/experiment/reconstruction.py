@@ -111,7 +111,7 @@ class Comparison:
     out: str = "runs"
 
     def __post_init__(self) -> None:
-        unknown = [method for method in self.methods if not is_method(method)]
+        unknown = [method for method in self.methods or [] if not is_method(method)]
         if unknown or not self.methods:
             listed = ", ".join(FAMILIES)
             raise ValueError(f"methods: {unknown or 'none'}; choose from {listed}, or name an ISP or its file")

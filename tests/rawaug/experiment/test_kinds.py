@@ -7,13 +7,14 @@ import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rawaug.cli import _parser
 from rawaug.commands.spelling import require_known_keys, require_known_options
 from rawaug.experiment.kinds import KINDS, kind_of
 from rawaug.experiment.methods import FAMILIES, ROWS
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.recipe import find_recipe
+from rawaug.experiment.recipe import ArmConfig, find_recipe
 from rawaug.experiment.reconstruction import Comparison
 from rawaug.isp.baselines import BASELINES
 from rawaug.isp.fit.samples import BLOCK
@@ -108,3 +109,17 @@ def test_a_recipe_that_names_no_kind_trains(tmp_path: Path) -> None:
         assert kind_of(tmp_path / "mine.yaml") == "training"
     with pytest.raises(FileNotFoundError, match=r"gone\.yaml"):
         kind_of(tmp_path / "gone.yaml")
+
+
+@pytest.mark.parametrize(("text", "key"), [("data: 5", "data"), ("train:", "train"), ("isp: [1]", "isp")])
+def test_a_section_that_is_none_is_refused(text: str, key: str) -> None:
+    _, commands = _parser("training", ["run"])
+    with pytest.raises(ValueError, match=rf"mine.yaml: {key}: must have keys below it, such as {key}\.\w+, got"):
+        require_known_keys("mine.yaml", yaml.safe_load(text), commands["run"])
+
+
+def test_null_where_a_number_or_a_list_belongs_is_refused() -> None:
+    with pytest.raises(ValueError, match="augmented must be between 0 and 1, got None"):
+        ArmConfig(augmented=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="methods: none; choose from"):
+        Comparison(methods=None)  # type: ignore[arg-type]
