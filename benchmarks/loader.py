@@ -82,13 +82,13 @@ def fastest(
 
 
 def processor_seconds() -> float:
-    """Of this process and all that come from it and are still there (Linux)."""
+    """Of this process and all that came from it (Linux)."""
     parents, seconds = dict[int, int](), dict[int, float]()
     for file in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
             fields = file.read_text(errors="replace").rpartition(")")[2].split()
             pid = int(file.parent.name)
-            parents[pid], seconds[pid] = int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+            parents[pid], seconds[pid] = int(fields[1]), sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
     def ours(pid: int) -> bool:
         return pid == os.getpid() or (pid in parents and ours(parents[pid]))

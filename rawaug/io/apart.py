@@ -114,13 +114,14 @@ def _answers(
     """
     sent = 0
     while sent < len(calls) or helper.expected:
-        while len(helper.waited) < MEMORIES and (sent < len(calls) or helper.expected > len(helper.waited)):
+        while len(helper.waited) < MEMORIES and (sent < len(calls) or helper.late):
             few = calls[sent : sent + helper.few]
             helper.ask(read, few)
             sent += len(few)
-        yield from helper.answer(seconds)
-    while helper.waited:  # for nothing, as the answers before had room for all
-        helper.answer(seconds)
+        answers = helper.answer(seconds)
+        if sent == len(calls) and not helper.expected:
+            helper.drain(seconds)  # now, since the caller may not ask for more than there is
+        yield from answers
 
 
 def _alone(read: Callable[..., T], call: Sequence[Any]) -> T | Exception:

@@ -109,6 +109,14 @@ def test_a_loop_that_is_left_early_leaves_no_answer_behind() -> None:
     assert apart(len, "four") == 4
 
 
+def test_as_many_values_as_there_are_leave_the_helper_there() -> None:
+    helper = [apart(os.getpid) for _ in range(3)][-1]  # so fast that all calls go in one message
+    values = apart_each(np.zeros, [FULL // 8, *range(9)])
+    assert [len(next(values)) for _ in range(10)] == [FULL // 8, *range(9)]  # type: ignore[arg-type]
+    values.close()  # type: ignore[attr-defined]
+    assert apart(os.getpid) == helper
+
+
 def test_a_helper_that_was_killed_while_it_had_nothing_to_do_is_no_fault_of_the_next_file() -> None:
     os.kill(apart(os.getpid), signal.SIGKILL)
     _wait_for(lambda: not reading._of_this_thread.helper.idle)
