@@ -228,6 +228,7 @@ def denoise_folder(
 
     Raises:
         FileNotFoundError: if there is no such file of weights.
+        OSError: if a result cannot be written, such as to a full disk; those that were are kept.
         ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
             of another denoiser or other settings.
     """
@@ -246,6 +247,8 @@ def denoise_folder(
         try:
             result.files.append(_denoise_file(file, target, made, noise, strength, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
+                raise  # what cannot be written, such as to a full disk, is no fault of the file
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")

@@ -118,7 +118,8 @@ class PairFolder(LazyPairs):
         name, *files = self.pairs[index]
         alone = files[0] == files[1]
         noisy, clean = (
-            read_mosaic(file, which, self.given, alone) for file, which in zip(files, ("noisy", "clean"), strict=True)
+            read_mosaic(file, which, self.given, alone, self.max_pixels)
+            for file, which in zip(files, ("noisy", "clean"), strict=True)
         )
         for what, one, other in (
             ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),

@@ -34,7 +34,7 @@ class DataConfig(PairSettings):
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
-        max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
+        max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
         read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import multiprocessing
 import sys
 from collections.abc import Callable
@@ -220,6 +221,26 @@ def test_what_is_there_stays_without_overwrite(
     assert out.stat().st_mtime_ns == before
     assert main([*command, "--overwrite"]) == 0
     assert out.stat().st_mtime_ns > before
+
+
+def test_a_full_disk_ends_a_folder_in_one_line(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    for name in "abc":
+        shot(source / f"{name}.dng", bayer_dng)
+
+    def write(path: Path, *rest: Any) -> None:
+        if path.stem != "a":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_dng(path, *rest)
+
+    monkeypatch.setattr("rawaug.commands.denoise.write_dng", write)
+    assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)
+    assert (out / "a.dng").is_file()
 
 
 def test_a_folder_with_a_broken_file_is_done_and_fails(
