@@ -64,7 +64,7 @@ def run(
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
-        seed: of that noise.
+        seed: seed of that noise.
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
@@ -108,7 +108,7 @@ def evaluate(
         self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
-        seed: of that noise.
+        seed: seed of that noise.
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.

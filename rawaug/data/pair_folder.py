@@ -32,12 +32,12 @@ _WILD = re.compile(r"[*?]")
 
 @dataclass
 class MosaicSettings:
-    """How the mosaics of ``pairs:PATH`` are read where their files do not say it.
+    """How the mosaics of ``pairs:PATH`` are read if their files do not state it.
 
     Args:
-        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, for files that do not state it.
-        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
-        white: of pairs:PATH: white level of files that do not state it.
+        cfa: CFA of files in pairs:PATH that do not state it: RGGB, BGGR, GRBG or GBRG.
+        black: black level of files in pairs:PATH that do not state it; one value, or four for R, Gr, Gb, B.
+        white: white level of files in pairs:PATH that do not state it.
     """
 
     cfa: str | None = None
@@ -47,11 +47,11 @@ class MosaicSettings:
 
 @dataclass
 class PairSettings(MosaicSettings):
-    """How noisy/clean pairs are found and read, where ``pairs:PATH`` alone does not say it.
+    """How noisy/clean pairs are found and read if ``pairs:PATH`` alone does not determine it.
 
     Args:
-        noisy: of pairs:PATH: pattern of the noisy files' names, such as "*_noisy.*", the naming of rawaug synth.
-        clean: of pairs:PATH: pattern of the clean files' names; null replaces the word noisy in ``noisy`` by clean.
+        noisy: pattern of the noisy files' names in pairs:PATH, such as "*_noisy.*", the naming of rawaug synth.
+        clean: pattern of the clean files' names in pairs:PATH; by default ``noisy`` with clean in place of noisy.
     """
 
     noisy: str | None = None
