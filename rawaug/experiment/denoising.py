@@ -103,7 +103,7 @@ def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     with reading_within(recipe.data.read_seconds):
         prepared = _Run(recipe, overwrite)
         print("\n".join(prepared.plan.lines(recipe)))
-        rehearse(recipe, prepared.plan)
+        rehearse(recipe, prepared.plan, prepared.classical)
     print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
 
 
