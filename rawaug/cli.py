@@ -188,7 +188,7 @@ def _add_run_arguments(run: Any, kind: str) -> None:
 
 
 def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
-    from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.kinds import KINDS, quickly
     from rawaug.experiment.plan import with_own_pairs
     from rawaug.experiment.recipe import Recipe
 
@@ -198,7 +198,7 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     recipe = experiment.settings(**settings)
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
-    recipe = experiment.smoke(recipe) if quick else recipe
+    recipe = quickly(kind, recipe, given) if quick else recipe
     if dry:
         experiment.dry_run(recipe, overwrite)
     else:
