@@ -282,8 +282,8 @@ class _Run:
         for name, method in others.items():
             classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
             write_json(everything, self.folder / "results.json")
-        settings = f"{len(self.pairs)} real pairs, {recipe.train.steps} steps, {recipe.seeds} seed(s)"
-        title = f"{recipe.name}: {settings}, tested on {self.data.test}"
+        settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
+        title = f"{recipe.name} tested on {self.data.test} ({settings})"
         page, shown = Page(title, results, classical), list[Row]()
         seeds = range(recipe.seed, recipe.seed + recipe.seeds)
         page.add_curves(

@@ -16,14 +16,15 @@ from rawaug.cli import main
 from rawaug.data import demo_pictures
 from rawaug.io import write_picture
 
-QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
+QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
 TINY = [
     "--data.pairs", "tiny:train", "--data.validation", "tiny:validation", "--data.test", "tiny:test",
     "--data.pictures", "tiny:",
 ]  # fmt: skip
 QUICK_RUN = [
     *TINY, "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32",
-    "--isp.steps", "2", "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
+    "--isp.steps", "2", "--isp.pixels", "512", "--isp.curve-steps", "10", "--isp.prior-steps", "10",
+    "--denoiser.settings", '{"width": 4, "scales": 2}',
     "--classical", "[]", "--untouched", "[]",
 ]  # fmt: skip
 
@@ -50,7 +51,7 @@ def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "picture.png"
-    write_picture(picture, demo_pictures(3)[2])
+    write_picture(picture, demo_pictures(3)[2][:, 64:160, 64:192])
     command = ["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2", "--cfa", "XTRANS"]
     assert main(command) == 0
     for name in ("stages.png", "stages-atoms.png"):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -29,6 +31,12 @@ OTHERS = {"rgb2raw": "reconstruction"}
 """Recipes that neither train nor are named after their kind."""
 
 
+@cache
+def parsers_of(kind: str) -> tuple[Any, dict[str, Any]]:
+    """The command line, and the parser of ``run`` for recipes of this kind."""
+    return _parser(kind, ["run"])
+
+
 def header(name: str) -> str:
     """The comment that a recipe opens with, a command's broken line joined."""
     lines = find_recipe(name).read_text().splitlines()
@@ -47,7 +55,7 @@ def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
     last = name.rpartition("/")[2]
     expected = last if last in KINDS else OTHERS.get(name, "training")
     assert kind_of(find_recipe(name)) == expected
-    parser, commands = _parser(expected, ["run"])
+    parser, commands = parsers_of(expected)
     require_known_keys(name, read_yaml(find_recipe(name)), commands["run"])
     assert parser.parse_args(["run", "--recipe", str(find_recipe(name))]).run.name == name
 
@@ -56,7 +64,7 @@ def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
 def test_the_commands_of_a_header_can_be_given(name: str) -> None:
     commands = re.findall(r"^#   (rawaug run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
     assert len(commands) >= 3 and any("--smoke" in command for command in commands)
-    parser, parsers = _parser(kind_of(find_recipe(name)), ["run"])
+    parser, parsers = parsers_of(kind_of(find_recipe(name)))
     for command in commands:
         _, _, named, *rest = shlex.split(command)
         assert named == name
@@ -127,7 +135,7 @@ def test_a_recipe_that_names_no_kind_trains(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "key"), [("data: 5", "data"), ("train:", "train"), ("isp: [1]", "isp")])
 def test_a_section_that_is_none_is_refused(text: str, key: str) -> None:
-    _, commands = _parser("training", ["run"])
+    _, commands = parsers_of("training")
     with pytest.raises(ValueError, match=rf"mine.yaml: {key}: must have keys below it, such as {key}\.\w+, got"):
         require_known_keys("mine.yaml", yaml.safe_load(text), commands["run"])
 
