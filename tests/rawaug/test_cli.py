@@ -112,8 +112,23 @@ def test_options_are_spelt_one_way_and_in_full(capsys: pytest.CaptureFixture[str
     assert "(nearest: --train.learning-rate)" in refused(capsys, "run", "fewshot", "--train.learning", "1")
     assert "(nearest: --train.steps)" in refused(capsys, "run", "fewshot", "--train.stepz=3")
     assert "(nearest: --first); see rawaug data check" in refused(capsys, "data", "check", "x", "--frist", "2")
-    assert refused(capsys, *fit, "--pixels", "many") == "rawaug: pixels: Expected a int. Got value: many"
+    assert refused(capsys, *fit, "--pixels", "many") == "rawaug: pixels must be a whole number, got many"
+    count = refused(capsys, "run", "fewshot", "--data.count", "few")
+    assert count == "rawaug: data.count must be a whole number or null, got few"
+    tone = refused(capsys, *fit, "--tone", "curves")
+    assert tone == "rawaug: tone must be one of auto, learned, curve, got curves (nearest: curve)"
     assert "augmented must be between" in refused(capsys, "run", "fewshot", "--arms.real.augmented", "7")
+
+
+def test_a_command_that_is_misspelt_or_incomplete_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, "denoize", "a.dng") == (
+        "rawaug: denoize: no such command (nearest: denoise); see rawaug --help"
+    )
+    assert refused(capsys, "data", "chek") == "rawaug: data chek: no such command; use rawaug data check"
+    assert "(nearest: fewshot)" in refused(capsys, "run", "fewshoot")
+    assert refused(capsys, "fit", "demo:train") == "rawaug: --out must be given; see rawaug fit --help"
+    assert refused(capsys, "denoise", "a.dng") == "rawaug: out must be given; see rawaug denoise --help"
+    assert refused(capsys, "denoise", "a", "b", "c") == "rawaug: c: too many arguments; see rawaug denoise --help"
 
 
 def test_help_is_quick() -> None:

@@ -188,6 +188,7 @@ def test_a_filter_whose_library_is_missing_is_refused_and_bm3d_left_out_of_recip
         require_classical(["Wavelet", "BM3D"])
     assert installed_classical(["Wavelet", "BM3D"]) == ["Wavelet"]
     assert "BM3D is left out: bm3d is not installed" in capsys.readouterr().out
+    assert installed_classical(["BM3D"], shown=False) == [] and not capsys.readouterr().out  # another process says so
     monkeypatch.setitem(sys.modules, "skimage", None)
     with pytest.raises(ValueError, match=r"classical: NonLocalMeans: skimage is not installed; run: pip install"):
         installed_classical(["NonLocalMeans"])

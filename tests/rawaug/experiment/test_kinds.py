@@ -13,13 +13,15 @@ import yaml
 
 from rawaug.cli import _parser
 from rawaug.commands.spelling import require_known_keys, require_known_options
-from rawaug.experiment.kinds import KINDS, kind_of
+from rawaug.experiment.ablation import Ablation
+from rawaug.experiment.kinds import KINDS, kind_of, quickly
 from rawaug.experiment.methods import FAMILIES, ROWS
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.recipe import ArmConfig, find_recipe
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe
 from rawaug.experiment.reconstruction import Comparison
 from rawaug.isp.baselines import BASELINES
 from rawaug.isp.fit.samples import BLOCK
+from rawaug.training.train_config import TrainConfig
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
@@ -71,6 +73,18 @@ def test_the_commands_of_a_header_can_be_given(name: str) -> None:
         kind = KINDS[kind_of(find_recipe(name))]
         recipe = kind.settings(**{key: getattr(given, key) for key in kind.settings.__dataclass_fields__})
         assert not given.smoke or kind.smoke(recipe).name.endswith("-smoke")
+
+
+def test_smoke_replaces_no_data_in_silence(capsys: pytest.CaptureFixture[str]) -> None:
+    data = DataConfig(pairs="mine", test="others", count=3)
+    recipe = Recipe(data=data, train=TrainConfig(steps=9), devices=2, arms={"real": ArmConfig()})
+    for key in ("data.pairs", "data.test"):
+        with pytest.raises(ValueError, match=rf"^--{key}: --smoke runs on built-in data; .* with --dry-run"):
+            quickly("training", recipe, {key, "smoke"})
+    with pytest.raises(ValueError, match=r"^--data: --smoke runs on built-in data"):
+        quickly("ablation", Ablation(data="mine"), {"data"})
+    assert quickly("training", recipe, {"train.steps", "devices", "data.count", "seed", "arms.real"}).train.steps == 4
+    assert capsys.readouterr().out == "--smoke sets data.count to 1, devices to 1, train.steps to 4\n"
 
 
 def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
