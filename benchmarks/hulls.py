@@ -73,8 +73,9 @@ def draw(path: Path) -> None:
     """Cameras and gains under the hulls of the shipped ISPs, and every tone curve under the others."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    by_camera, by_light, by_tone = figure.subplots(1, 3, width_ratios=(1, 1, 1.25))
+    figure = Figure(figsize=(7.6, 8.4), layout="constrained")
+    grid = figure.add_gridspec(2, 2, height_ratios=(1, 1.5))
+    by_camera, by_light, by_tone = (figure.add_subplot(part) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
     cameras = camera_points(published_cameras().xyz_to_camera)
     shares = torch.linspace(100.0, 0.0, len(cameras))
     for name in ("universal", "universal-small"):
@@ -93,23 +94,24 @@ def draw(path: Path) -> None:
     kept = psnr(nearest_in_hull(inverse / 3**0.5, atoms / 3**0.5)[1]) >= DECIBEL
     for points, style, label in (
         (1.0 / inverse[kept], "o", f"{int(kept.sum())} draws held"),
-        (1.0 / inverse[~kept], "rx", f"{int((~kept).sum())} not"),
+        (1.0 / inverse[~kept], "rx", f"{int((~kept).sum())} not held"),
         (1.0 / atoms, "k^", f"{len(atoms)} atoms"),
     ):
         red, _, blue = (points / points[:, 1:2]).unbind(1)
         by_light.loglog(red, blue, style, markersize=4, alpha=0.6, label=label)
-    by_light.set(xlabel="red gain over green", ylabel="blue gain over green")
-    for axis, ticks in ((by_light.xaxis, (0.5, 1, 2, 4)), (by_light.yaxis, (0.5, 1, 2, 4))):
-        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+    by_light.set(ylim=(0.3, 7), xlabel="red gain over green", ylabel="blue gain over green")
+    ticks = (0.5, 1, 2, 4)
+    for set_ticks in (by_light.set_xticks, by_light.set_yticks):
+        set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        set_ticks([], minor=True)
     tones = left_out_tones()
     by_tone.barh(range(len(tones)), list(tones.values()), color="0.6")
-    by_tone.set_yticks(range(len(tones)), list(tones), fontsize=6)
+    by_tone.set_yticks(range(len(tones)), list(tones), fontsize=8)
     by_tone.set(xlim=(20, 60), xlabel="PSNR under a mixture of the other curves (dB)")
     for axis in (by_camera, by_tone):
         axis.axvline(DECIBEL, color="0.3", linestyle=":")
-    for axis in (by_camera, by_light):
-        axis.legend(fontsize=8, loc="lower left")
+    by_camera.legend(fontsize=8, loc="lower left")
+    by_light.legend(fontsize=8, loc="lower left")
     figure.savefig(path, dpi=110)
 
 

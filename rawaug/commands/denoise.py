@@ -68,7 +68,8 @@ def run(
         overwrite: replace existing results.
 
     Raises:
-        ValueError: if a file of a folder could not be denoised, after all others.
+        ValueError: if a file of a folder could not be denoised, after all others; if a folder's output is named as a
+            file, or a preview is asked of it.
     """
     method = frame_denoiser(denoiser, classical, self_ensemble, device)
     law = stored_noise(noise, DEFAULT if denoiser is None else denoiser)
@@ -78,6 +79,8 @@ def run(
         return
     if preview is not None:
         raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
+    if Path(out).suffix.lower() == ".dng" and not Path(out).is_dir():
+        raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without .dng")
     result = denoise_folder(source, out, method, law, strength=strength, overwrite=overwrite)
     print_denoised(result)
     if result.broken:

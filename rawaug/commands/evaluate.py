@@ -64,7 +64,7 @@ def run(
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
-        seed: of that noise.
+        seed: seed of that noise.
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
@@ -108,7 +108,7 @@ def evaluate(
         self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
         noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
             with.
-        seed: of that noise.
+        seed: seed of that noise.
         classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
         device: where the denoiser runs.
         report: HTML file to write: scores and pictures of a denoiser.
@@ -150,7 +150,7 @@ def evaluate(
             result["classical"] = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
-            page = Page(f"{weights.name} on {data}", {"denoised": [runs]}, result.get("classical", {}))
+            page = Page(f"{weights.stem} on {data}", {weights.stem: [runs]}, result.get("classical", {}))
             scoring.add_frames(page, classical)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
@@ -165,6 +165,7 @@ class _Scoring:
         self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: torch.device
     ) -> None:
         model, info = denoisers.load(weights)
+        self.name = weights.stem
         self.model, self.pairs, self.seed = model.to(device), pairs, seed
         self.levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
         self.cfa = CFA(info.get("cfa", "RGGB"))
@@ -187,7 +188,7 @@ class _Scoring:
     def add_frames(self, page: Page, classical: Sequence[Spec]) -> None:
         """Pictures of some frames: noisy, denoised by each filter and by the denoiser, clean."""
         methods = {label_of(spec): classical_method(spec, self.levels, self.seed) for spec in classical}
-        methods["denoised"] = self.method()
+        methods[self.name] = self.method()
         for pair in shown_on_page(self.pairs.kept()):
             page.add_frame(row_of(methods, pair, self.levels, self.cfa, self.seed), self.cfa)
 

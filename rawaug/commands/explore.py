@@ -18,7 +18,7 @@ def run(pictures: str | None = None, *, host: str = "127.0.0.1", port: int = 786
     Args:
         pictures: a picture, or a folder of them; built-in ones by default.
         host: address to listen on; by default this machine alone can open the page.
-        port: of the page.
+        port: port to listen on.
     """
     page = build(*choices(pictures))
     with listening(host, port) as open_, suppress(KeyboardInterrupt):

@@ -57,8 +57,8 @@ def run(
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
-        frame: of a denoiser, RAW file on whose middle both are compared; by default a generated frame.
-        white_balance: of an ISP, as-shot multipliers R, G, B of the setting; the fit's typical one by default.
+        frame: RAW file whose middle is used to compare a denoiser with its ONNX; by default a generated frame.
+        white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
 
     Raises:
         ValueError: if an option is given that is of the other kind.

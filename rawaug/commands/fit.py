@@ -43,7 +43,7 @@ def run(
     Args:
         data: RAW files, folders of them, or one kind:path.
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
-        held_out: frames of which none is fitted; their PSNR_r is shown during the fit.
+        held_out: frames to leave out of the fit; their PSNR_r is shown during the fit.
         out: output .safetensors file.
         noise: measure the camera's noise at each ISO of the files, for noise: camera; auto continues without it where
             the frames do not allow it.
@@ -109,7 +109,7 @@ def fit(
         dark: folder of dark frames to measure the read variance.
         noise_figure: where to draw the measured points and the line.
         camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
-        held_out: frames of which none is fitted; their PSNR_r is shown in the progress bar and stored in
+        held_out: frames to leave out of the fit; their PSNR_r is shown in the progress bar and stored in
             ``isp.info["held_out"]``.
         state: file with the state of the fit, to resume it; removed at the end.
         cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.

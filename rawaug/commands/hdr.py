@@ -37,7 +37,7 @@ def run(
         pictures: sRGB pictures of one scene, aligned and of one size; or a single one.
         out: the picture to write, 8-bit sRGB.
         ev: exposure of each picture in stops, as [-2,0,2]; by default from EXIF, relative to the median exposure.
-        exposure: of the result in stops; 0 is that of the picture at 0 EV.
+        exposure: exposure of the result in stops, relative to the picture at 0 EV.
         isp: ISP file of the camera, or the name of a shipped ISP.
         overwrite: replace the output file if it exists.
         max_pixels: a larger picture is refused before it is decoded.

@@ -50,7 +50,7 @@ def run(
         out: output PNG; the atoms are written to NAME-atoms.png.
         isp: ISP file, or the name of a shipped ISP.
         count: number of augmented RAWs to plot.
-        seed: random seed of these.
+        seed: random seed of the augmented RAWs.
         cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
         max_pixels: a larger picture is refused before it is decoded.
     """
@@ -74,7 +74,7 @@ def preview(
         weights: an ISP, shipped or a path.
         out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
         count: number of augmented RAWs to plot.
-        seed: random seed of these.
+        seed: random seed of the augmented RAWs.
         max_pixels: a larger picture is refused before it is decoded.
         cfa: pattern of the RAW, as in :class:`rawaug.RawAugment`.
 

@@ -32,12 +32,12 @@ _WILD = re.compile(r"[*?]")
 
 @dataclass
 class MosaicSettings:
-    """How the mosaics of ``pairs:PATH`` are read where their files do not say it.
+    """How the mosaics of ``pairs:PATH`` are read if their files do not state it.
 
     Args:
-        cfa: of pairs:PATH: RGGB, BGGR, GRBG or GBRG, for files that do not state it.
-        black: of pairs:PATH: black level of files that do not state it, or the four of R, Gr, Gb, B.
-        white: of pairs:PATH: white level of files that do not state it.
+        cfa: CFA of files in pairs:PATH that do not state it: RGGB, BGGR, GRBG or GBRG.
+        black: black level of files in pairs:PATH that do not state it; one value, or four for R, Gr, Gb, B.
+        white: white level of files in pairs:PATH that do not state it.
     """
 
     cfa: str | None = None
@@ -47,11 +47,11 @@ class MosaicSettings:
 
 @dataclass
 class PairSettings(MosaicSettings):
-    """How noisy/clean pairs are found and read, where ``pairs:PATH`` alone does not say it.
+    """How noisy/clean pairs are found and read if ``pairs:PATH`` alone does not determine it.
 
     Args:
-        noisy: of pairs:PATH: pattern of the noisy files' names, such as "*_noisy.*", the naming of rawaug synth.
-        clean: of pairs:PATH: pattern of the clean files' names; null replaces the word noisy in ``noisy`` by clean.
+        noisy: pattern of the noisy files' names in pairs:PATH, such as "*_noisy.*", the naming of rawaug synth.
+        clean: pattern of the clean files' names in pairs:PATH; by default ``noisy`` with clean in place of noisy.
     """
 
     noisy: str | None = None
@@ -164,7 +164,8 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
         if found and as_clean:
             raise ValueError(
-                f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one"
+                f"{file}: is noisy by its name and would be taken for a clean frame; "
+                f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"
             )
 
 
@@ -215,7 +216,9 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
         )
         partner = index.get(wanted.casefold())
         if partner is None:
-            raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or give its pattern")
+            raise FileNotFoundError(
+                f"{file}: has no clean frame {top / wanted}; add it, or set clean, the pattern of clean files"
+            )
         if partner == file:
             raise ValueError(f"{file}: would be its own clean frame by the pattern {clean}")
         found.append(PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, partner))

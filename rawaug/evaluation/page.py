@@ -35,6 +35,8 @@ WHOLE = 640
 ON_PAGE = 12
 """Largest number of frames on the page."""
 
+PICTURES = "<h2>Pictures</h2>"
+
 CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are drawn, with what they are."""
 LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
@@ -44,16 +46,18 @@ body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem
 h1, h3, figcaption { overflow-wrap: anywhere; }
 .table { overflow-x: auto; margin: 1rem 0; } table { border-collapse: collapse; }
 th, td { padding: .25rem .8rem; border-bottom: 1px solid #ddd; text-align: right; font-variant-numeric: tabular-nums; }
+td + td { white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff; }
 .frame { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-start; margin-bottom: 2rem; }
 figure { margin: 0; } figcaption { font-size: 13px; }
 .window { width: 256px; } .window img { width: 100%; image-rendering: pixelated; }
 .curve { flex: 1 1 20rem; max-width: 36rem; } .curve img { width: 100%; }
+.two .curve { flex-basis: max(20rem, 40%); }
 img { max-width: 100%; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
 @media (max-width: 40rem) {
   body { margin: 1rem auto; padding: 0 .6rem; font-size: 14px; } h1 { font-size: 1.3rem; }
   th, td { padding: .2rem .4rem; } th { vertical-align: bottom; } .table { font-size: 13px; }
-  td:first-child { min-width: 6rem; max-width: 35vw; overflow-wrap: anywhere; }
+  td:first-child { max-width: 45vw; overflow-wrap: break-word; }
   .window { width: calc(50% - .3rem); }
 }
 """
@@ -72,18 +76,22 @@ class Page:
         self.title = title
         self.parts = [f"<h1>{html.escape(title)}</h1>", "<h2>Scores</h2>"]
         for columns in (COLUMNS, QUARTERS):
-            self.parts.append(_table(["", *columns], table_rows(results, classical, columns)))
+            rows = table_rows(results, classical, columns)
+            filled = [k for k in range(len(columns)) if any(cells[k] for cells in rows.values())]
+            kept = {name: [cells[k] for k in filled] for name, cells in rows.items()}
+            self.parts.append(_table(["", *(list(columns)[k] for k in filled)], kept))
         if note := levels_note(next(iter(results.values()))[0]["plain"]):
             self.parts.append(f"<p>{html.escape(note)}</p>")
         self.parts += ["<h2>Every image</h2>", _images_table(results, classical)]
 
     def add_curves(self, pngs: Mapping[str, bytes]) -> None:
         """Figures as :func:`draw_curves` makes them."""
-        figures = (f'<figure class="curve">{_picture(png, title)}</figure>' for title, png in pngs.items())
-        self.parts += ["<h2>Training</h2>", f'<div class="frame">{"".join(figures)}</div>', "<h2>Pictures</h2>"]
+        self.parts += ["<h2>Training</h2>", _curves(pngs)]
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
+        if PICTURES not in self.parts:
+            self.parts.append(PICTURES)
         clean = list(row.panels.values())[-1]
         exposure = exposure_of(clean, row.pair)
         top, left = most_detailed(clean)
@@ -109,13 +117,13 @@ class Page:
 def write_figure_page(
     path: Path,
     title: str,
-    png: bytes,
+    pngs: Mapping[str, bytes],
     head: Sequence[str],
     rows: Mapping[str, Sequence[str]],
     settings: Mapping[str, Any],
 ) -> Path:
-    """A page of one figure and one table."""
-    parts = [f"<h1>{html.escape(title)}</h1>", f"<p>{_picture(png, title)}</p>", _table(head, rows)]
+    """A page of figures, by title, and one table."""
+    parts = [f"<h1>{html.escape(title)}</h1>", _curves(pngs), _table(head, rows)]
     return _write(path, title, parts, settings)
 
 
@@ -194,11 +202,18 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
         if points:
             axis.plot(*zip(*points, strict=True), marker="o" if len(points) == 1 else "", **style)
     axis.set(xlabel="step", ylabel=title, yscale="log" if key == "loss" else "linear")
+    axis.locator_params(axis="x", integer=True)
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=8)
     file = io.BytesIO()
     figure.savefig(file, dpi=130)
     return file.getvalue()
+
+
+def _curves(pngs: Mapping[str, bytes]) -> str:
+    """Figures side by side, or one below the other on a phone."""
+    figures = (f'<figure class="curve">{_picture(png, title)}</figure>' for title, png in pngs.items())
+    return f'<div class="frame{" two" if len(pngs) == 4 else ""}">{"".join(figures)}</div>'
 
 
 def _picture(png: bytes, alt: str) -> str:

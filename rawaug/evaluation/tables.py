@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from rawaug.printable import printable
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
 
+ACROSS = 4
+"""Panels side by side, at most: more make captions too small to read on a page."""
 
 METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
 """Of an image: on the mosaic, and developed."""
@@ -42,21 +45,23 @@ class Row:
 
 
 def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
-    """Write the figure: one line of panels a row."""
+    """Write the figure: the panels of each row, at most :data:`ACROSS` side by side."""
     with extra("train"):
         from matplotlib.figure import Figure
 
-    columns = max(len(row.panels) for row in rows)
-    figure = Figure(figsize=(3.2 * columns, 3.2 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), columns, squeeze=False)
-    for line, row in zip(axes, rows, strict=True):
+    columns = min(ACROSS, max(len(row.panels) for row in rows))
+    lines = [-(-len(row.panels) // columns) for row in rows]
+    figure = Figure(figsize=(2.1 * columns, 2.5 * sum(lines)), layout="constrained")
+    axes = figure.subplots(sum(lines), columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for row, first in zip(rows, accumulate(lines, initial=0), strict=False):
         exposure = exposure_of(list(row.panels.values())[-1], row.pair)
-        for axis, (title, packed) in zip(line, row.panels.items(), strict=True):
+        for axis, (title, packed) in zip(axes[first:].flat, row.panels.items(), strict=False):
             panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             caption = f"{printable(title)}\n{printable(row.captions.get(title, ''))}"
             axis.set_title(caption, fontsize=9, parse_math=False)
-            axis.set_axis_off()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     return path

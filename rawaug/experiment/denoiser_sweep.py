@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
@@ -208,11 +208,11 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
 
     folder, rows = run_folder(settings), result["rows"]
     write_json(result, folder / "table.json")
-    png = _figure(rows, settings)
     with replacing(folder / "figure.png") as partial:
-        partial.write_bytes(png)
-    title = f"{settings.name}: {result['frames']} frames, noise of {settings.camera}"
-    head = ["PSNR / PSNR sRGB (dB)", *(f"ISO {iso}" for iso in settings.isos), "s a megapixel"]
+        partial.write_bytes(_figure(rows, settings, TITLES))
+    curves = {label: _figure(rows, settings, {key: label}) for key, label in TITLES.items()}
+    title = f"{settings.name}: noise of {settings.camera}, frames: {result['frames']}"
+    head = ["PSNR / PSNR sRGB (dB)", *(f"ISO {iso}" for iso in settings.isos), "s per megapixel"]
     cells = {
         name: [
             *(f"{at['psnr']:.2f} / {at['psnr_srgb']:.2f}" for at in row["iso"].values()),
@@ -220,8 +220,8 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
         ]
         for name, row in rows.items()
     }
-    page = write_figure_page(folder / "report.html", title, png, head, cells, asdict(settings))
-    table = Table(title=f"{title}; {result['threads']} thread(s)")
+    page = write_figure_page(folder / "report.html", title, curves, head, cells, asdict(settings))
+    table = Table(title=f"{title}; threads: {result['threads']}")
     for k, column in enumerate(head):
         table.add_column(column, justify="right" if k else "left")
     for name, row in cells.items():
@@ -230,18 +230,20 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
     print(f"table: {folder / 'table.json'}\nfigure: {folder / 'figure.png'}\npage: {page}")
 
 
-def _figure(rows: dict[str, Any], settings: DenoiserSweep) -> bytes:
-    """The four scores over the ISO."""
+def _figure(rows: dict[str, Any], settings: DenoiserSweep, titles: Mapping[str, str]) -> bytes:
+    """Scores over the ISO: one plot, or four as two by two."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    for axis, (key, label) in zip(figure.subplots(2, 2).flat, TITLES.items(), strict=True):
+    side = 2 if len(titles) > 1 else 1
+    figure = Figure(figsize=(5.6 * side, 3.8 * side), layout="constrained")
+    for axis, (key, label) in zip(figure.subplots(side, side, squeeze=False).flat, titles.items(), strict=True):
         for name, row in rows.items():
             style = {"color": "grey", "linestyle": ":"} if name == "noisy input" else {"marker": "o"}
             axis.plot(settings.isos, [at[key] for at in row["iso"].values()], label=name, **style)
         axis.set(xscale="log", xlabel=f"ISO of {settings.camera}", ylabel=label)
+        axis.minorticks_off()
         axis.set_xticks(settings.isos, [str(iso) for iso in settings.isos])
     axis.legend(fontsize=8)
     file = io.BytesIO()
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=130)
     return file.getvalue()

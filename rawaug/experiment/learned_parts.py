@@ -195,6 +195,6 @@ def _print(rows: dict[str, dict[str, Any]], learned: LearnedParts) -> None:
         cells.append([name, *figures, "" if row is first else mean_and_spread(apart, 2)])
     title = (
         f"{learned.name}: fitted to {learned.frames} frames of {len(learned.cameras)} cameras, scored on "
-        f"{learned.left_out} others, {learned.seeds} seed(s); dB"
+        f"{learned.left_out} others, seeds: {learned.seeds}; dB"
     )
     print_rows(title, ["fit", *COLUMNS.values(), "PSNR_r beside the first"], cells)

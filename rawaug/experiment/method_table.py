@@ -37,7 +37,7 @@ def print_methods(title: str, rows: dict[str, dict[str, Any]], balanced: bool, c
     heads = [COLUMNS[name] for name in columns] + ["M par.", "s to fit", "Mpix/s"]
     print_rows(title, ["method", *heads], [[name, *_cells(row, columns)] for name, row in rows.items()])
     threads = torch.get_num_threads()
-    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); {threads} thread(s)")
+    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); threads: {threads}")
 
 
 def row_name(family: str, row: str) -> str:

@@ -13,7 +13,7 @@ from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
@@ -314,4 +314,5 @@ def find_recipe(name: str) -> Path:
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]
-    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe ({', '.join(known)})")
+    shipped = f"{', '.join(known)}{nearest(wanted, known)}"
+    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe: {shipped}")

@@ -212,7 +212,7 @@ class PreparedComparison:
         write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
         frames, settings = len(next(iter(rows.values()))["frames"]), self.settings
         on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
-        title = f"{settings.name}: {on}, {settings.seeds} seed(s), {settings.data}"
+        title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
         print_methods(title, rows, settings.balanced, ceiling)
         return rows
 

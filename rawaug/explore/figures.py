@@ -28,7 +28,7 @@ _FEWEST = 50
 
 def histograms(drawn: Drawn) -> np.ndarray:
     """How often RAW has each value, by colour: clean as a line, noisy as an area."""
-    figure, (axis,) = _figure(1)
+    figure, axis = _figure()
     clean, noisy = (_by_colour(drawn, raw) for raw in (drawn.pair.clean, drawn.pair.noisy))
     edges = torch.linspace(-0.05, 1.0, 106)
     for (name, colour), a, b in zip(COLOURS.items(), clean, noisy, strict=True):
@@ -44,9 +44,9 @@ def histograms(drawn: Drawn) -> np.ndarray:
     return _pixels(figure)
 
 
-def camera(drawn: Drawn) -> np.ndarray:
-    """The drawn tone curve over the tone atoms, and what the drawn matrix makes of colours over the colour atoms."""
-    figure, (tone, colour) = _figure(2)
+def tone_curve(drawn: Drawn) -> np.ndarray:
+    """The drawn tone curve over the tone atoms."""
+    figure, tone = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
     code = np.arange(256)
     if isp.tone is not None:
@@ -54,22 +54,31 @@ def camera(drawn: Drawn) -> np.ndarray:
     tone.plot(code, grey_curve(isp, setting).numpy(), color="tab:blue", linewidth=2)
     title = "learned tone curve" if isp.tone is None else f"tone curve over {len(isp.tone.curves)} atoms"
     tone.set(xlabel="sRGB grey", ylabel="linear", title=title)
+    return _pixels(figure)
+
+
+def colours(drawn: Drawn) -> np.ndarray:
+    """What the drawn matrix makes of colours, over the colour atoms."""
+    figure, colour = _figure()
+    isp, setting = drawn.augment.isp, drawn.pair.params.isp
     atoms = isp.colour.atoms()
     patches = torch.cat([torch.eye(3), torch.tensor([[0.6, 0.35, 0.25], [0.25, 0.45, 0.65]])])
     for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
         seen = (patches @ matrices.mT).flatten(0, 1)
         share = seen / seen.sum(dim=1, keepdim=True)
-        colours = _shown(patches.repeat(len(matrices), 1))
-        colour.scatter(share[:, 0], share[:, 1], s=size, c=colours, alpha=alpha, edgecolors=edge)
-    colour.set(xlabel="R / (R + G + B) in the camera", ylabel="G / (R + G + B)")
+        shown = _shown(patches.repeat(len(matrices), 1))
+        colour.scatter(share[:, 0], share[:, 1], s=size, c=shown, alpha=alpha, edgecolors=edge)
+    colour.set(xlabel="R / (R + G + B)", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
-    colour.set(title=f"colours by the matrix over {count} atoms")
+    colour.set(title=f"colours in the camera over {count} atoms")
     return _pixels(figure)
 
 
-def noise(drawn: Drawn) -> np.ndarray:
-    """Variance of noisy minus clean against the clean signal, by colour, and the law that was drawn."""
-    figure, axes = _figure(2)
+def noise(drawn: Drawn) -> list[np.ndarray]:
+    """Variance of noisy minus clean against the clean signal, by colour, and the law that was drawn.
+
+    Two figures: linear axes and logarithmic ones.
+    """
     pair = drawn.pair
     ramp = torch.logspace(-4, 0, 100)
     params = {name: value[None] for name, value in pair.params.noise.items()}
@@ -79,7 +88,9 @@ def noise(drawn: Drawn) -> np.ndarray:
     measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
     highest = max([float(variance.max()) for _, variance in measured if len(variance)], default=float(law[-1]))
     lowest = float(law[0])
-    for axis, scale in zip(axes, ("linear", "log"), strict=True):
+    made = []
+    for scale in ("linear", "log"):
+        figure, axis = _figure()
         for (name, colour), (signal, variance) in zip(COLOURS.items(), measured, strict=True):
             axis.scatter(signal, variance, s=14, color=colour, label=f"{name}, measured")
         axis.plot(ramp, law, color="black", linewidth=1.2, label="law")
@@ -91,7 +102,8 @@ def noise(drawn: Drawn) -> np.ndarray:
         else:
             _plain_numbers(axis, axis.xaxis, axis.yaxis)
             axis.set(xlim=(1e-4, 1), ylim=(lowest / 3, 3 * max(highest, float(law[-1]))))
-    return _pixels(figure)
+        made.append(_pixels(figure))
+    return made
 
 
 def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,20 +147,19 @@ def _shown(linear: Tensor) -> np.ndarray:
     return shown
 
 
-def _figure(columns: int) -> tuple[Any, Any]:
+def _figure() -> tuple[Any, Any]:
     with extra("train"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.8 * columns, 3.4), dpi=100)
+    figure = Figure(figsize=(4.0, 3.1), dpi=140)
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    figure.subplots_adjust(left=0.17 / columns + 0.02, right=0.98, bottom=0.16, top=0.92, wspace=0.28)
-    for axis in axes:
-        axis.grid(color="0.92")
-        axis.set_axisbelow(True)
-        axis.title.set_fontsize(10)
-    return figure, axes
+    axis = figure.subplots()
+    figure.subplots_adjust(left=0.2, right=0.97, bottom=0.16, top=0.9)
+    axis.grid(color="0.92")
+    axis.set_axisbelow(True)
+    axis.title.set_fontsize(10)
+    return figure, axis
 
 
 def _plain_numbers(axis: Any, *scales: Any) -> None:

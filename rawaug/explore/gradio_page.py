@@ -190,7 +190,7 @@ def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
 
 def _about_iso(noise: str) -> str:
     measured = iso_range(noise)
-    return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise has none"
+    return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise model has no ISO"
 
 
 def server_of(page: Any) -> Any:

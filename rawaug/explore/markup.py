@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +18,8 @@ STYLE = """
 .panels figure {margin: 0; min-width: 0}
 .panels img {width: 100%; height: auto; display: block; border-radius: 4px}
 .panels figcaption {font-size: 13px; line-height: 1.4; padding: 4px 0; overflow-wrap: anywhere}
+.panels .number {white-space: nowrap}
+#message:not(:has(.message)) {display: none}
 .message {border: 1px solid #c0392b; border-radius: 4px; padding: 8px 12px; overflow-wrap: anywhere}
 #controls {max-width: 420px}
 #views {min-width: 0 !important}
@@ -31,10 +34,15 @@ def as_html(panels: Sequence[Panel]) -> str:
     """A grid of pictures with their titles."""
     figures = "".join(
         f'<figure><img src="{data_url(panel.image)}" alt="{html.escape(panel.title)}">'
-        f"<figcaption>{html.escape(panel.title)}</figcaption></figure>"
+        f"<figcaption>{_caption(panel.title)}</figcaption></figure>"
         for panel in panels
     )
     return f'<div class="panels">{figures}</div>'
+
+
+def _caption(title: str) -> str:
+    """The title; numbers such as 2.9e-03 stay on one line."""
+    return re.sub(r"\S+e-\d+", r'<span class="number">\g<0></span>', html.escape(title))
 
 
 def message(text: str) -> str:

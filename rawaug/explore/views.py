@@ -54,7 +54,7 @@ def pair(look: Look) -> list[Panel]:
     made = drawn(look)
     noisy, clean = _developed(made, made.pair.noisy, made.pair.clean)
     quality = psnr(made.pair.noisy[None], made.pair.clean[None]).item()
-    return [Panel(f"noisy: {_levels(made)}, {quality:.1f} dB", noisy), Panel(f"clean: {_setting(made)}", clean)]
+    return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", noisy), Panel(f"clean: {_setting(made)}", clean)]
 
 
 @torch.no_grad()
@@ -100,13 +100,17 @@ def raw(look: Look) -> list[Panel]:
 def camera(look: Look) -> list[Panel]:
     """Tone curve and colour matrix of the draw over those of the ISP."""
     made = drawn(look)
-    return [Panel(f"{_setting(made)}; large: red, green, blue, skin and sky by the drawn matrix", figures.camera(made))]
+    return [
+        Panel(_setting(made), figures.tone_curve(made)),
+        Panel("large: red, green, blue, skin and sky by the drawn matrix; small: by the atoms", figures.colours(made)),
+    ]
 
 
 def noise(look: Look) -> list[Panel]:
     """The noise of the pair against the law that it was drawn from."""
     made = drawn(look)
-    return [Panel(f"noise of the pair and its law: {_levels(made)}", figures.noise(made))]
+    titles = f"noise of the pair and its law: {_levels(made)}", "the same on logarithmic axes"
+    return [Panel(title, image) for title, image in zip(titles, figures.noise(made), strict=True)]
 
 
 @torch.no_grad()
@@ -173,7 +177,7 @@ def _half(made: Drawn) -> Tensor:
 def _setting(made: Drawn) -> str:
     """Gains of the draw: white balance and exposure."""
     red, green, blue = (made.pair.params.isp.gains / made.pair.params.isp.gains[1]).tolist()
-    return f"white balance {red:.2f} {green:.0f} {blue:.2f}, mean {made.pair.clean.mean().item():.3f}"
+    return f"white balance {red:.2f}, {green:.0f}, {blue:.2f}; mean {made.pair.clean.mean().item():.3f}"
 
 
 def _levels(made: Drawn) -> str:

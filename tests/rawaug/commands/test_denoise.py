@@ -16,7 +16,7 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder
+from rawaug.commands.denoise import denoise_file, denoise_folder, run
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
 from rawaug.commands.frame_noise import levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
@@ -241,6 +241,13 @@ def test_a_full_disk_ends_a_folder_in_one_line(
     said = capsys.readouterr().err.strip().splitlines()
     assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)
     assert (out / "a.dng").is_file()
+
+
+def test_a_folder_is_not_denoised_to_a_dng(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    with pytest.raises(ValueError, match=r"out\.dng: .*raw is a folder, and so is its output; give a name without"):
+        run(str(tmp_path / "raw"), str(tmp_path / "out.dng"))
+    assert not (tmp_path / "out.dng").exists()
 
 
 def test_a_folder_with_a_broken_file_is_done_and_fails(

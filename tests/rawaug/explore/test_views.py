@@ -67,7 +67,7 @@ def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> No
     look = Look(picture, Drawing(noise=LEVELS))
     panels = {name: view(look) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
-        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 1, "Noise": 1, "Eight draws": 8
+        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8
     }  # fmt: skip
     for panel in (panel for found in panels.values() for panel in found):
         assert panel.title and panel.image.dtype == np.uint8 and panel.image.shape[2] == 3 and panel.image.std() > 3
