@@ -69,6 +69,11 @@ class Helper:
         return not (self.waited or self.expected or self.owner != os.getpid() or self.answered.poll(0))
 
     @property
+    def next(self) -> int:
+        """Calls, at most, that the next answer is for."""
+        return self.late + (self.waited[0][1] if self.waited else 0)
+
+    @property
     def late(self) -> int:
         """Calls that did not fit into the answer that they were sent for."""
         return self.expected - sum(calls for _, calls in self.waited)
