@@ -5,14 +5,16 @@
 Every command runs in a forked child on small generated files. First it runs to its end; then it is killed ``--kills``
 times at moments drawn uniformly over that time, by SIGKILL, SIGTERM and SIGINT in turn, and after each kill the same
 command is run again to its end in the same folder. Its files must then equal those of the run that was not killed, bit
-for bit (tensors of safetensors; of JSON all but times), and nothing else may be left. Other faults follow, those of a
-small file system as root on Linux only. Exit status 1 if anything differs or ends in more than one line.
+for bit (tensors of safetensors; of JSON all but times), and nothing else may be left. Other faults follow; those that
+need a small file system are skipped where it cannot be mounted, and a small /dev/shm is for commands whose workers
+send tensors through it. Exit status 1 if anything differs or ends in more than one line.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import json
 import os
 import random
@@ -43,6 +45,12 @@ COMMANDS: dict[str, list[str]] = {
     "denoise": ["denoise", "shots", OUT, "--denoiser", "denoiser.safetensors"],
 }  # fmt: skip
 """In a folder that :func:`make_inputs` has filled."""
+
+WITH_WORKERS = {"run": ["--train.workers", "2"]}
+"""What makes a command send tensors through shared memory."""
+
+SHARED_KILOBYTES = (4, 64)
+"""Too little for the process itself, and for what its workers send."""
 
 RECIPE = """
 name: small
@@ -208,17 +216,43 @@ def kills(folder: Path, names: list[str], count: int, seed: int) -> Iterator[tup
 # -- other faults -----------------------------------------------------------------------------------------------------
 
 
+class Skipped(Exception):
+    """The fault cannot be made here, or does not concern the command; the text says which."""
+
+
 @contextlib.contextmanager
-def small_file_system(place: Path, kilobytes: int) -> Iterator[bool]:
-    """Mount a tmpfs of this size over a folder; False where that is not allowed."""
+def small_file_system(place: Path, kilobytes: int) -> Iterator[None]:
+    """Mount a tmpfs of this size over a folder.
+
+    Raises:
+        Skipped: where that is not allowed.
+    """
     place.mkdir(exist_ok=True)
-    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
-    mounted = shutil.which("mount") is not None and subprocess.run(command, capture_output=True).returncode == 0
+    mount(place, kilobytes)
     try:
-        yield mounted
+        yield
     finally:
-        if mounted:
-            subprocess.run(["umount", "--lazy", str(place)], check=True)
+        subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def mount(place: Path, kilobytes: int) -> None:
+    """Likewise, for as long as nobody unmounts it."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+        raise Skipped("needs the right to mount file systems")
+
+
+def small_shared_memory(kilobytes: int) -> None:
+    """A /dev/shm of this size for this process alone and those that come from it.
+
+    Raises:
+        Skipped: where that is not allowed.
+    """
+    new_mount_namespace = 0x00020000
+    if ctypes.CDLL(None, use_errno=True).unshare(new_mount_namespace):
+        raise Skipped(f"needs a mount namespace ({os.strerror(ctypes.get_errno())})")
+    subprocess.run(["mount", "--make-rprivate", "/"], check=True, capture_output=True)
+    mount(Path("/dev/shm"), kilobytes)
 
 
 def one_line(child: Child, *said: str) -> str | None:
@@ -234,9 +268,7 @@ def full_disk(folder: Path, name: str) -> str | None:
     """A disk with room for a part: one line, and the files that are there are whole."""
     whole, _ = uninterrupted(folder, name)
     size = sum(file.stat().st_size for file in (folder / OUT).rglob("*") if file.is_file())
-    with small_file_system(fresh(folder) / OUT, max(16, size // 2048)) as mounted:
-        if not mounted:
-            return None
+    with small_file_system(fresh(folder) / OUT, max(16, size // 2048)):
         if wrong := one_line(Child(folder, COMMANDS[name]), "No space left on device"):
             return wrong
         parts = contents(folder / OUT)
@@ -244,13 +276,20 @@ def full_disk(folder: Path, name: str) -> str | None:
         return f"incomplete: {', '.join(half)}" if half and name != "run" else None
 
 
+def stop_at_work(folder: Path, child: Child) -> None:
+    """Stop a command once it has the lock of its output folder, and has written who it is."""
+    while time.monotonic() - child.start < PATIENCE:
+        if any(file.stat().st_size for file in folder.rglob("*.lock")):
+            break
+        time.sleep(0.002)
+    child.send(signal.SIGSTOP)
+
+
 def two_at_once(folder: Path, name: str) -> str | None:
     """The second of two is refused; the first comes to its end."""
     whole, _ = uninterrupted(folder, name)
     first = Child(fresh(folder), COMMANDS[name])
-    while not list(folder.rglob("*.lock")) and time.monotonic() - first.start < PATIENCE:
-        time.sleep(0.002)
-    first.send(signal.SIGSTOP)
+    stop_at_work(folder, first)
     first.log = first.log.rename(folder / "first.txt")
     wrong = one_line(Child(folder, COMMANDS[name]), "in use by process", str(first.pid))
     first.send(signal.SIGCONT)
@@ -284,9 +323,7 @@ def jumping_clock(folder: Path, name: str) -> str | None:
 def removed_folder(folder: Path, name: str) -> str | None:
     """The output folder is removed in the middle: one line, no false success."""
     child = Child(fresh(folder), COMMANDS[name])
-    while not list(folder.rglob("*.lock")) and time.monotonic() - child.start < PATIENCE:
-        time.sleep(0.002)
-    child.send(signal.SIGSTOP)
+    stop_at_work(folder, child)
     shutil.rmtree(folder / OUT)
     child.send(signal.SIGCONT)
     return one_line(child, OUT)
@@ -294,11 +331,30 @@ def removed_folder(folder: Path, name: str) -> str | None:
 
 def unwritable_folder(folder: Path, name: str) -> str | None:
     """An output folder on a file system that is mounted read-only."""
-    with small_file_system(fresh(folder) / OUT, 64) as mounted:
-        if not mounted:
-            return None
+    with small_file_system(fresh(folder) / OUT, 64):
         subprocess.run(["mount", "-o", "remount,ro", str(folder / OUT)], check=True)
         return one_line(Child(folder, COMMANDS[name]), OUT, "Read-only file system")
+
+
+def little_shared_memory(folder: Path, name: str) -> str | None:
+    """Workers whose /dev/shm is full: one line; and the same command goes on to the same files where it is not."""
+    if name not in WITH_WORKERS:
+        raise Skipped("sends no tensors between processes")
+    command = [*COMMANDS[name], *WITH_WORKERS[name]]
+    whole = Child(fresh(folder), command)
+    if status := whole.wait():
+        return f"with workers: status {status}: {whole.said()}"
+    expected = contents(folder / OUT)
+    for kilobytes in SHARED_KILOBYTES:
+        short = Child(fresh(folder), command, lambda size=kilobytes: small_shared_memory(size))  # type: ignore[misc]
+        if wrong := one_line(short, "shared memory is full"):
+            if "Skipped: " in wrong:
+                raise Skipped(wrong.rpartition("Skipped: ")[2].strip())
+            return f"{kilobytes} KiB: {wrong}"
+        again = Child(folder, command)
+        if (status := again.wait()) or contents(folder / OUT) != expected:
+            return f"{kilobytes} KiB, then run again: status {status}: {again.said()}"
+    return None
 
 
 FAULTS = {
@@ -308,7 +364,16 @@ FAULTS = {
     "clock jumps": jumping_clock,
     "folder removed": removed_folder,
     "folder read-only": unwritable_folder,
+    "small /dev/shm": little_shared_memory,
 }
+
+
+def attempted(fault: str, folder: Path, name: str) -> tuple[str | None, str]:
+    """What is wrong, if anything, and what to say otherwise."""
+    try:
+        return FAULTS[fault](folder, name), "as it should be"
+    except Skipped as why:
+        return None, f"skipped: {why}"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -329,9 +394,9 @@ def main(arguments: list[str] | None = None) -> int:
             results[command] = {"seconds": round(seconds, 2), "kills": count, "wrong": wrong}
             print(f"{command:8} {seconds:5.1f} s  {count} kills, {len(wrong)} wrong", flush=True)
             for fault in args.faults:
-                found = FAULTS[fault](folder, command)
+                found, said = attempted(fault, folder, command)
                 results[command][fault] = found
-                print(f"{command:8} {fault}: {found or 'as it should be'}", flush=True)
+                print(f"{command:8} {fault}: {found or said}", flush=True)
     took = round(time.perf_counter() - start)
     print(f"{took} s")
     if args.json:

@@ -74,8 +74,8 @@ def draw(path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.6, 8.4), layout="constrained")
-    axes = figure.subplot_mosaic([["camera", "light"], ["tone", "tone"]], height_ratios=(1, 1.5))
-    by_camera, by_light, by_tone = axes["camera"], axes["light"], axes["tone"]
+    grid = figure.add_gridspec(2, 2, height_ratios=(1, 1.5))
+    by_camera, by_light, by_tone = (figure.add_subplot(part) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
     cameras = camera_points(published_cameras().xyz_to_camera)
     shares = torch.linspace(100.0, 0.0, len(cameras))
     for name in ("universal", "universal-small"):
@@ -100,9 +100,10 @@ def draw(path: Path) -> None:
         red, _, blue = (points / points[:, 1:2]).unbind(1)
         by_light.loglog(red, blue, style, markersize=4, alpha=0.6, label=label)
     by_light.set(ylim=(0.3, 7), xlabel="red gain over green", ylabel="blue gain over green")
-    for axis, ticks in ((by_light.xaxis, (0.5, 1, 2, 4)), (by_light.yaxis, (0.5, 1, 2, 4))):
-        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+    ticks = (0.5, 1, 2, 4)
+    for set_ticks in (by_light.set_xticks, by_light.set_yticks):
+        set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        set_ticks([], minor=True)
     tones = left_out_tones()
     by_tone.barh(range(len(tones)), list(tones.values()), color="0.6")
     by_tone.set_yticks(range(len(tones)), list(tones), fontsize=8)

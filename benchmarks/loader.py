@@ -6,9 +6,9 @@
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
 The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first. All are timed
 in turn, and the fastest run of each counts. ``--reading`` times PictureFolder alone: with decoders in a helper process
-of each worker (rawaug.io.apart), one by one and by batches, and without. ``--memory`` prints the resident memory of the
-process and its persistent workers after each epoch. Pictures are those of PICTURES, or the built-in ones written to a
-folder.
+of each worker (rawaug.io.apart), one by one and by batches, and without; on Linux also in processor seconds of all
+processes together. ``--memory`` prints the resident memory of the process and its persistent workers after each epoch.
+Pictures are those of PICTURES, or the built-in ones written to a folder.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ import json
 import multiprocessing
 import os
 import platform
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,24 +56,44 @@ class Crops(Dataset[Tensor]):
 
 
 class BatchesOfCrops(Crops):
-    """The same, with the pictures of a batch read at once."""
+    """The same, the next pictures of a batch decoded while one is cropped."""
 
     def __getitems__(self, indices: list[int]) -> list[Tensor]:
-        pictures = self.pictures.__getitems__(indices)
+        pictures = self.pictures.read_ahead(indices)
         return [self.cropped(picture, index) for picture, index in zip(pictures, indices, strict=True)]
 
 
-def fastest(runs: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
+def fastest(
+    runs: Mapping[str, Callable[[], object]],
+    repeats: int,
+    device: torch.device,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
     """The least seconds of each, timed in turn."""
     best = dict.fromkeys(runs, float("inf"))
     for _ in range(repeats):
         for name, run in runs.items():
-            start = time.perf_counter()
+            start = clock()
             run()
             if device.type == "cuda":
                 torch.cuda.synchronize(device)
-            best[name] = min(best[name], time.perf_counter() - start)
+            best[name] = min(best[name], clock() - start)
     return best
+
+
+def processor_seconds() -> float:
+    """Of this process and all that come from it and are still there (Linux)."""
+    parents, seconds = dict[int, int](), dict[int, float]()
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            fields = file.read_text(errors="replace").rpartition(")")[2].split()
+            pid = int(file.parent.name)
+            parents[pid], seconds[pid] = int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+    def ours(pid: int) -> bool:
+        return pid == os.getpid() or (pid in parents and ours(parents[pid]))
+
+    return sum(taken for pid, taken in seconds.items() if ours(pid))
 
 
 def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
@@ -91,7 +113,7 @@ def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
     return fastest(runs, args.repeats, args.device)
 
 
-def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, float]:
+def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Seconds of an epoch that decodes in the loader's workers, and of those whose workers have helpers for it."""
     runs: dict[str, Callable[[], object]] = {}
     kinds: tuple[tuple[str, str, type[Crops]], ...]
@@ -110,7 +132,10 @@ def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, float]:
 
         epoch()
         runs[name] = epoch
-    return fastest(runs, args.repeats, torch.device("cpu"))
+    clocks = {"reading": time.perf_counter}
+    if sys.platform == "linux":
+        clocks["reading, processors"] = processor_seconds
+    return {what: fastest(runs, args.repeats, torch.device("cpu"), clock) for what, clock in clocks.items()}
 
 
 def time_steps(args: argparse.Namespace) -> dict[str, float]:
@@ -165,7 +190,7 @@ def measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         growth = memory[-1] / memory[min(1, len(memory) - 1)] - 1
         print(f"  from epoch 2 to {len(memory)}: {growth:+.1%}")
         return {"memory_mib": memory, "growth": growth}
-    timed = {"reading": time_reading(folder, args)}
+    timed = time_reading(folder, args)
     if not args.reading:
         timed |= {"loader": time_loaders(folder, args), f"step of UNet({args.width})": time_steps(args)}
     for what, seconds in timed.items():

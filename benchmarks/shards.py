@@ -2,6 +2,7 @@
 
     python benchmarks/shards.py [--pictures 20000] [--size 64 64] [--workers 1 2 4] [--kills 2] [--json FILE]
     python benchmarks/shards.py --pictures 400 --size 375 500 --workers --kills 0     what MIR Flickr's size costs
+    python benchmarks/shards.py --no-costs                                           the bytes alone
 
 Pictures are crops of the built-in ones, as JPEG. ``rawaug synth --format webdataset`` runs once with each number of
 workers, and once more with two workers, killed at equal parts of the way and started again. The hash is of all names
@@ -107,15 +108,15 @@ def measure(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     pictures, shards = folder / "pictures", min(40, args.pictures)
     generate(pictures, args.pictures, *args.size)
     megapixels = args.pictures * args.size[0] * args.size[1] / 1e6
-    seconds, hashes = costs(pictures, folder / "alone"), dict[str, str]()
-    size = digest(folder / "alone")[1]
+    seconds = costs(pictures, folder / "alone") if args.costs else {}
+    hashes, size = dict[str, str](), digest(folder / "alone")[1]
     ways = [(f"{workers} workers", workers, 0) for workers in args.workers]
     ways += [(f"2 workers, killed {args.kills} times", 2, args.kills)] if args.kills else []
     for name, workers, kills in ways:
         run(pictures, folder / "out", workers, kills, shards)
-        hashes[name], _ = digest(folder / "out")
+        hashes[name], size = digest(folder / "out")
         shutil.rmtree(folder / "out")
-        print(f"  {name:28s} {hashes[name]}")
+        print(f"  {name:28s} {hashes[name]}", flush=True)
     speed = {name: megapixels / taken for name, taken in seconds.items()}
     return {
         "pictures": args.pictures,
@@ -134,6 +135,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, nargs=2, default=[64, 64], help="height and width")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4])
     parser.add_argument("--kills", type=int, default=2)
+    parser.add_argument("--no-costs", action="store_false", dest="costs", help="compare the bytes alone")
     parser.add_argument("--quick", action="store_true", help="40 pictures")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()

@@ -67,7 +67,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    metadata, tensors = read_tensors(path, "train or copy it again")
+    metadata, tensors = read_tensors(path, "give one written by rawaug run or denoisers.save, or copy it again")
     if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     config, info = (_parse(path, metadata, key) for key in ("config", "info"))

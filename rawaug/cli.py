@@ -59,6 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _dispatch(argv: list[str]) -> int:
     from rawaug.commands.arguments import call
     from rawaug.commands.listing import command, listed
+    from rawaug.commands.parser_errors import require_known_command
     from rawaug.commands.spelling import given_keys, require_known_options
     from rawaug.progress import quiet
 
@@ -70,6 +71,7 @@ def _dispatch(argv: list[str]) -> int:
         return 0
     argv, kind, recipe = _recipe_of(argv)
     names = [*OWN, *listed()]
+    require_known_command(argv, names)
     chosen = next((name for name in names if argv[: len(name.split())] == name.split()), None)
     if chosen in WHOLE_FRAMES:
         os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
@@ -81,7 +83,7 @@ def _dispatch(argv: list[str]) -> int:
         require_known_options(chosen, leaves[chosen], argv)
     if recipe is not None:
         _require_known_keys(recipe, kind, leaves["run"], helps=bool({"-h", "--help"} & set(argv)))
-    parsed = parser.parse_args(argv)
+    parsed = _parsed(parser, argv, chosen, leaves.get(str(chosen)))
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
     with quiet(values["quiet"]):
@@ -92,6 +94,18 @@ def _dispatch(argv: list[str]) -> int:
         else:
             call(command(str(chosen)), values)
     return 0
+
+
+def _parsed(parser: Any, argv: list[str], chosen: str | None, leaf: Any) -> Any:
+    """The arguments as the parser of the chosen command takes them; errors in plain words."""
+    from jsonargparse import ArgumentError
+
+    from rawaug.commands.parser_errors import in_plain_words
+
+    try:
+        return parser.parse_args(argv)
+    except ArgumentError as error:
+        raise ValueError(in_plain_words(_one_line(error), chosen, leaf)) from None
 
 
 def _recipe_of(argv: list[str]) -> tuple[list[str], str, Path | None]:
@@ -174,7 +188,7 @@ def _add_run_arguments(run: Any, kind: str) -> None:
 
 
 def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
-    from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.kinds import KINDS, quickly
     from rawaug.experiment.plan import with_own_pairs
     from rawaug.experiment.recipe import Recipe
 
@@ -184,7 +198,7 @@ def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
     recipe = experiment.settings(**settings)
     if isinstance(recipe, Recipe) and file:
         recipe = with_own_pairs(recipe, str(file[0]), given)
-    recipe = experiment.smoke(recipe) if quick else recipe
+    recipe = quickly(kind, recipe, given) if quick else recipe
     if dry:
         experiment.dry_run(recipe, overwrite)
     else:

@@ -207,7 +207,9 @@ def read_header(path: str | Path) -> dict[str, str]:
     Raises:
         ValueError: if it is not a safetensors file written by rawaug.
     """
-    header, _ = _opened(path, "fit or train it again", tensors=False)
+    header, _ = _opened(
+        path, "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again", tensors=False
+    )
     if header.get("format") != "rawaug" or "kind" not in header:
         raise ValueError(f"{path}: not a rawaug file; give one written by rawaug fit or rawaug run")
     return header

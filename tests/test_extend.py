@@ -44,11 +44,13 @@ gone = abroad:Missing
 RECIPE = """
 name: abroad
 camera: universal
-data: {pairs: null, validation: null, test: "demo:validation", test_count: 1}
+data: {pairs: null, pictures: "tiny:", validation: null, test: "tiny:validation", test_count: 1}
 denoiser: {name: Shallow, settings: {width: 4}}
 noise: {name: Banded, settings: {row_var: 1.0e-4}}
 train: {steps: 3, batch: 2, crop: 32, validate_every: 2, checkpoint_every: 2, loss: {name: charbonnier}}
 arms: {pictures: {augmented: 1.0}}
+classical: []
+untouched: []
 device: cpu
 """
 
@@ -81,7 +83,7 @@ def look_again(registries: list[Registry]) -> None:
         vars(kind).pop("_entry_points", None)
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("installed", "tiny")
 def test_a_recipe_trains_with_what_another_package_brings(
     tmp_path: Path, registries: list[Registry], monkeypatch: pytest.MonkeyPatch
 ) -> None:

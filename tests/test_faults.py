@@ -312,6 +312,21 @@ def test_64_descriptors_are_enough_for_two_workers() -> None:
     assert in_child(load) == 0
 
 
+def test_a_small_dev_shm_is_said_in_one_line(harness: Any) -> None:
+    """Batches of two workers that do not fit into a /dev/shm of 64 KiB, mounted for a child of this process alone."""
+    if in_child(lambda: harness.small_shared_memory(64)):
+        pytest.skip("needs the right to mount a file system")
+
+    def load() -> None:
+        harness.small_shared_memory(64)
+        loader = DataLoader([torch.rand(3, 100, 100) for _ in range(8)], batch_size=4, num_workers=2)  # type: ignore[arg-type]
+        with pytest.raises(RuntimeError) as error:
+            list(loader)
+        assert "shared memory is full" in str(shortage(error.value))
+
+    assert in_child(load) == 0
+
+
 def test_a_wall_clock_that_jumps_changes_nothing(
     inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Any
 ) -> None:

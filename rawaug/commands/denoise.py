@@ -68,7 +68,8 @@ def run(
         overwrite: replace existing results.
 
     Raises:
-        ValueError: if a file of a folder could not be denoised, after all others.
+        ValueError: if a file of a folder could not be denoised, after all others; if a folder's output is named as a
+            file, or a preview is asked of it.
     """
     method = frame_denoiser(denoiser, classical, self_ensemble, device)
     law = stored_noise(noise, DEFAULT if denoiser is None else denoiser)
@@ -78,6 +79,8 @@ def run(
         return
     if preview is not None:
         raise ValueError(f"--preview {preview}: is for one file, and {source} is a folder")
+    if Path(out).suffix.lower() == ".dng" and not Path(out).is_dir():
+        raise ValueError(f"{out}: {source} is a folder, and so is its output; give a name without .dng")
     result = denoise_folder(source, out, method, law, strength=strength, overwrite=overwrite)
     print_denoised(result)
     if result.broken:
@@ -228,6 +231,7 @@ def denoise_folder(
 
     Raises:
         FileNotFoundError: if there is no such file of weights.
+        OSError: if a result cannot be written, such as to a full disk; those that were are kept.
         ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
             of another denoiser or other settings.
     """
@@ -246,6 +250,8 @@ def denoise_folder(
         try:
             result.files.append(_denoise_file(file, target, made, noise, strength, partial(apart, read_raw)))
         except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
+                raise  # what cannot be written, such as to a full disk, is no fault of the file
             result.broken[str(file)] = str(error)
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")

@@ -47,7 +47,7 @@ def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[floa
         raise ValueError(f"{out}: an ISP is exported to {', '.join(WRITERS)}, or to a folder with all of them")
     files = [out] if out.suffix else [out / f"isp{suffix}" for suffix in WRITERS]
     if any(file.suffix == ".onnx" for file in files):
-        require_onnx()
+        require_onnx("; .json and .cube files can be written without, one by one")
     for file in files:
         WRITERS[file.suffix](isp, file, white_balance)
     return files

@@ -16,11 +16,11 @@ TOLERANCE = 1e-4
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
 
 
-def require_onnx() -> None:
-    """Raise ValueError if a package that writes or runs ONNX is missing."""
+def require_onnx(way_out: str = "") -> None:
+    """Raise ValueError if a package that writes or runs ONNX is missing; ``way_out`` ends the message."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        raise ValueError(f"export needs {', '.join(missing)}: pip install 'rawaug[export]'")
+        raise ValueError(f"export to ONNX needs {', '.join(missing)}: pip install 'rawaug[export]'{way_out}")
 
 
 def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path) -> None:

@@ -14,7 +14,7 @@ from rawaug._version import __version__
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture
 from rawaug.io.apart import apart
-from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.io.picture_files import MAX_PIXELS, decode_picture
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.drawing import Drawing, draw_key
 from rawaug.plugin.params import AugmentParams, RawPair
@@ -105,7 +105,7 @@ class PairMaker:
             OSError, ValueError: if it cannot be read, or changes meanwhile, here and not on iteration.
         """
         before, content = picture.stat(), sha256(picture)
-        srgb = even_sided(apart(read_picture, picture, self.max_pixels))
+        srgb = even_sided(apart(decode_picture, picture, self.max_pixels)).contiguous()
         after = picture.stat()
         if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
             raise ValueError(f"{picture}: changed while it was read; run the same command again")

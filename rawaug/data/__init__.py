@@ -84,8 +84,8 @@ def open_pairs(
         split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
-        max_pixels: of a JPEG beside a RAW file of a bare folder; None for
-            :data:`rawaug.io.picture_files.MAX_PIXELS`.
+        max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
+            for :data:`rawaug.io.picture_files.MAX_PIXELS`. Pairs given as a sequence keep theirs.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -109,6 +109,8 @@ def open_pairs(
     path, named = _path_and_split(path)
     chosen = checked_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
     pairs: Sequence[Pair] = reader(path, named or split, **chosen)
+    if max_pixels is not None and isinstance(pairs, LazyPairs):
+        pairs.max_pixels = max_pixels
     return pairs
 
 

@@ -9,6 +9,7 @@ from typing import overload
 
 from rawaug.data.pair import Pair
 from rawaug.io.apart import prepare
+from rawaug.io.picture_files import MAX_PIXELS
 
 
 class LazyPairs(Sequence[Pair], ABC):
@@ -16,7 +17,12 @@ class LazyPairs(Sequence[Pair], ABC):
 
     Args:
         names: of the pairs, known without reading any.
+
+    Attributes:
+        max_pixels: sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded.
     """
+
+    max_pixels: int = MAX_PIXELS
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)

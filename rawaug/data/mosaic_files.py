@@ -41,7 +41,7 @@ from rawaug.data.statements import KINDS, Statements, levels, shown
 from rawaug.extras import extra
 from rawaug.io import read_raw
 from rawaug.io.apart import apart
-from rawaug.io.picture_files import read_plane
+from rawaug.io.picture_files import MAX_PIXELS, read_plane
 from rawaug.io.tiff_tags import opened_tiff
 
 ARRAYS = (".npz", ".tif", ".tiff", ".png", ".mat")
@@ -72,13 +72,14 @@ class Mosaic(NamedTuple):
     iso: float | None = None
 
 
-def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) -> Mosaic:
+def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False, max_pixels: int = MAX_PIXELS) -> Mosaic:
     """Read a mosaic.
 
     Args:
         which: ``"noisy"`` or ``"clean"``.
         given: CFA and levels for files that do not state them.
         alone: the file holds both mosaics of its pair, each by its name.
+        max_pixels: a PNG with more is refused; other formats have limits of their own.
 
     Raises:
         FileNotFoundError, OSError: if it is missing or damaged.
@@ -90,7 +91,7 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False) 
     if suffix in TWO_IN_ONE:
         numbers, values = apart(_npz, file, which, alone) if suffix == ".npz" else _mat(file, which, alone)
     elif suffix == ".png":
-        numbers, values = _png(file), {}
+        numbers, values = _png(file, max_pixels), {}
     elif suffix in (".tif", ".tiff"):
         numbers, values = apart(_tiff, file)
     else:
@@ -139,8 +140,8 @@ def _mat(file: Path, which: str, alone: bool) -> tuple[np.ndarray, dict[str, Any
     return read_array(file, _name_of(file, names, which, alone)), values
 
 
-def _png(file: Path) -> np.ndarray:
-    numbers = apart(read_plane, file)
+def _png(file: Path, max_pixels: int) -> np.ndarray:
+    numbers = apart(read_plane, file, max_pixels)
     if numbers.dtype != np.uint16:
         raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
     return numbers

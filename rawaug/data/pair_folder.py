@@ -118,7 +118,8 @@ class PairFolder(LazyPairs):
         name, *files = self.pairs[index]
         alone = files[0] == files[1]
         noisy, clean = (
-            read_mosaic(file, which, self.given, alone) for file, which in zip(files, ("noisy", "clean"), strict=True)
+            read_mosaic(file, which, self.given, alone, self.max_pixels)
+            for file, which in zip(files, ("noisy", "clean"), strict=True)
         )
         for what, one, other in (
             ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),
@@ -163,7 +164,8 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
         if found and as_clean:
             raise ValueError(
-                f"{file}: is noisy by its name and would be taken for a clean frame; rename it if it is one"
+                f"{file}: is noisy by its name and would be taken for a clean frame; "
+                f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"
             )
 
 
@@ -214,7 +216,9 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
         )
         partner = index.get(wanted.casefold())
         if partner is None:
-            raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or give its pattern")
+            raise FileNotFoundError(
+                f"{file}: has no clean frame {top / wanted}; add it, or set clean, the pattern of clean files"
+            )
         if partner == file:
             raise ValueError(f"{file}: would be its own clean frame by the pattern {clean}")
         found.append(PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, partner))

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 
 from rawaug.io.apart import apart, apart_each, prepare
-from rawaug.io.picture_files import MAX_PIXELS, read_picture
+from rawaug.io.picture_files import MAX_PIXELS, decode_picture
 from rawaug.printable import printable
 
 EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
@@ -75,22 +75,27 @@ class PictureFolder(Dataset[Tensor]):
         return len(self.names)
 
     def __getitem__(self, index: int) -> Tensor:
-        return self._picture(range(len(self))[index], {})
+        return self._picture(range(len(self))[index])
 
     def __getitems__(self, indices: Sequence[int]) -> list[Tensor]:
-        """Those of a batch, as a DataLoader asks for them: read by many in one message, which is cheaper."""
-        wanted = [range(len(self))[index] for index in indices]
-        todo = [index for index in dict.fromkeys(wanted) if not self._bad[index]]
-        files = [self.path / self.names[index] for index in todo]
-        known = dict(zip(todo, apart_each(read_picture, files, self.max_pixels), strict=True))
-        return [self._picture(index, known) for index in wanted]
+        """Those of a batch, as a DataLoader asks for them."""
+        return list(self.read_ahead(indices))
 
-    def _picture(self, first: int, known: dict[int, Tensor | Exception]) -> Tensor:
-        """The picture of a file, or of the next that can be used; ``known`` are files that have been read."""
+    def read_ahead(self, indices: Sequence[int]) -> Iterator[Tensor]:
+        """The pictures in this order, the next ones decoded while the caller works on one."""
+        wanted = [range(len(self))[index] for index in indices]
+        usable = [not self._bad[index] for index in wanted]
+        files = [self.path / self.names[index] for index, use in zip(wanted, usable, strict=True) if use]
+        found = apart_each(decode_picture, files, self.max_pixels)
+        for index, use in zip(wanted, usable, strict=True):
+            yield self._picture(index, next(found) if use else None)
+
+    def _picture(self, first: int, known: Tensor | Exception | None = None) -> Tensor:
+        """The picture of a file, or of the next that can be used; ``known`` is what came of reading the first."""
         for candidate in chain(range(first, len(self)), range(first)):
             if self._bad[candidate]:
                 continue
-            picture = self._judged(candidate, known.pop(candidate, None))
+            picture = self._judged(candidate, known if candidate == first else None)
             if picture is not None:
                 self._count()
                 return picture
@@ -102,14 +107,14 @@ class PictureFolder(Dataset[Tensor]):
         Raises:
             FileNotFoundError, OSError, ValueError: if it cannot be used.
         """
-        return self._required(index, apart(read_picture, self.path / self.names[index], self.max_pixels))
+        return self._required(index, apart(decode_picture, self.path / self.names[index], self.max_pixels))
 
     def _required(self, index: int, picture: Tensor) -> Tensor:
         file = self.path / self.names[index]
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"
             raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
-        return picture
+        return picture.contiguous()
 
     @property
     def skipped(self) -> dict[Path, str]:

@@ -87,7 +87,7 @@ class Rawir(LazyPairs):
         file, picture = self.files[index], self.pictures[index]
         return Pair(
             name=self.names[index],
-            srgb=apart(read_picture, picture),
+            srgb=apart(read_picture, picture, self.max_pixels),
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             camera=self.camera_of(file),

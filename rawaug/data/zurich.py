@@ -68,7 +68,7 @@ class Zurich(LazyPairs):
 
     def read(self, index: int) -> Pair:
         file = self.files[index]
-        numbers = apart(read_plane, file)
+        numbers = apart(read_plane, file, self.max_pixels)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(
@@ -77,7 +77,7 @@ class Zurich(LazyPairs):
         light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
         return Pair(
             name=self.names[index],
-            srgb=apart(read_picture, self.folder / "canon" / f"{file.stem}.jpg"),
+            srgb=apart(read_picture, self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
             raw=torch.from_numpy(np.minimum(light, 1))[None],
             cfa=CFA.RGGB,
             white_balance=(1.0, 1.0, 1.0),

@@ -174,15 +174,15 @@ def require_classical(specs: Sequence[Spec]) -> None:
             raise ValueError(f"classical: {name_and_settings(spec)[0]}: {reason}")
 
 
-def installed_classical(specs: Sequence[Spec]) -> list[Spec]:
-    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed.
+def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
+    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if ``shown``.
 
     Raises:
         ValueError: as :func:`require_classical`, for the others.
     """
     bm3d = {"BM3D": FILTERS["BM3D"].missing()}
     kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
-    if len(kept) < len(specs):
+    if shown and len(kept) < len(specs):
         print(f"classical: BM3D is left out: {bm3d['BM3D']}")
     require_classical(kept)
     return kept

@@ -103,7 +103,7 @@ def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
     with reading_within(recipe.data.read_seconds):
         prepared = _Run(recipe, overwrite)
         print("\n".join(prepared.plan.lines(recipe)))
-        rehearse(recipe, prepared.plan)
+        rehearse(recipe, prepared.plan, prepared.classical)
     print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
 
 
@@ -117,7 +117,7 @@ class _Run:
         require_runnable(recipe, overwrite)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
         self.folder = run_folder(recipe)
-        self.classical = installed_classical(recipe.classical)
+        self.classical = installed_classical(recipe.classical, shown=_leads())
         if recipe.noise != "camera":
             noise_model(recipe.noise)
         for arm in recipe.arms:
@@ -182,7 +182,8 @@ class _Run:
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
-                print(f"already fitted: {path}")
+                if _leads():
+                    print(f"already fitted: {path}")
                 return isp
         isp = fit(self.pairs, noise="on" if measure else "off", **settings)
         isp.info["key"] = key

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
+import torch
+
 from rawaug.devices import find_device
 from rawaug.evaluation.scores import require_classical
 from rawaug.experiment.recipe import Recipe
@@ -34,6 +36,8 @@ def require_runnable(recipe: Recipe, overwrite: bool = False) -> None:
             raise MissingExtra(f"{name} is not installed; run: pip install 'rawaug[train]'")
     require_training_device(recipe.device, recipe.devices)
     require_precision(recipe.train.precision)
+    if recipe.train.compile:
+        require_compiler(find_device(recipe.device))
     require_classical([spec for spec in recipe.classical if name_and_settings(spec)[0] != "BM3D"])
     require_free(recipe, overwrite)
 
@@ -51,6 +55,21 @@ def require_training_device(device: str, devices: int = 1) -> None:
             f"device {device!r}: training takes a kind of device, as cuda; choose which by CUDA_VISIBLE_DEVICES"
         )
     find_device(device, count=devices)
+
+
+def require_compiler(device: torch.device) -> None:
+    """Check that ``torch.compile`` works on a device, by a function of one operation.
+
+    Raises:
+        ValueError: if it does not, for want of a C++ compiler above all.
+    """
+    try:
+        torch.compile(torch.neg)(torch.zeros(8, device=device))
+    except RuntimeError as error:
+        raise ValueError(
+            f"train.compile: PyTorch cannot compile here ({str(error).splitlines()[0]}); install a C++ compiler, or "
+            "train without train.compile"
+        ) from None
 
 
 def require_precision(precision: str) -> None:

@@ -37,6 +37,9 @@ class Kind(NamedTuple):
     dry_run: Callable[[Any, bool], None]
 
 
+_DATA = ("data", "test", "pictures")
+"""Keys of data, and what those below begin with."""
+
 KINDS = {
     "training": Kind(Recipe, run, smoke, dry_run),
     "reconstruction": Kind(Comparison, compare, smoke_comparison, rehearse_comparison),
@@ -44,6 +47,36 @@ KINDS = {
     "learned": Kind(LearnedParts, weigh_parts, smoke_learned, rehearse_learned),
     "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep, rehearse_sweep),
 }
+
+
+def quickly(kind: str, settings: Any, given: set[str]) -> Any:
+    """Settings in a form of seconds, on built-in data; of what was given, that which they replace is printed.
+
+    Args:
+        kind: of the experiment.
+        settings: its settings.
+        given: keys that were set on the command line.
+
+    Raises:
+        ValueError: if one of them names data.
+    """
+    quick = KINDS[kind].smoke(settings)
+    replaced = {key: _value(quick, key) for key in sorted(given) if _value(settings, key) != _value(quick, key)}
+    for key in replaced:
+        if key.partition(".")[0] in _DATA and isinstance(_value(settings, key), (str, list)):
+            option = f"--{key.replace('_', '-')}"
+            raise ValueError(f"{option}: --smoke runs on built-in data; rehearse a run on your own with --dry-run")
+    replaced.pop("name", None)
+    if replaced:
+        print(f"--smoke sets {', '.join(f'{key} to {value}' for key, value in replaced.items())}")
+    return quick
+
+
+def _value(settings: Any, key: str) -> Any:
+    """Of a dotted key; None where there is no such key."""
+    for name in key.split("."):
+        settings = settings.get(name) if isinstance(settings, dict) else getattr(settings, name, None)
+    return settings
 
 
 def kind_of(recipe: str | Path) -> str:

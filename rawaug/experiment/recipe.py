@@ -13,7 +13,7 @@ from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, require_between
+from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
 from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 HELD_OUT = "auto"
@@ -34,7 +34,7 @@ class DataConfig(PairSettings):
         pictures: the sRGB pictures to augment with: a folder, ``demo:``, ``shapes:COUNT``, a list of these, or
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
-        max_pixels: larger pictures, and JPEGs beside RAW files of a folder, are refused; null for 2^26.
+        max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
         read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
@@ -314,4 +314,5 @@ def find_recipe(name: str) -> Path:
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]
-    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe ({', '.join(known)})")
+    shipped = f"{', '.join(known)}{nearest(wanted, known)}"
+    raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe: {shipped}")

@@ -18,7 +18,7 @@ from denoisers.network import Denoiser
 from rawaug.commands.fit import fit
 from rawaug.data.pair import Pair
 from rawaug.data.readable import each_readable
-from rawaug.evaluation.scores import classical_method, installed_classical, network_method, score_method
+from rawaug.evaluation.scores import classical_method, network_method, score_method
 from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
 from rawaug.experiment.recipe import Recipe
@@ -27,7 +27,7 @@ from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import noise_for
-from rawaug.registry import LOSSES
+from rawaug.registry import LOSSES, Spec
 from rawaug.training.criteria import weighed
 from rawaug.training.noisy_frames import noisy_only
 from rawaug.training.start import first_network, start_of
@@ -39,8 +39,8 @@ SIDE = 256
 """Of the middle of a frame that is fitted, validated or scored."""
 
 
-def rehearse(recipe: Recipe, plan: Plan) -> None:
-    """Try a run, and print what was read of its frames.
+def rehearse(recipe: Recipe, plan: Plan, classical: Sequence[Spec]) -> None:
+    """Try a run with its installed classical denoisers, and print what was read of its frames.
 
     Raises:
         OSError, ValueError: for the first thing that would fail.
@@ -69,7 +69,7 @@ def rehearse(recipe: Recipe, plan: Plan) -> None:
         watched = validation_samples(recipe, [pair.middle(SIDE) for pair in validation[:1]], plan.pictures, own, noise)
         validate(net, watched[:1], torch.device("cpu"))
         _score(network_method(net.eval(), isp.cfa, own.cfa), test, noise, isp)
-    for spec in installed_classical(recipe.classical):
+    for spec in classical:
         _score(classical_method(spec, noise, seed=0), test, noise, isp)
     print(f"tried: every arm for one step; frames read: {', '.join(read)}")
 

@@ -4,8 +4,8 @@ LibRaw, OpenImageIO, SciPy and HDF5 are C and C++ code that reads what strangers
 a helper that this process keeps; pixels come back through shared memory. If the helper dies, or takes more than
 ``RAWAUG_READ_SECONDS`` (60 by default; 0 reads in this process), the file is named in an OSError and the next file gets
 a new helper. On a busy machine, where it did not get to use a processor for that long, it has ten times as many. Each
-thread of each DataLoader worker has its own. :func:`apart_each` reads small files by many in one message, which takes
-most of the cost away.
+thread of each DataLoader worker has its own. :func:`apart_each` reads many: the helper decodes the next files while
+this process works on one, and small files share a message.
 
 Helpers are forked from one clean process (:mod:`rawaug.io.reading_process`), which imports the libraries once: to
 start one takes milliseconds, and no thread of a decoder has to survive a fork. Needs Unix sockets; elsewhere, files are
@@ -16,38 +16,34 @@ from __future__ import annotations
 
 import atexit
 import json
-import math
-import mmap
 import os
-import pickle
-import select
 import shutil
-import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import warnings
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
+from rawaug.io.helper import LIMIT, Helper, Lost
+from rawaug.io.reading_process import MEMORIES
 
 T = TypeVar("T")
 
 SECONDS = 60.0
-PATIENCE = 10
-"""Times the limit that a file may take where the helper has not used the limit of a processor: on a busy machine."""
-START_SECONDS = 300.0
-"""For the first helper, which waits until the libraries are imported."""
-
-_ADDRESS, _LIMIT = "RAWAUG_READERS", "RAWAUG_READ_SECONDS"
+_ADDRESS = "RAWAUG_READERS"
 _SERVE = "import sys, json; sys.path[:] = json.loads(sys.argv[1]); from rawaug.io.reading_process import serve; serve()"
+_KEEP_MEMORY = {
+    "MALLOC_MMAP_THRESHOLD_": f"{2**25}",  # the most that glibc takes
+    "MALLOC_TRIM_THRESHOLD_": f"{2**28}",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
+"""glibc keeps what a decoder frees for the next picture, and takes the rest in huge pages. Otherwise all pages of every
+picture are mapped anew, which takes a quarter of the time of decoding it."""
 
 
 def apart(read: Callable[..., T], *arguments: Any) -> T:
@@ -66,82 +62,98 @@ def apart(read: Callable[..., T], *arguments: Any) -> T:
         4
     """
     seconds = time_limit()
-    helper = _helper() if seconds else None
-    if helper is None:
-        return read(*arguments)
-    try:
-        ((known, value),) = _called(helper, read, [arguments], seconds)
-    except _Lost as lost:
-        raise OSError(f"{arguments[0]}: {lost}") from None
+    with _borrowed(seconds > 0) as helper:
+        if helper is None:
+            return read(*arguments)
+        try:
+            helper.ask(read, [arguments])
+            ((known, value),) = helper.answer(seconds)
+        except Lost as lost:
+            raise OSError(f"{arguments[0]}: {lost}") from None
     if not known:
         raise value
     return value
 
 
-def apart_each(read: Callable[..., T], files: Sequence[Any], *rest: Any) -> list[T | Exception]:
-    """``read(file, *rest)`` of each file in a helper process, many by one message; an error stands in place of a value.
+def apart_each(read: Callable[..., T], files: Sequence[Any], *rest: Any) -> Iterator[T | Exception]:
+    """``read(file, *rest)`` of each file in order, by a helper that works ahead; an error stands in place of a value.
 
     Args:
         read: a function of a module, found there by its name.
         files, rest: that can be pickled.
 
     Example:
-        >>> apart_each(len, ["four", "three", 2])[:2]
+        >>> list(apart_each(len, ["four", "three", 2]))[:2]
         [4, 5]
     """
-    done: list[T | Exception] = []
-    while len(done) < len(files):
+    calls, done = [(file, *rest) for file in files], 0
+    while done < len(calls):
         seconds = time_limit()
-        helper = _helper() if seconds and len(files) - len(done) > 1 else None
-        if helper is None:
-            done.append(_alone(read, files[len(done)], rest))
-            continue
-        try:
-            asked = [(file, *rest) for file in files[len(done) :]]
-            done += [value for _, value in _called(helper, read, asked, seconds)]
-        except _Lost:  # by one of them, which is found by reading them one by one
-            done += [_alone(read, file, rest) for file in files[len(done) :]]
-    return done
+        suspects = 1
+        with _borrowed(seconds > 0 and len(calls) - done > 1) as helper:
+            if helper is not None:
+                try:
+                    for _, value in _answers(helper, read, calls[done:], seconds):
+                        done += 1
+                        yield value
+                    return
+                except Lost:
+                    suspects = helper.expected
+        for call in calls[done : done + suspects]:  # one of them is found by reading them one by one
+            done += 1
+            yield _alone(read, call)
 
 
-def _alone(read: Callable[..., T], file: Any, rest: Sequence[Any]) -> T | Exception:
+def _answers(
+    helper: Helper, read: Callable[..., Any], calls: Sequence[Any], seconds: float
+) -> Iterator[tuple[bool, Any]]:
+    """What ``read`` made of each, in order; the helper always has what to do next.
+
+    Raises:
+        Lost: if the helper dies or hangs, by one of the next ``helper.expected`` calls.
+    """
+    sent = 0
+    while sent < len(calls) or helper.expected:
+        while len(helper.waited) < MEMORIES and (sent < len(calls) or helper.expected > len(helper.waited)):
+            few = calls[sent : sent + helper.few]
+            helper.ask(read, few)
+            sent += len(few)
+        yield from helper.answer(seconds)
+    while helper.waited:  # for nothing, as the answers before had room for all
+        helper.answer(seconds)
+
+
+def _alone(read: Callable[..., T], call: Sequence[Any]) -> T | Exception:
     try:
-        return apart(read, file, *rest)
+        return apart(read, *call)
     except Exception as error:
         return error
 
 
-def _called(helper: _Helper, read: Callable[..., Any], calls: Sequence[Any], seconds: float) -> list[tuple[bool, Any]]:
-    """What ``read`` made of the first of these arguments, at least of one; a helper that is lost is forgotten."""
+@contextmanager
+def _borrowed(wanted: bool) -> Iterator[Helper | None]:
+    """A helper of this thread, which keeps one; None if none is wanted or, with a warning, the system lacks room."""
+    helper = _idle_or_new() if wanted else None
     try:
-        return helper.call((_folder(), read, calls), seconds)
-    except _Lost:
-        _of_this_thread.helper = None
-        raise
-    except BaseException:  # such as KeyboardInterrupt, which leaves an answer behind
-        _of_this_thread.helper = None
-        helper.kill()
-        raise
+        yield helper
+    finally:
+        if helper is not None:
+            if helper.idle and getattr(_of_this_thread, "helper", None) is None:
+                _of_this_thread.helper = helper
+            else:  # such as after a KeyboardInterrupt, which leaves an answer behind
+                helper.let_go()
 
 
-def _folder() -> str | None:
-    """The working folder, in which the helper finds a relative path; None if it has been removed."""
-    try:
-        return str(Path.cwd())
-    except FileNotFoundError:
-        return None
-
-
-def _helper() -> _Helper | None:
-    """The helper of this thread; none, with a warning, where the system has no room for one."""
+def _idle_or_new() -> Helper | None:
     global _unavailable
-    found: _Helper | None = getattr(_of_this_thread, "helper", None)
-    if found is None and not _unavailable:
+    found: Helper | None = getattr(_of_this_thread, "helper", None)
+    _of_this_thread.helper = None
+    if (found is None or not found.idle) and not _unavailable:
         try:
-            found = _of_this_thread.helper = _Helper(_connected())
+            found = Helper(_connected())
         except (OSError, RuntimeError) as error:
             _unavailable = True
-            warnings.warn(f"files are read in this process, so a damaged one may crash it: {error}", stacklevel=4)
+            warnings.warn(f"files are read in this process, so a damaged one may crash it: {error}", stacklevel=5)
     return found
 
 
@@ -151,13 +163,13 @@ def time_limit() -> float:
     Raises:
         ValueError: if ``RAWAUG_READ_SECONDS`` is no number of seconds.
     """
-    text = os.environ.get(_LIMIT, str(SECONDS))
+    text = os.environ.get(LIMIT, str(SECONDS))
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
     if not 0 <= seconds < float("inf"):
-        raise ValueError(f"{_LIMIT}={text}: must be a number of seconds, or 0 to read in the same process")
+        raise ValueError(f"{LIMIT}={text}: must be a number of seconds, or 0 to read in the same process")
     return seconds if hasattr(os, "fork") and hasattr(socket, "AF_UNIX") else 0.0
 
 
@@ -170,15 +182,15 @@ def reading_within(seconds: float | None) -> Iterator[None]:
         ...     time_limit()
         5.0
     """
-    before = os.environ.get(_LIMIT)
+    before = os.environ.get(LIMIT)
     if seconds is not None:
-        os.environ[_LIMIT] = str(seconds)
+        os.environ[LIMIT] = str(seconds)
     try:
         yield
     finally:
         if seconds is not None:
-            os.environ.pop(_LIMIT)
-            os.environ.update({} if before is None else {_LIMIT: before})
+            os.environ.pop(LIMIT)
+            os.environ.update({} if before is None else {LIMIT: before})
 
 
 def prepare() -> None:
@@ -186,97 +198,6 @@ def prepare() -> None:
     if time_limit() and _address() is None:
         with suppress(OSError):  # whoever reads will say so
             _start()
-
-
-class _Lost(Exception):
-    """The helper died or hung; the text says which."""
-
-
-class _Helper:
-    """A helper process: a connection, the memory that it shares, and the processor's seconds at its last answer."""
-
-    def __init__(self, link: socket.socket) -> None:
-        link.settimeout(START_SECONDS)
-        try:
-            message, (descriptor,), *_ = socket.recv_fds(link, 64, 1)
-        except (OSError, ValueError):
-            link.close()
-            raise RuntimeError("the process that helpers come from did not start") from None
-        link.settimeout(None)
-        self.pid, self.memory = int(message), descriptor
-        self.view: mmap.mmap | None = None
-        self.busy = 0.0
-        self.connection = Connection(link.detach())
-        self.answered = select.poll()
-        self.answered.register(self.connection.fileno(), select.POLLIN)
-        self.let_go = weakref.finalize(self, _close, self.connection, descriptor)
-
-    def call(self, request: Any, seconds: float) -> list[tuple[bool, Any]]:
-        """Of each of the first calls, whether there is a value, and the value or the error.
-
-        Raises:
-            _Lost: if the helper dies or takes longer.
-        """
-        try:
-            self.connection.send_bytes(pickle.dumps(request))
-            if not self._answers(seconds):
-                self.kill()
-                raise _Lost(f"cannot be read within {seconds:g} s ({_LIMIT}); leave it out, or copy it again")
-            busy, answers, sizes = pickle.loads(self.connection.recv_bytes())
-        except (EOFError, ConnectionError):
-            busy, answers, sizes = None, 0, ()
-        if busy is None:
-            self.let_go()
-            raise _Lost(f"crashes the decoder ({_ending(answers)}); leave it out, or copy it again")
-        self.busy, copies = busy, iter(self._copied(sizes))
-        return [pickle.loads(answer, buffers=copies) for answer in answers]
-
-    def _answers(self, seconds: float) -> bool:
-        """Whether an answer comes; a helper that other programs keep from running gets more time."""
-        for _ in range(PATIENCE):
-            if self.answered.poll(1e3 * seconds):
-                return True
-            if not _processor_seconds(self.pid) < self.busy + seconds:
-                return False
-        return False
-
-    def _copied(self, sizes: tuple[int, ...]) -> list[np.ndarray]:
-        """The buffers in shared memory, which the next answer overwrites."""
-        total, place, buffers = sum(sizes), 0, []
-        if total and (self.view is None or len(self.view) < total):
-            self.view = mmap.mmap(self.memory, os.fstat(self.memory).st_size)
-        for size in sizes:
-            assert self.view is not None
-            buffers.append(np.frombuffer(self.view, np.uint8, size, place).copy())
-            place += size
-        return buffers
-
-    def kill(self) -> None:
-        """End the process, whatever it does."""
-        with suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
-        self.let_go()
-
-
-def _processor_seconds(process: int) -> float:
-    """What a process has used of the processors; infinite where the system does not say."""
-    try:
-        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    except (OSError, IndexError, ValueError):
-        return math.inf
-
-
-def _close(connection: Connection, descriptor: int) -> None:
-    """Let go of a helper, which then ends by itself."""
-    connection.close()
-    os.close(descriptor)
-
-
-def _ending(status: int) -> str:
-    if os.WIFSIGNALED(status):
-        return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
-    return f"exited with status {os.waitstatus_to_exitcode(status)}"
 
 
 # -- the process that helpers come from -------------------------------------------------------------------------------
@@ -322,7 +243,7 @@ def _start() -> str:
                 stdout=2,
                 pass_fds=[number],
                 start_new_session=True,  # an interrupt is for this process
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+                env=_KEEP_MEMORY | os.environ | {"OPENBLAS_NUM_THREADS": "1"},
             )
         os.environ[_ADDRESS] = address
         atexit.register(_stop, process, folder, os.getpid())

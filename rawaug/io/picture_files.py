@@ -71,9 +71,14 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
+    return decode_picture(path, max_pixels).contiguous()
+
+
+def decode_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
+    """:func:`read_picture` in the strides of the decoder, for :mod:`rawaug.io.apart`, which copies it anyway."""
     with _text_damage_as_os_error(Path(path)):
         pixels, orientation = _read(Path(path), max_pixels)
-    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
+    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation))
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

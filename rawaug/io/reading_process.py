@@ -7,7 +7,6 @@ To every connection it forks a helper, whose end it reports; it ends with the pr
 from __future__ import annotations
 
 import gc
-import mmap
 import os
 import pickle
 import select
@@ -15,21 +14,25 @@ import shutil
 import signal
 import socket
 import sys
-import tempfile
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib import import_module
-from io import BytesIO
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+
+from rawaug.io.shared_arrays import SharedMemory, pickled
 
 _LIBRARIES = ("h5py", "OpenImageIO", "PIL.Image", "PIL.ImageCms", "rawpy", "scipy.io", "tifffile")
 FULL = 2**24
 """Bytes of values, of pixels above all, beyond which an answer takes no more calls."""
+MEMORIES = 2
+"""That a helper shares with the process that it helps: one is written while the other is read."""
+_Call = tuple["str | None", Callable[..., Any], tuple[Any, ...]]
 _CLOSED = select.POLLHUP | select.POLLERR | getattr(select, "POLLRDHUP", 0)
 
 
@@ -110,52 +113,31 @@ def _help(others: list[socket.socket], link: socket.socket, pipe: tuple[int, int
         other.close()
     status = 1
     try:
-        memory = _Memory()
-        socket.send_fds(link, [str(os.getpid()).encode()], [memory.file])
+        memories = [SharedMemory() for _ in range(MEMORIES)]
+        socket.send_fds(link, [str(os.getpid()).encode()], [memory.file for memory in memories])
         with Connection(link.detach()) as connection, suppress(EOFError, ConnectionError):
+            todo = deque[_Call]()
             while True:
-                _answer(connection, memory)
+                _answer(connection, memories, todo)
         status = 0
     finally:
         os._exit(status)
 
 
-class _Memory:
-    """A file without a name, mapped: what the helper puts there, the process that it helps sees."""
-
-    def __init__(self) -> None:
-        if hasattr(os, "memfd_create"):
-            self.file = os.memfd_create("rawaug")
-        else:
-            with tempfile.TemporaryFile() as file:
-                self.file = os.dup(file.fileno())
-        self.view: mmap.mmap | None = None
-
-    def put(self, buffers: list[memoryview]) -> None:
-        """One after the other, from the beginning; the file grows to hold them."""
-        total, place = sum(map(len, buffers)), 0
-        if total and (self.view is None or len(self.view) < total):
-            self.view = None  # a mapping cannot grow
-            os.ftruncate(self.file, total)
-            self.view = mmap.mmap(self.file, total)
-        for buffer in buffers:
-            assert self.view is not None
-            self.view[place : place + len(buffer)] = buffer
-            place += len(buffer)
-
-
-def _answer(connection: Connection, memory: _Memory) -> None:
+def _answer(connection: Connection, memories: list[SharedMemory], todo: deque[_Call]) -> None:
     """The processor's seconds so far, and what came of the first calls: of one, or as many as FULL holds."""
-    folder, read, calls = pickle.loads(connection.recv_bytes())
-    answers, buffers = list[bytes](), list[memoryview]()
-    for arguments in calls:
-        content, more = _pickled(_attempt(folder, read, arguments))
-        answers.append(content)
-        buffers += more
-        if sum(map(len, buffers)) >= FULL:
-            break
-    memory.put(buffers)
-    connection.send_bytes(pickle.dumps((time.process_time(), answers, tuple(map(len, buffers)))))
+    which, folder, read, calls = pickle.loads(connection.recv_bytes())
+    todo.extend((folder, read, arguments) for arguments in calls)
+    answers, arrays = list[bytes](), list[np.ndarray]()
+    while todo and sum(array.nbytes for array in arrays) < FULL:
+        answer = _attempt(*todo.popleft())
+        try:
+            answers.append(pickled(answer, arrays))
+        except (pickle.PicklingError, TypeError, AttributeError):  # an exception of an extension
+            _, value = answer
+            answers.append(pickle.dumps((False, RuntimeError(f"{type(value).__name__}: {value}"))))
+    kinds = memories[which].put(arrays)
+    connection.send_bytes(pickle.dumps((time.process_time(), answers, kinds)))
 
 
 def _attempt(folder: str | None, read: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
@@ -166,23 +148,3 @@ def _attempt(folder: str | None, read: Callable[..., Any], arguments: tuple[Any,
         return True, read(*arguments)
     except Exception as error:
         return False, error
-
-
-def _pickled(answer: tuple[bool, Any]) -> tuple[bytes, list[memoryview]]:
-    """An answer, with the content of its arrays apart."""
-    file, buffers = BytesIO(), list[memoryview]()
-    try:
-        _Pickler(file, protocol=5, buffer_callback=lambda buffer: buffers.append(buffer.raw())).dump(answer)
-    except (pickle.PicklingError, TypeError, AttributeError):  # an exception of an extension
-        _, value = answer
-        return pickle.dumps((False, RuntimeError(f"{type(value).__name__}: {value}"))), []
-    return file.getvalue(), buffers
-
-
-class _Pickler(pickle.Pickler):
-    """Tensors as the arrays whose memory they share."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, Tensor) and type(value) is Tensor and value.layout == torch.strided:
-            return torch.from_numpy, (value.contiguous().numpy(),)
-        return NotImplemented

@@ -16,14 +16,15 @@ from rawaug.cli import main
 from rawaug.data import demo_pictures
 from rawaug.io import write_picture
 
-QUICK_FIT = ["--steps", "4", "--pixels", "512", "--batch", "128"]
+QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
 TINY = [
     "--data.pairs", "tiny:train", "--data.validation", "tiny:validation", "--data.test", "tiny:test",
     "--data.pictures", "tiny:",
 ]  # fmt: skip
 QUICK_RUN = [
     *TINY, "--train.steps", "4", "--train.validate-every", "2", "--train.batch", "2", "--train.crop", "32",
-    "--isp.steps", "2", "--isp.pixels", "512", "--denoiser.settings", '{"width": 4, "scales": 2}',
+    "--isp.steps", "2", "--isp.pixels", "512", "--isp.curve-steps", "10", "--isp.prior-steps", "10",
+    "--denoiser.settings", '{"width": 4, "scales": 2}',
     "--classical", "[]", "--untouched", "[]",
 ]  # fmt: skip
 
@@ -50,7 +51,7 @@ def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "picture.png"
-    write_picture(picture, demo_pictures(3)[2])
+    write_picture(picture, demo_pictures(3)[2][:, 64:160, 64:192])
     command = ["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2", "--cfa", "XTRANS"]
     assert main(command) == 0
     for name in ("stages.png", "stages-atoms.png"):
@@ -111,8 +112,23 @@ def test_options_are_spelt_one_way_and_in_full(capsys: pytest.CaptureFixture[str
     assert "(nearest: --train.learning-rate)" in refused(capsys, "run", "fewshot", "--train.learning", "1")
     assert "(nearest: --train.steps)" in refused(capsys, "run", "fewshot", "--train.stepz=3")
     assert "(nearest: --first); see rawaug data check" in refused(capsys, "data", "check", "x", "--frist", "2")
-    assert refused(capsys, *fit, "--pixels", "many") == "rawaug: pixels: Expected a int. Got value: many"
+    assert refused(capsys, *fit, "--pixels", "many") == "rawaug: pixels must be a whole number, got many"
+    count = refused(capsys, "run", "fewshot", "--data.count", "few")
+    assert count == "rawaug: data.count must be a whole number or null, got few"
+    tone = refused(capsys, *fit, "--tone", "curves")
+    assert tone == "rawaug: tone must be one of auto, learned, curve, got curves (nearest: curve)"
     assert "augmented must be between" in refused(capsys, "run", "fewshot", "--arms.real.augmented", "7")
+
+
+def test_a_command_that_is_misspelt_or_incomplete_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refused(capsys, "denoize", "a.dng") == (
+        "rawaug: denoize: no such command (nearest: denoise); see rawaug --help"
+    )
+    assert refused(capsys, "data", "chek") == "rawaug: data chek: no such command; use rawaug data check"
+    assert "(nearest: fewshot)" in refused(capsys, "run", "fewshoot")
+    assert refused(capsys, "fit", "demo:train") == "rawaug: --out must be given; see rawaug fit --help"
+    assert refused(capsys, "denoise", "a.dng") == "rawaug: out must be given; see rawaug denoise --help"
+    assert refused(capsys, "denoise", "a", "b", "c") == "rawaug: c: too many arguments; see rawaug denoise --help"
 
 
 def test_help_is_quick() -> None:

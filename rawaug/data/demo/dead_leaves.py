@@ -14,7 +14,6 @@ are laid front to back on what is still bare, until nothing is, which draws exac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, floor
 
 import numpy as np
 import torch
@@ -61,9 +60,9 @@ def dead_leaves(
             f"smallest_radius {smallest_radius} is too large: the sources allow at most {fits / _OVERSAMPLING}"
         )
     fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
-    cells = fine.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3)
-    mean = cells.mean(axis=(1, 3), dtype=np.float32)
-    return torch.from_numpy(np.rint(mean).astype(np.uint8)).permute(2, 0, 1).contiguous()
+    n = _OVERSAMPLING
+    total = sum(fine[i::n, j::n].astype(np.uint16) for i in range(n) for j in range(n))
+    return torch.from_numpy(np.rint(total / n**2).astype(np.uint8)).permute(2, 0, 1).contiguous()
 
 
 def _fine_picture(
@@ -80,19 +79,40 @@ def _fine_picture(
         # centres as far outside as the largest disk reaches, so that the border is like the middle
         y = u[1] * (height + 2 * largest) - largest
         x = u[2] * (width + 2 * largest) - largest
-        visible = (y + radius > 0) & (y - radius < height - 1) & (x + radius > 0) & (x - radius < width - 1)
-        for k in np.flatnonzero(visible):
-            _lay(picture, bare, (y[k], x[k], radius[k]), photographs[int(u[3, k] * len(photographs))], u[4:, k])
+        edges = _edges(y, x, radius, bare.shape)
+        for k in np.flatnonzero(_bare_pixels(bare, edges)):
+            disk, photograph = (y[k], x[k], radius[k]), photographs[int(u[3, k] * len(photographs))]
+            _lay(picture, bare, disk, edges[:, k].tolist(), photograph, u[4:, k])
     return picture
 
 
+def _edges(y: np.ndarray, x: np.ndarray, radius: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Top, bottom, left and right of each disk within the picture, ``(4, N)``; bottom and right are exclusive."""
+    ends = [
+        end.clip(0, side)
+        for centre, side in ((y, shape[0]), (x, shape[1]))
+        for end in (np.ceil(centre - radius), np.floor(centre + radius) + 1)
+    ]
+    return np.stack(ends).astype(np.int64)
+
+
+def _bare_pixels(bare: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """How many pixels between the edges are bare, by summed areas; what is covered never becomes bare again."""
+    areas = np.pad(bare.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32), ((1, 0), (1, 0)))
+    top, bottom, left, right = edges
+    return np.asarray(areas[bottom, right] - areas[top, right] - areas[bottom, left] + areas[top, left])
+
+
 def _lay(
-    picture: np.ndarray, bare: np.ndarray, disk: tuple[float, float, float], photograph: np.ndarray, u: np.ndarray
+    picture: np.ndarray,
+    bare: np.ndarray,
+    disk: tuple[float, float, float],
+    edges: Sequence[int],
+    photograph: np.ndarray,
+    u: np.ndarray,
 ) -> None:
     """Put one disk (row, column, radius) where ``bare``; ``u`` are uniform: window (2), flat or textured."""
-    y, x, radius = disk
-    top, bottom = max(ceil(y - radius), 0), min(floor(y + radius) + 1, bare.shape[0])
-    left, right = max(ceil(x - radius), 0), min(floor(x + radius) + 1, bare.shape[1])
+    (y, x, radius), (top, bottom, left, right) = disk, edges
     free = bare[top:bottom, left:right]
     if not free.any():
         return

@@ -86,7 +86,11 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-        pictures = {kind: _turned_back(files[kind], view) for kind in ("GT_SRGB", "NOISY_SRGB") if kind in files}
+        pictures = {
+            kind: _turned_back(files[kind], view, self.max_pixels)
+            for kind in ("GT_SRGB", "NOISY_SRGB")
+            if kind in files
+        }
         known = self.levels.get(scene.name)
         shot_var, read_var = known or measured_levels(clean, noisy)
         return Pair(
@@ -192,9 +196,9 @@ def colour_of(file: Path) -> Colour:
         raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
 
 
-def _turned_back(file: Path, view: int) -> Tensor:
+def _turned_back(file: Path, view: int, max_pixels: int) -> Tensor:
     """The upright picture in ``file`` as the sensor saw it."""
-    return _even(turn_back(apart(read_picture, file), view)).contiguous()
+    return _even(turn_back(apart(read_picture, file, max_pixels), view)).contiguous()
 
 
 def _even(image: Tensor) -> Tensor:

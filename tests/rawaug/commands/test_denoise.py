@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import multiprocessing
 import sys
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from torch import Tensor
 import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder
+from rawaug.commands.denoise import denoise_file, denoise_folder, run
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
 from rawaug.commands.frame_noise import levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
@@ -220,6 +221,33 @@ def test_what_is_there_stays_without_overwrite(
     assert out.stat().st_mtime_ns == before
     assert main([*command, "--overwrite"]) == 0
     assert out.stat().st_mtime_ns > before
+
+
+def test_a_full_disk_ends_a_folder_in_one_line(
+    tmp_path: Path, bayer_dng: Dng, identity: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    for name in "abc":
+        shot(source / f"{name}.dng", bayer_dng)
+
+    def write(path: Path, *rest: Any) -> None:
+        if path.stem != "a":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_dng(path, *rest)
+
+    monkeypatch.setattr("rawaug.commands.denoise.write_dng", write)
+    assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)
+    assert (out / "a.dng").is_file()
+
+
+def test_a_folder_is_not_denoised_to_a_dng(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    with pytest.raises(ValueError, match=r"out\.dng: .*raw is a folder, and so is its output; give a name without"):
+        run(str(tmp_path / "raw"), str(tmp_path / "out.dng"))
+    assert not (tmp_path / "out.dng").exists()
 
 
 def test_a_folder_with_a_broken_file_is_done_and_fails(

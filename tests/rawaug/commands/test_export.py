@@ -43,7 +43,9 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
 def test_what_is_missing_is_said_in_one_line(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("onnx", "onnxscript", "onnxruntime"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ValueError, match=r"export needs onnx, onnxscript, onnxruntime: pip install 'rawaug\[export\]'"):
+    with pytest.raises(
+        ValueError, match=r"export to ONNX needs onnx, onnxscript, onnxruntime: pip install 'rawaug\[export\]'"
+    ):
         export(weights, tmp_path / "a.onnx")
     with pytest.raises(ValueError, match=r"ends in \.onnx"):
         export(weights, tmp_path / "a.pt")

@@ -50,6 +50,15 @@ def test_8_bits_are_a_quarter(tmp_path: Path) -> None:
     assert planes.tolist() == pytest.approx([100, 200, 300, 400], abs=4)
 
 
+def test_larger_pictures_and_mosaics_are_refused(folder: Path) -> None:
+    assert open_pairs(f"zurich:{folder}", "test", max_pixels=96)[0].raw.shape == (1, 8, 12)
+    with pytest.raises(ValueError, match=r"huawei_raw/0\.png: declares 8 x 12 pixels, above the limit of 95"):
+        open_pairs(f"zurich:{folder}", "test", max_pixels=95)[0]
+    write_picture(folder / "test" / "canon" / "0.jpg", torch.zeros(3, 16, 24, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"canon/0\.jpg: declares 16 x 24 pixels, above the limit of 96"):
+        open_pairs(f"zurich:{folder}", "test", max_pixels=96)[0]
+
+
 def test_what_is_wrong_is_reported(folder: Path) -> None:
     (folder / "train" / "canon" / "2.jpg").unlink()
     with pytest.raises(FileNotFoundError, match=r"2\.jpg: is missing, and 0 others"):

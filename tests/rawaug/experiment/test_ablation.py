@@ -23,7 +23,7 @@ from rawaug.isp.model import DictionaryISP
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)
-TINY = FitConfig(steps=2, curve_steps=8, pixels=1024, batch=256, encoders="off", prior_steps=50)
+TINY = FitConfig(steps=2, curve_steps=8, pixels=1024, batch=256, encoders="off", prior_steps=10)
 
 
 def test_every_stage_of_the_true_camera_brings_the_image_nearer(known_camera: DictionaryISP, frame_of: FrameOf) -> None:

@@ -44,6 +44,21 @@ def test_it_is_found_before_any_work(
     assert not list(Path(recipe.out).iterdir())
 
 
+def test_compilation_is_tried_first(recipe: Recipe, unread: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def compiled(function: object) -> object:
+        def call(*_: object) -> None:
+            raise RuntimeError("InvalidCxxCompiler: No working C++ compiler found\nSet TORCHDYNAMO_VERBOSE=1")
+
+        return call
+
+    monkeypatch.setattr("torch.compile", compiled)
+    data = DataConfig(pairs=unread, validation=unread, test=unread)
+    said = r"train\.compile: PyTorch cannot compile here \(InvalidCxxCompiler: .* found\); install a C\+\+ compiler, or"
+    with pytest.raises(ValueError, match=said):
+        denoising.run(replace(recipe, data=data, train=TrainConfig(compile=True)))
+    assert not list(Path(recipe.out).iterdir())
+
+
 def test_a_run_that_can_go_on_passes_and_leaves_nothing(recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
     require_runnable(replace(recipe, train=TrainConfig(precision="bf16-mixed"), classical=["NonLocalMeans"]))
     assert not list(Path(recipe.out).iterdir())

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import re
 import shlex
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from rawaug.cli import _parser
 from rawaug.commands.spelling import require_known_keys, require_known_options
-from rawaug.experiment.kinds import KINDS, kind_of
+from rawaug.experiment.ablation import Ablation
+from rawaug.experiment.kinds import KINDS, kind_of, quickly
 from rawaug.experiment.methods import FAMILIES, ROWS
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.recipe import ArmConfig, find_recipe
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe
 from rawaug.experiment.reconstruction import Comparison
 from rawaug.isp.baselines import BASELINES
 from rawaug.isp.fit.samples import BLOCK
+from rawaug.training.train_config import TrainConfig
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
@@ -25,6 +29,12 @@ NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(
 
 OTHERS = {"rgb2raw": "reconstruction"}
 """Recipes that neither train nor are named after their kind."""
+
+
+@cache
+def parsers_of(kind: str) -> tuple[Any, dict[str, Any]]:
+    """The command line, and the parser of ``run`` for recipes of this kind."""
+    return _parser(kind, ["run"])
 
 
 def header(name: str) -> str:
@@ -45,7 +55,7 @@ def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
     last = name.rpartition("/")[2]
     expected = last if last in KINDS else OTHERS.get(name, "training")
     assert kind_of(find_recipe(name)) == expected
-    parser, commands = _parser(expected, ["run"])
+    parser, commands = parsers_of(expected)
     require_known_keys(name, read_yaml(find_recipe(name)), commands["run"])
     assert parser.parse_args(["run", "--recipe", str(find_recipe(name))]).run.name == name
 
@@ -54,7 +64,7 @@ def test_a_recipe_is_of_the_kind_that_it_names(name: str) -> None:
 def test_the_commands_of_a_header_can_be_given(name: str) -> None:
     commands = re.findall(r"^#   (rawaug run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
     assert len(commands) >= 3 and any("--smoke" in command for command in commands)
-    parser, parsers = _parser(kind_of(find_recipe(name)), ["run"])
+    parser, parsers = parsers_of(kind_of(find_recipe(name)))
     for command in commands:
         _, _, named, *rest = shlex.split(command)
         assert named == name
@@ -63,6 +73,18 @@ def test_the_commands_of_a_header_can_be_given(name: str) -> None:
         kind = KINDS[kind_of(find_recipe(name))]
         recipe = kind.settings(**{key: getattr(given, key) for key in kind.settings.__dataclass_fields__})
         assert not given.smoke or kind.smoke(recipe).name.endswith("-smoke")
+
+
+def test_smoke_replaces_no_data_in_silence(capsys: pytest.CaptureFixture[str]) -> None:
+    data = DataConfig(pairs="mine", test="others", count=3)
+    recipe = Recipe(data=data, train=TrainConfig(steps=9), devices=2, arms={"real": ArmConfig()})
+    for key in ("data.pairs", "data.test"):
+        with pytest.raises(ValueError, match=rf"^--{key}: --smoke runs on built-in data; .* with --dry-run"):
+            quickly("training", recipe, {key, "smoke"})
+    with pytest.raises(ValueError, match=r"^--data: --smoke runs on built-in data"):
+        quickly("ablation", Ablation(data="mine"), {"data"})
+    assert quickly("training", recipe, {"train.steps", "devices", "data.count", "seed", "arms.real"}).train.steps == 4
+    assert capsys.readouterr().out == "--smoke sets data.count to 1, devices to 1, train.steps to 4\n"
 
 
 def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
@@ -113,7 +135,7 @@ def test_a_recipe_that_names_no_kind_trains(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "key"), [("data: 5", "data"), ("train:", "train"), ("isp: [1]", "isp")])
 def test_a_section_that_is_none_is_refused(text: str, key: str) -> None:
-    _, commands = _parser("training", ["run"])
+    _, commands = parsers_of("training")
     with pytest.raises(ValueError, match=rf"mine.yaml: {key}: must have keys below it, such as {key}\.\w+, got"):
         require_known_keys("mine.yaml", yaml.safe_load(text), commands["run"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -169,8 +170,10 @@ def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
     monkeypatch.setattr("rawaug.experiment.rehearsal.READ_SECONDS", 1e6)
     command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test]
     command += ["--data.pictures", str(data.pictures), "--dry-run", "--out", str(tmp_path / "runs")]
-    assert main([*command, *ONE_ARM, *BARE]) == 0
+    monkeypatch.setitem(sys.modules, "bm3d", None)
+    assert main([*command, *ONE_ARM, *BARE, "--classical", "[BM3D]"]) == 0
     said = capsys.readouterr().out
+    assert said.count("BM3D is left out") == 1
     assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said
     assert "frames read: train 6 of 6, validate 1 of 1, test 2 of 2" in said and "nothing wrong found" in said
     assert not (tmp_path / "runs").exists()

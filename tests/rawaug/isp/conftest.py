@@ -76,4 +76,4 @@ def exact_pairs() -> list[Pair]:
 @pytest.fixture(scope="session")
 def fitted(exact_pairs: list[Pair]) -> DictionaryISP:
     """Fitted to the three shots."""
-    return fit_isp(exact_pairs, FitConfig(steps=60, pixels=4096, batch=1024), progress=False)
+    return fit_isp(exact_pairs, FitConfig(steps=60, pixels=4096, batch=1024, prior_steps=100), progress=False)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +14,13 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, distributed, nn
+from torch.distributed.run import main as torchrun
 from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, RandomSampler, SequentialSampler
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -106,8 +110,30 @@ def test_counted_draws_of_processes_differ(augment: RawAugment, tmp_path: Path) 
     assert first[2] == second[2] == first[0]
 
 
+READ = """
+import sys
+import torch
+import webdataset as wds
+from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairStream
+
+def read(urls):
+    shards = wds.WebDataset(urls, shardshuffle=False, nodesplitter=wds.split_by_node).decode("pil")
+    augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)), noise=(0.01, 0.01), sampling="chosen")
+    pairs = RawPairStream(shards, augment, crop=8, key="png", identity="__key__")
+    return [(sample["__key__"], sample["png"].noisy) for sample in pairs]
+
+if __name__ == "__main__":
+    torch.distributed.init_process_group("gloo")
+    torch.save(read(sys.argv[2:]), f"{sys.argv[1]}/{torch.distributed.get_rank()}.pt")
+    torch.distributed.destroy_process_group()
+"""
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_two_nodes_read_every_sample_of_the_shards_once(augment: RawAugment, tmp_path: Path) -> None:
+def test_torchrun_on_two_nodes_reads_every_sample_of_the_shards_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two launchers on one machine, a process each. Importing torch there takes most of the time."""
     wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
     urls = [str(tmp_path / f"pictures-{k}.tar") for k in range(3)]
     for k, url in enumerate(urls):
@@ -115,14 +141,26 @@ def test_two_nodes_read_every_sample_of_the_shards_once(augment: RawAugment, tmp
             for i in range(3):
                 tar.write({"__key__": f"{k}-{i}", "png": np.full((16, 16, 3), 60 * k + 20 * i, np.uint8)})
 
-    def read() -> list[tuple[str, Tensor]]:
-        shards = wds.WebDataset(urls, shardshuffle=False, nodesplitter=wds.split_by_node).decode("pil")
-        drawn = RawAugment(augment.isp, noise=(0.01, 0.01))
-        pairs = RawPairStream(shards, drawn, crop=8, key="png", identity="__key__")
-        return [(sample["__key__"], sample["png"].noisy) for sample in pairs]
-
-    alone = dict(read())
-    nodes = [[(key, noisy) for key, noisy in own] for own in in_two_processes(read, tmp_path)]
+    script = tmp_path / "read.py"
+    script.write_text(READ)
+    scope: dict[str, Any] = {"__name__": "read"}
+    exec(READ, scope)
+    alone = dict(scope["read"](urls))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    launch = ["--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d", "--rdzv-endpoint", endpoint]
+    started = []
+    for node in ("0", "1"):
+        command = [*launch, "--node-rank", node, str(script), str(tmp_path), *urls]
+        started.append(multiprocessing.get_context("fork").Process(target=torchrun, args=(command,)))
+        started[-1].start()
+    for process in started:
+        process.join(400)
+    assert [process.exitcode for process in started] == [0, 0]
+    nodes = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]
     assert [len(own) for own in nodes] == [6, 3] and len(alone) == 9
     assert sorted(key for own in nodes for key, _ in own) == sorted(alone)
     assert all(torch.equal(noisy, alone[key]) for own in nodes for key, noisy in own)

@@ -168,7 +168,7 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     shots = clean + torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0)) * (0.01 * clean + 1e-3).sqrt()
     frame = NoisyFrame("smooth", shots[:2], 0.01, 1e-3, CFA.RGGB)
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
-    config = TrainConfig(steps=120, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
+    config = TrainConfig(steps=80, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
     frames = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
     net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)

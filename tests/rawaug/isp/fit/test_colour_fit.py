@@ -16,7 +16,8 @@ from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
-CURVE = FitConfig(steps=0, pixels=4096, batch=512)
+CURVE = FitConfig(steps=0, pixels=2048, batch=512, prior_steps=100)
+SHORT = replace(CURVE, curve_steps=50)
 WB = (1.6, 1.0, 1.5)
 
 
@@ -81,8 +82,8 @@ def test_fall_off_is_measured(exact_pair: Callable[..., Pair]) -> None:
 def test_a_mask_is_kept_where_there_is_fall_off(exact_pair: Callable[..., Pair]) -> None:
     pairs = [exact_pair(f"shot{k}", WB, k, fall_off=0.8) for k in range(2)]
     unseen = exact_pair("unseen", WB, seed=9, fall_off=0.8)
-    with_mask = fit_isp(pairs, CURVE, progress=False)
-    without = fit_isp(pairs, replace(CURVE, shading="off"), progress=False)
+    with_mask = fit_isp(pairs, SHORT, progress=False)
+    without = fit_isp(pairs, replace(SHORT, shading="off"), progress=False)
     assert "shading" in with_mask.config.stages and "shading" not in without.config.stages
     torch.testing.assert_close(
         cast(Any, with_mask.stages["shading"]).mask.precision.diagonal(), torch.full((2,), 0.8), atol=0.1, rtol=0
@@ -97,11 +98,11 @@ def test_content_that_goes_with_the_place_feigns_no_fall_off(exact_pair: Callabl
     for k in range(2):
         colours = 0.7 + 0.3 * torch.rand(3, 96, 128, generator=torch.Generator().manual_seed(k))
         pairs.append(exact_pair(f"shot{k}", WB, k, curve=s_curve, picture=light * colours))
-    on = fit_isp(pairs, replace(CURVE, shading="on"), progress=False)
+    on = fit_isp(pairs, replace(SHORT, shading="on"), progress=False)
     assert cast(Any, on.stages["shading"]).mask.precision.diagonal().max() > 0.02
-    auto = fit_isp(pairs, CURVE, progress=False)
+    auto = fit_isp(pairs, SHORT, progress=False)
     assert "shading" not in auto.config.stages
-    off = fit_isp(pairs, replace(CURVE, shading="off"), progress=False)
+    off = fit_isp(pairs, replace(SHORT, shading="off"), progress=False)
     assert torch.equal(
         cast(Any, auto.stages["gamma"]).reverse_gamma, cast(Any, off.stages["gamma"]).reverse_gamma
     )  # nothing of the trial is left
@@ -123,6 +124,6 @@ def test_one_frame_whose_metadata_lie_does_not_spoil_the_others(
     exact_pairs: list[Pair], exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
 ) -> None:
     liar = replace(exact_pair("liar", (1.9, 1.0, 1.4), 5), white_balance=(1.0, 1.0, 1.0))
-    isp = fit_isp([*exact_pairs, liar], replace(CURVE, steps=60), progress=False)
+    isp = fit_isp([*exact_pairs, liar], replace(SHORT, steps=40), progress=False)
     torch.testing.assert_close(isp.colour.atoms(), camera_matrix.expand(4, 3, 3), atol=0.02, rtol=0)
     assert error_db(isp, exact_pair("unseen", (1.7, 1.0, 1.6), 9)) > 60.0

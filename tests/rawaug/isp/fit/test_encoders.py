@@ -18,12 +18,12 @@ LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 
-QUICK = EncoderTraining(steps=40, frames=2, pixels=64, learning_rate=1.5e-2, folds=2)
+QUICK = EncoderTraining(steps=30, frames=2, pixels=64, learning_rate=1.5e-2, folds=2)
 
 
 def config(wanted: str, quick: EncoderTraining = QUICK) -> FitConfig:
     """With ``mse_floor`` the constants are a compromise between the two lights, not one of them."""
-    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "prior_steps": 100}
+    few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "prior_steps": 40}
     settings: dict[str, Any] = {**few, "encoder_training": quick, "encoders": wanted}
     return FitConfig(atoms=2, reach=1.0, shading="off", isp=SETTINGS, **settings)
 

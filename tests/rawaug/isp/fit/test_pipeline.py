@@ -14,7 +14,7 @@ from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
-QUICK = FitConfig(steps=60, pixels=4096, batch=1024)
+QUICK = FitConfig(steps=60, pixels=4096, batch=1024, prior_steps=100)
 TINY = FitConfig(steps=3, curve_steps=30, pixels=512, batch=128, shading="off", prior_steps=50)
 
 
@@ -52,7 +52,7 @@ def test_the_isp_records_what_it_was_fitted_to(fitted: DictionaryISP) -> None:
 def test_noisy_frames_give_the_constants_of_clean_ones(exact_pair: Callable[..., Pair]) -> None:
     balances = [(1.5, 1.0, 2.0), (1.7, 1.0, 1.7), (2.0, 1.0, 1.5)]
     pairs = [exact_pair(f"shot{k}", balance, k, shot_var=5e-3) for k, balance in enumerate(balances)]
-    config = replace(QUICK, steps=20, pixels=16384, shading="off")
+    config = replace(QUICK, steps=10, curve_steps=50, prior_steps=100, pixels=8192, shading="off")
     clean = fit_isp(pairs, config, progress=False)
     unread = [replace(pair, raw=torch.full_like(pair.raw, torch.nan)) for pair in pairs]  # the clean RAW is not seen
     noisy = fit_isp(unread, replace(config, noisy=True), progress=False)
