@@ -6,9 +6,9 @@
 The loader reads a folder of pictures, crops and collates; RawPairs makes the pairs in its workers, wrap on the device.
 The step is that of denoisers.UNet on a batch of pairs, alone and with the batch made by RawAugment first. All are timed
 in turn, and the fastest run of each counts. ``--reading`` times PictureFolder alone: with decoders in a helper process
-of each worker (rawaug.io.apart), one by one and by batches, and without; on Linux also in processor seconds of all
-processes together. ``--memory`` prints the resident memory of the process and its persistent workers after each epoch.
-Pictures are those of PICTURES, or the built-in ones written to a folder.
+of each worker (rawaug.io.apart), one by one and by batches, and without; on Linux also the mean processor seconds of
+all processes together. ``--memory`` prints the resident memory of the process and its persistent workers after each
+epoch. Pictures are those of PICTURES, or the built-in ones written to a folder.
 """
 
 from __future__ import annotations
@@ -63,32 +63,27 @@ class BatchesOfCrops(Crops):
         return [self.cropped(picture, index) for picture, index in zip(pictures, indices, strict=True)]
 
 
-def fastest(
-    runs: Mapping[str, Callable[[], object]],
-    repeats: int,
-    device: torch.device,
-    clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, float]:
+def fastest(runs: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
     """The least seconds of each, timed in turn."""
     best = dict.fromkeys(runs, float("inf"))
     for _ in range(repeats):
         for name, run in runs.items():
-            start = clock()
+            start = time.perf_counter()
             run()
             if device.type == "cuda":
                 torch.cuda.synchronize(device)
-            best[name] = min(best[name], clock() - start)
+            best[name] = min(best[name], time.perf_counter() - start)
     return best
 
 
 def processor_seconds() -> float:
-    """Of this process and all that come from it and are still there (Linux)."""
+    """Of this process and all that came from it (Linux)."""
     parents, seconds = dict[int, int](), dict[int, float]()
     for file in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
             fields = file.read_text(errors="replace").rpartition(")")[2].split()
             pid = int(file.parent.name)
-            parents[pid], seconds[pid] = int(fields[1]), sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+            parents[pid], seconds[pid] = int(fields[1]), sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
     def ours(pid: int) -> bool:
         return pid == os.getpid() or (pid in parents and ours(parents[pid]))
@@ -115,7 +110,7 @@ def time_loaders(folder: Path, args: argparse.Namespace) -> dict[str, float]:
 
 def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Seconds of an epoch that decodes in the loader's workers, and of those whose workers have helpers for it."""
-    runs: dict[str, Callable[[], object]] = {}
+    runs, spent = dict[str, Callable[[], object]](), dict[str, float]()
     kinds: tuple[tuple[str, str, type[Crops]], ...]
     kinds = (("without", "0", Crops), ("apart", "60", Crops), ("apart, by batches", "60", BatchesOfCrops))
     for name, limit, kind in kinds:
@@ -125,17 +120,20 @@ def time_reading(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, 
             persistent_workers=args.workers > 0,
         )  # fmt: skip
 
-        def epoch(loader: DataLoader[Tensor] = loader, limit: str = limit) -> None:
+        def epoch(loader: DataLoader[Tensor] = loader, limit: str = limit, name: str = name) -> None:
             os.environ["RAWAUG_READ_SECONDS"] = limit  # which persistent workers keep from their start
+            before = processor_seconds()
             for _ in loader:
                 pass
+            spent[name] = spent.get(name, 0.0) + processor_seconds() - before
 
         epoch()
+        spent.clear()
         runs[name] = epoch
-    clocks = {"reading": time.perf_counter}
+    timed = {"reading": fastest(runs, args.repeats, torch.device("cpu"))}
     if sys.platform == "linux":
-        clocks["reading, processors"] = processor_seconds
-    return {what: fastest(runs, args.repeats, torch.device("cpu"), clock) for what, clock in clocks.items()}
+        timed["reading, processors"] = {name: seconds / args.repeats for name, seconds in spent.items()}
+    return timed
 
 
 def time_steps(args: argparse.Namespace) -> dict[str, float]:

@@ -29,4 +29,5 @@ class Markdown(griffe.Extension):
 
 
 def _one_line(tex: str) -> str:
-    return " ".join(tex.split())
+    """On one line, with the space after a logarithm that TeX sets by itself."""
+    return re.sub(r"\\(log|ln) (?=\\)", r"\\\1\\, ", " ".join(tex.split()))

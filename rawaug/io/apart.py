@@ -89,7 +89,7 @@ def apart_each(read: Callable[..., T], files: Sequence[Any], *rest: Any) -> Iter
     calls, done = [(file, *rest) for file in files], 0
     while done < len(calls):
         seconds = time_limit()
-        suspects = 1
+        suspects, lost = 1, None
         with _borrowed(seconds > 0 and len(calls) - done > 1) as helper:
             if helper is not None:
                 try:
@@ -97,11 +97,11 @@ def apart_each(read: Callable[..., T], files: Sequence[Any], *rest: Any) -> Iter
                         done += 1
                         yield value
                     return
-                except Lost:
-                    suspects = helper.expected
-        for call in calls[done : done + suspects]:  # one of them is found by reading them one by one
+                except Lost as ended:
+                    suspects, lost = helper.next, ended
+        for call in calls[done : done + suspects]:  # one of several is found by reading them one by one
             done += 1
-            yield _alone(read, call)
+            yield OSError(f"{call[0]}: {lost}") if lost and suspects == 1 else _alone(read, call)
 
 
 def _answers(
@@ -110,17 +110,18 @@ def _answers(
     """What ``read`` made of each, in order; the helper always has what to do next.
 
     Raises:
-        Lost: if the helper dies or hangs, by one of the next ``helper.expected`` calls.
+        Lost: if the helper dies or hangs, by one of the next ``helper.next`` calls.
     """
     sent = 0
     while sent < len(calls) or helper.expected:
-        while len(helper.waited) < MEMORIES and (sent < len(calls) or helper.expected > len(helper.waited)):
+        while len(helper.waited) < MEMORIES and (sent < len(calls) or helper.late):
             few = calls[sent : sent + helper.few]
             helper.ask(read, few)
             sent += len(few)
-        yield from helper.answer(seconds)
-    while helper.waited:  # for nothing, as the answers before had room for all
-        helper.answer(seconds)
+        answers = helper.answer(seconds)
+        if sent == len(calls) and not helper.expected:
+            helper.drain(seconds)  # now, since the caller may not ask for more than there is
+        yield from answers
 
 
 def _alone(read: Callable[..., T], call: Sequence[Any]) -> T | Exception:

@@ -28,7 +28,7 @@ PATIENCE = 10
 """Times the limit that a file may take where the helper has not used the limit of a processor: on a busy machine."""
 START_SECONDS = 300.0
 """For the first helper, which waits until the libraries are imported."""
-MESSAGE_SECONDS, MOST = 4e-3, 16
+MESSAGE_SECONDS, MOST = 16e-3, 16
 """What a message of several calls should take, and how many it has at most."""
 
 
@@ -40,7 +40,7 @@ class Helper:
     """A helper process: a connection, the memories that it shares, and what it has been asked.
 
     Attributes:
-        waited: by number, the memories of the answers to come, in order.
+        waited: for the answers to come, in order: the number of the memory, and the calls sent for it.
         expected: calls that it has been sent and has not answered.
         few: calls that are worth a message, by the time that the last ones took.
         busy: the processor's seconds at its last answer.
@@ -57,7 +57,7 @@ class Helper:
         link.settimeout(None)
         self.memories = [SharedMemory(descriptor) for descriptor in descriptors]
         self.owner, self.busy, self.expected, self.few = os.getpid(), 0.0, 0, 1
-        self.waited, self.turns = deque[int](), cycle(range(MEMORIES))
+        self.waited, self.turns = deque[tuple[int, int]](), cycle(range(MEMORIES))
         self.connection = Connection(link.detach())
         self.answered = select.poll()
         self.answered.register(self.connection.fileno(), select.POLLIN)
@@ -68,12 +68,23 @@ class Helper:
         """Whether it is there, for this process, and has answered all."""
         return not (self.waited or self.expected or self.owner != os.getpid() or self.answered.poll(0))
 
+    @property
+    def next(self) -> int:
+        """Calls, at most, that the next answer is for."""
+        return self.late + (self.waited[0][1] if self.waited else 0)
+
+    @property
+    def late(self) -> int:
+        """Calls that did not fit into the answer that they were sent for."""
+        return self.expected - sum(calls for _, calls in self.waited)
+
     def ask(self, read: Callable[..., Any], calls: Sequence[Any]) -> None:
         """Send calls, and let it fill the memory whose turn it is with answers to these or earlier ones."""
-        self.waited.append(next(self.turns))
+        which = next(self.turns)
+        self.waited.append((which, len(calls)))
         self.expected += len(calls)
         with suppress(ConnectionError):  # it has died, which the answer says
-            self.connection.send_bytes(pickle.dumps((self.waited[-1], _folder(), read, calls)))
+            self.connection.send_bytes(pickle.dumps((which, _folder(), read, calls)))
 
     def answer(self, seconds: float) -> list[tuple[bool, Any]]:
         """Of each of the next calls, at least of one, whether there is a value, and the value or the error.
@@ -91,12 +102,18 @@ class Helper:
         if busy is None:
             self.let_go()
             raise Lost(f"crashes the decoder ({_ending(answers)}); leave it out, or copy it again")
-        arrays = self.memories[self.waited.popleft()].copies(kinds)
+        arrays = self.memories[self.waited.popleft()[0]].copies(kinds)
         if answers:
             pace = max(1e-9, busy - self.busy) / len(answers)
             self.few = min(max(1, round(MESSAGE_SECONDS / pace)), MOST)
         self.busy, self.expected = busy, self.expected - len(answers)
         return [unpickled(answer, arrays) for answer in answers]
+
+    def drain(self, seconds: float) -> None:
+        """Take the answers that are left when all calls have been answered, as there was room for more in others."""
+        with suppress(Lost):  # which is no file's fault
+            while self.waited:
+                self.answer(seconds)
 
     def _answers(self, seconds: float) -> bool:
         """Whether an answer comes; a helper that other programs keep from running gets more time."""

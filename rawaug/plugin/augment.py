@@ -144,7 +144,7 @@ class RawAugment(nn.Module):
         light: float | str | None = None,
         tone: str | None = None,
     ) -> RawAugment:
-        """The same ISP and pattern with other draws, in no time: both share the baked ISP.
+        """The same ISP and pattern with other draws; both share the baked ISP, so nothing is baked again.
 
         Arguments and errors are those of the constructor.
         """
@@ -301,7 +301,7 @@ class RawAugment(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the module is."""
+        """The device of the module."""
         return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:

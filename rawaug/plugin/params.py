@@ -35,7 +35,7 @@ class AugmentParams(NamedTuple):
         return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place))
 
     def tensors(self) -> dict[str, Tensor]:
-        """As a flat dict, to be kept with a batch; :meth:`from_tensors` is the way back."""
+        """As a flat dict, to store with a batch; :meth:`from_tensors` is the inverse."""
         isp = {f"isp.{name}": value for name, value in self.isp._asdict().items()}
         return isp | {f"noise.{name}": value for name, value in self.noise.items()} | {"place": self.place}
 

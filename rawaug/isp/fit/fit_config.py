@@ -122,7 +122,7 @@ class FitConfig:
         return {key: value for key, value in asdict(self).items() if key not in _LATER or value != _LATER[key]}
 
     def smoke(self) -> FitConfig:
-        """In a second."""
+        """The same configuration, reduced to a fit of a second."""
         few = replace(self.encoder_training, steps=4)
         return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
 

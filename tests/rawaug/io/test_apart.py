@@ -21,6 +21,7 @@ from rawaug.data import PictureFolder
 from rawaug.io import apart as reading
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import apart, apart_each, prepare, time_limit
+from rawaug.io.helper import Helper
 from rawaug.io.picture_files import decode_picture
 from rawaug.io.reading_process import FULL
 
@@ -107,6 +108,36 @@ def test_a_loop_that_is_left_early_leaves_no_answer_behind() -> None:
         assert value == 4
         break
     assert apart(len, "four") == 4
+
+
+def _busy(seconds: float) -> float:
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
+    return seconds
+
+
+def test_a_hang_among_many_is_waited_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "_of_this_thread", threading.local())  # whose helper knows no pace yet
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0.3")
+    kills, kill = list[Helper](), Helper.kill
+
+    def counted(helper: Helper) -> None:
+        kills.append(helper)
+        kill(helper)
+
+    monkeypatch.setattr(Helper, "kill", counted)
+    values = list(apart_each(_busy, [0.02, 0.03, 60.0, 0.04]))
+    assert [value for value in values if isinstance(value, float)] == [0.02, 0.03, 0.04]
+    assert "60.0: cannot be read within 0.3 s" in str(values[2]) and len(kills) == 1
+
+
+def test_as_many_values_as_there_are_leave_the_helper_there() -> None:
+    helper = [apart(os.getpid) for _ in range(3)][-1]  # so fast that all calls go in one message
+    values = apart_each(np.zeros, [FULL // 8, *range(9)])
+    assert [len(next(values)) for _ in range(10)] == [FULL // 8, *range(9)]  # type: ignore[arg-type]
+    values.close()  # type: ignore[attr-defined]
+    assert apart(os.getpid) == helper
 
 
 def test_a_helper_that_was_killed_while_it_had_nothing_to_do_is_no_fault_of_the_next_file() -> None:
