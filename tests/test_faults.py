@@ -233,7 +233,7 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture
 
-    monkeypatch.setattr(pair_maker, "read_picture", unlucky)
+    monkeypatch.setattr(pair_maker, "decode_picture", unlucky)
     result = synth(tmp_path / "in", tmp_path / "out", workers=0)
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
 
@@ -319,7 +319,8 @@ def test_a_small_dev_shm_is_said_in_one_line(harness: Any) -> None:
 
     def load() -> None:
         harness.small_shared_memory(64)
-        loader = DataLoader([torch.rand(3, 100, 100) for _ in range(8)], batch_size=4, num_workers=2)  # type: ignore[arg-type]
+        pictures: Any = [torch.rand(3, 100, 100) for _ in range(8)]
+        loader: DataLoader[Any] = DataLoader(pictures, batch_size=4, num_workers=2)
         with pytest.raises(RuntimeError) as error:
             list(loader)
         assert "shared memory is full" in str(shortage(error.value))
