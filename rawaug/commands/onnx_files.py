@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -33,13 +35,25 @@ def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path
         path: the file.
     """
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own
+    with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
+        warnings.simplefilter("ignore")
         shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
         program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
         onnx = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
         assert onnx is not None
         onnx.save(str(path), external_data=False)
+
+
+@contextmanager
+def errors_only(name: str) -> Iterator[None]:
+    """A logger and those below it say nothing less than an error."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def session_of(path: Path) -> Any:

@@ -275,7 +275,7 @@ class PreparedComparison:
             result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
         if settings.balanced:
             result["balanced"] = balanced_rows(fitted, pair)
-        result |= {"key": key, "seconds": fitted.seconds, "parameters": fitted.parameters, **fitted.model.info}
+        result |= {**fitted.model.info, "key": key, "seconds": fitted.seconds, "parameters": fitted.parameters}
         write_json(result, path)
         return result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 import denoisers
 from rawaug.cli import main
 from rawaug.commands.export import export
-from rawaug.commands.onnx_files import session_of
+from rawaug.commands.onnx_files import errors_only, session_of
 
 
 @pytest.fixture
@@ -38,6 +39,15 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
             expected = model(noisy, variance)
         assert (expected - noisy).abs().max() > 1e-3
         assert (torch.from_numpy(denoised) - expected).abs().max() < 1e-4
+
+
+def test_of_the_exporter_errors_alone_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    below = logging.getLogger("exporter.registration")
+    with errors_only("exporter"):
+        below.warning("torchvision is not installed")
+        below.error("broken")
+    below.warning("heard again")
+    assert caplog.messages == ["broken", "heard again"]
 
 
 def test_what_is_missing_is_said_in_one_line(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
