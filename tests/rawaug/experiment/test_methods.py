@@ -37,6 +37,13 @@ FrameOf = Callable[..., Pair]
 DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 
+@pytest.fixture
+def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its row is filled, but it takes no time."""
+    monkeypatch.setattr(oracle, "STEPS", 1)
+
+
+@pytest.mark.usefixtures("no_oracle")
 def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path: Path) -> None:
     frame = frame_of("one", size=(64, 96))
     universal = DictionaryISP.from_pretrained("universal-small")
@@ -57,12 +64,6 @@ def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path
 def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, float]:
     rows: dict[str, float] = score_rows(Fitted(model, 0.0, 0), pair, patches)["rows"]
     return rows
-
-
-@pytest.fixture
-def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(oracle, "STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
