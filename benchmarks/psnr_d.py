@@ -1,10 +1,11 @@
 """What each part of the universal ISP is worth: PSNR_d of denoisers trained on RAW made without it.
 
     python benchmarks/psnr_d.py --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
-        [--older universal.safetensors] [--seeds 0 1 2] [--out runs/psnr_d]
+        [--older universal.safetensors] [--seeds 0 1 2] [--recipe RECIPE.yaml] [--steps 1200] [--out runs/psnr_d]
 
-Network, steps, noise and pictures are those of recipes/reconstruction.yaml and the same in every row; a row differs in
-the way from sRGB to RAW. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
+Network, steps, noise and pictures are those of recipes/reconstruction.yaml, or of the training recipe that is given,
+but for its zoom, and the same in every row; a row differs in the way from sRGB to RAW. The test frames have
+cycleisp_sidd noise. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
 in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
 alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
 rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
@@ -27,11 +28,13 @@ from rawaug.data import open_pairs, open_pictures
 from rawaug.evaluation.scores import classical_method, score_method
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
+from rawaug.experiment.plain_yaml import read_yaml
+from rawaug.experiment.recipe import find_recipe
 from rawaug.files import write_json
 from rawaug.isp.baselines import UPI
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
-from rawaug.noise import noise_model
+from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.pictures import even_sided
@@ -49,6 +52,19 @@ NARROW = "Canon EOS 5D Mark III"
 """The camera that stands for all where the hull is taken away."""
 
 
+def settings(recipe: str | None, steps: int | None) -> tuple[DownstreamConfig, NoiseModel]:
+    """Network and loop, and the noise of the training samples, of a training recipe; None for :data:`CONFIG`'s."""
+    config, noise = CONFIG, noise_model(CONFIG.noise)
+    if recipe is not None:
+        found = read_yaml(find_recipe(recipe))
+        train = TrainConfig(**{**found["train"], "workers": 0})
+        config, noise = (
+            replace(CONFIG, denoiser=DenoiserConfig(**found["denoiser"]), train=train),
+            noise_model(found["noise"]),
+        )
+    return replace(config, train=replace(config.train, steps=steps or config.train.steps)), noise
+
+
 def without_tone(isp: DictionaryISP) -> DictionaryISP:
     """The ISP with the linear rendering for every tone atom."""
     assert isp.tone is not None
@@ -57,9 +73,10 @@ def without_tone(isp: DictionaryISP) -> DictionaryISP:
     return isp
 
 
-def sources(pictures: Sequence[Tensor], older: Path | None, real: dict[str, list[str]]) -> Iterator[tuple[str, Source]]:
+def sources(
+    pictures: Sequence[Tensor], older: Path | None, real: dict[str, list[str]], noise: NoiseModel, crop: int
+) -> Iterator[tuple[str, Source]]:
     """Rows: name and training samples."""
-    noise, crop = noise_model(CONFIG.noise), CONFIG.train.crop
 
     def universal() -> DictionaryISP:
         return DictionaryISP.from_pretrained("universal")
@@ -106,24 +123,28 @@ def main() -> None:
     parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
     parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
     parser.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
+    parser.add_argument("--recipe", help="a training recipe; its network, loop, noise and crops")
+    parser.add_argument("--steps", type=int, help="in place of the recipe's")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
     options = parser.parse_args()
     torch.set_num_threads(1)
-    folders = [open_pictures(folder, min_side=CONFIG.train.crop) for folder in options.pictures]
+    config, noise = settings(options.recipe, options.steps)
+    crop = config.train.crop
+    folders = [open_pictures(folder, min_side=crop) for folder in options.pictures]
     pictures = [even_sided(folder[k]) for folder in folders for k in range(len(folder))]
     tests, known = named(options.test), options.out / "scores.json"
     rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
     for seed in options.seeds:
-        for row, crops in sources(pictures, options.older, named(options.real)):
+        for row, crops in sources(pictures, options.older, named(options.real), noise, crop):
             if options.rows and row not in options.rows:
                 continue
             scores = rows.setdefault(row, {}).setdefault(str(seed), {})
             if tests.keys() <= scores.keys():
                 continue
-            net = trained_on(crops, CONFIG, options.out / row.replace(" ", "-").replace(",", ""), seed)
+            net = trained_on(crops, config, options.out / row.replace(" ", "-").replace(",", ""), seed)
             scores |= {
-                test: list(score_on(net, replace(CONFIG, test=specs), CFA.RGGB)) for test, specs in tests.items()
+                test: list(score_on(net, replace(config, test=specs), CFA.RGGB)) for test, specs in tests.items()
             }
             write_json(rows, known)
     rows["NonLocalMeans"] = {"": {test: list(filtered(specs)) for test, specs in tests.items()}}
