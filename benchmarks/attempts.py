@@ -5,11 +5,11 @@ On request the commands (benchmarks/commands.py) read it too.
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
-import sys
 from collections.abc import Callable
 from functools import cache
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -116,26 +116,28 @@ def attempt(kind: str, path: Path) -> tuple[str, str]:
     return outcome
 
 
-def work() -> None:
-    """Read what standard input names, and answer each with a line of JSON; the first answer says that all is there."""
+def work(asked: Connection, log: str) -> None:
+    """Read what is asked for, ``(kind, path, by_commands)``, and answer each; a first answer says that all is there.
+
+    What decoders print goes to ``log``, and where Python was if one of them crashes.
+    """
     import faulthandler
     import warnings
 
-    faulthandler.enable()
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(file, stream)
+    faulthandler.enable(file)
     warnings.simplefilter("ignore")
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what decoders print must not come between the answers
+    os.environ["RAWAUG_READ_SECONDS"] = "0"  # this process is what a decoder may take down
     for kind in ("dng", "recipe"):  # imports are no part of reading
         attempt(kind, Path("none"))
-    print("[]", file=answers, flush=True)
-    for line in sys.stdin:
-        kind, name, by_commands = json.loads(line)
-        outcome, why = attempt(kind, Path(name))
-        if by_commands and outcome != "fault":
-            said = run_all(kind, Path(name))
-            outcome, why = said if said[0] == "fault" or outcome == "read" else (outcome, why)
-        print(json.dumps([outcome, why]), file=answers, flush=True)
-
-
-if __name__ == "__main__":
-    work()
+    asked.send(None)
+    with contextlib.suppress(EOFError):
+        while True:
+            kind, name, by_commands = asked.recv()
+            outcome, why = attempt(kind, Path(name))
+            if by_commands and outcome != "fault":
+                said = run_all(kind, Path(name))
+                outcome, why = said if said[0] == "fault" or outcome == "read" else (outcome, why)
+            asked.send((outcome, why))

@@ -17,12 +17,12 @@ keeps all files but those of the first two columns; a run with ``--journal`` tha
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import multiprocessing
 import os
-import select
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.attempts import work
 from benchmarks.damage import make_originals, mutated
 from benchmarks.mutations import MUTATIONS
 from rawaug.seeding import derived_seed
@@ -55,6 +56,8 @@ DECODERS = {
 BY_COMMANDS, COMMANDS_COST = 8, 6
 """Of so many files one is read by the commands as well, and then has so many times the seconds."""
 
+IMPORTED = ["rawaug.experiment.kinds", "rawaug.commands.fit", "rawaug.plugin.dataset", "lightning_fabric"]
+"""What the readers and commands need, in whole."""
 OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]
 
@@ -64,67 +67,58 @@ class Worker:
 
     def __init__(self, folder: Path, seconds: float = WAITING_SECONDS) -> None:
         self.log, self.seconds = folder / "stderr.txt", seconds
-        self.process: subprocess.Popen[str] | None = None
+        self.process: Any = None
+        self.asked: Any = None
 
     def read(self, kind: str, path: Path, by_commands: bool = False) -> tuple[str, str]:
         """What became of a file, read by readers alone or by commands too: one of OUTCOMES, and why."""
         process = self.process or self._start()
-        assert process.stdin is not None and process.stdout is not None
         _forget_peak(process.pid)
-        process.stdin.write(json.dumps([kind, str(path), by_commands]) + "\n")
-        process.stdin.flush()
+        with contextlib.suppress(ConnectionError):  # it may have died since
+            self.asked.send((kind, str(path), by_commands))
         allowed = SECONDS * (COMMANDS_COST if by_commands else 1)
         end, busy = time.monotonic() + self.seconds, _processor_seconds(process.pid) + allowed
         answered = False
         while not answered and time.monotonic() < end and _processor_seconds(process.pid) < busy:
             if _peak_mebibytes(process.pid) >= MEBIBYTES:
                 break
-            answered = bool(select.select([process.stdout], [], [], 0.05)[0])
-        line = process.stdout.readline() if answered else ""
+            answered = self.asked.poll(0.05)
         peak = _peak_mebibytes(process.pid)
-        if peak < MEBIBYTES and line:
-            outcome, why = json.loads(line)
-            return outcome, why
+        if answered and peak < MEBIBYTES:
+            with contextlib.suppress(EOFError, ConnectionError):
+                outcome, why = self.asked.recv()
+                return outcome, why
         self.stop()
         if peak >= MEBIBYTES:
             return "memory", f"{peak:.0f} MiB"
         if not answered:
             return "hung", f"more than {allowed:g} s of a processor, or {self.seconds:g} s in all"
-        name = signal.Signals(-process.returncode).name if process.returncode < 0 else f"status {process.returncode}"
+        name = signal.Signals(-process.exitcode).name if process.exitcode < 0 else f"status {process.exitcode}"
         return "crashed", f"{DECODERS[kind]}: {name} in {_innermost(self.log)}"
 
-    def _start(self) -> subprocess.Popen[str]:
-        with self.log.open("w") as log:
-            command, pipe = [sys.executable, "-m", "benchmarks.attempts"], subprocess.PIPE
-            here = os.environ | {"RAWAUG_READ_SECONDS": "0"}  # this worker is what a decoder may take down
-            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True, env=here)
-        assert process.stdout is not None
-        ready = select.select([process.stdout], [], [], START_SECONDS)[0] and process.stdout.readline()
-        if not ready:
-            process.kill()
+    def _start(self) -> Any:
+        """Forked from a server that has imported the readers once, so that a crash costs no second start."""
+        multiprocessing.set_forkserver_preload(IMPORTED)
+        context = multiprocessing.get_context("forkserver")
+        self.asked, theirs = context.Pipe()
+        self.process = context.Process(target=work, args=(theirs, str(self.log)), daemon=True)
+        self.process.start()
+        theirs.close()
+        if not self.asked.poll(START_SECONDS):
+            self.process.kill()
             raise OSError(f"the reader process failed to start: {self.log.read_text()[-500:]}")
-        self.process = process
-        return process
+        self.asked.recv()
+        return self.process
 
     def stop(self) -> None:
         """End the process, if there is one."""
         if self.process is not None:
-            if self.process.stdin is not None:
-                self.process.stdin.close()
-            if self.process.poll() is None and not _ends(self.process):
+            self.asked.close()
+            self.process.join(1)
+            if self.process.is_alive():
                 self.process.kill()
-            self.process.wait()
-            if self.process.stdout is not None:
-                self.process.stdout.close()
+            self.process.join()
             self.process = None
-
-
-def _ends(process: subprocess.Popen[str]) -> bool:
-    try:
-        process.wait(1)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
 
 
 def _processor_seconds(process: int) -> float:

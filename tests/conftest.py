@@ -25,11 +25,14 @@ from rawaug.data.pair import Pair
 torch.set_num_threads(1)
 settings.register_profile("rawaug", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rawaug")
-multiprocessing.set_forkserver_preload(["rawaug.training.loop", "rawaug.plugin.dataset", "lightning_fabric"])
+multiprocessing.set_forkserver_preload(
+    ["rawaug.experiment.kinds", "rawaug.commands.fit", "rawaug.plugin.dataset", "lightning_fabric"]
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests with the mark ``gpu`` are skipped without a CUDA device."""
+    """Long tests come first, so that no process waits for the other at the end; ``gpu`` is skipped without a device."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
     if torch.cuda.is_available():
         return
     for item in items:

@@ -21,6 +21,7 @@ def fuzz(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return import_module("benchmarks.fuzz")
 
 
+@pytest.mark.long
 def test_damaged_files_are_read_or_refused_in_one_line(
     fuzz: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -32,6 +33,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(
     assert all(row["refused"] for row in kinds.values()) and sum(row["read"] for row in kinds.values()) > 5
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 def test_a_worker_that_dies_or_hangs_is_named_and_started_anew(fuzz: ModuleType, tmp_path: Path) -> None:
     worker, missing = fuzz.Worker(tmp_path, seconds=1.0), tmp_path / "missing.jpg"

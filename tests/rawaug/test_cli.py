@@ -59,6 +59,7 @@ def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("tiny")
 def test_run_is_resumable_and_ends_with_table_and_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -33,6 +33,7 @@ print(batch.clean.shape[0])
 """
 
 
+@pytest.mark.long
 def test_wrapping_a_loader_needs_no_extra() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.split() == ["2"], done.stderr[-2000:]

@@ -106,6 +106,7 @@ def test_scores_are_those_of_the_passes(known_camera: DictionaryISP, frame_of: F
     assert lamps["forward"] < right["forward"] - 3.0, "the forward pass is under its own choice of light"
 
 
+@pytest.mark.long
 def test_the_smoke_form_runs(tmp_path: Path) -> None:
     quick = smoke_learned(LearnedParts(fit=TINY, variants=VARIANTS, out=str(tmp_path)))
     rows = weigh_parts(quick)

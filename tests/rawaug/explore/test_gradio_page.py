@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import importlib.util
 import io
+import multiprocessing
+import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from rawaug.explore.views import pair as view
 from rawaug.io import write_picture
 from rawaug.plugin.drawing import Drawing
 
+pytestmark = pytest.mark.long
 WAIT = 60_000
 """Milliseconds; a busy machine is slow."""
 
@@ -53,17 +54,30 @@ def chromium() -> str:
     return found
 
 
+SERVE = """
+import sys
+from rawaug.cli import main
+sys.stdout = open(out.fileno(), "w", closefd=False)
+raise SystemExit(main(["explore", folder, "--port", "0"]))
+"""
+
+
 @pytest.fixture(scope="module")
 def served(pictures: Path, chromium: str) -> Iterator[str]:
     """The address of the page, in a process of its own: Gradio leaves event loops and sockets to Python."""
-    command = [sys.executable, "-m", "rawaug", "explore", str(pictures / "in"), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        address, _, hint = process.stdout.readline().partition(" ")
+    said, out = multiprocessing.Pipe(duplex=False)
+    variables = {"folder": str(pictures / "in"), "out": out}
+    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(SERVE, variables))
+    process.start()
+    out.close()
+    assert process.pid is not None
+    with open(said.fileno(), closefd=False) as lines:
+        address, _, hint = lines.readline().partition(" ")
         assert hint == "(Ctrl-C stops it)\n"
         yield address
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        os.kill(process.pid, signal.SIGINT)
+        process.join(60)
+        assert process.exitcode == 0
 
 
 @pytest.fixture(scope="module")

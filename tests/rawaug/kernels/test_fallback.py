@@ -16,6 +16,7 @@ from rawaug.kernels import fallback
 triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
 
 
+@pytest.mark.long
 def test_step_by_step_they_do_what_the_cpu_does() -> None:
     script = Path(__file__).with_name("kernels_interpreted.py")
     paths = os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])

@@ -357,6 +357,7 @@ print("done")
 """
 
 
+@pytest.mark.long
 def test_forked_workers_do_not_hang_after_libraw_has_developed(bayer_dng: Callable[..., Path], tmp_path: Path) -> None:
     numbers = np.random.default_rng(0).integers(4096, size=(2, 512, 768), dtype=np.uint16)
     files = [str(bayer_dng(tmp_path / f"{i}.dng", array)) for i, array in enumerate(numbers)]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, distributed, nn
-from torch.distributed.run import main as torchrun
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, RandomSampler, SequentialSampler
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.dataset import RawPairs, RawPairStream
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -110,60 +108,48 @@ def test_counted_draws_of_processes_differ(augment: RawAugment, tmp_path: Path) 
     assert first[2] == second[2] == first[0]
 
 
-READ = """
-import sys
-import torch
-import webdataset as wds
-from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairStream
-
-def read(urls):
+def read(urls: list[str]) -> dict[str, Tensor]:
+    """By key, the noisy RAW of the samples of this process."""
+    wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
     shards = wds.WebDataset(urls, shardshuffle=False, nodesplitter=wds.split_by_node).decode("pil")
     augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)), noise=(0.01, 0.01), sampling="chosen")
     pairs = RawPairStream(shards, augment, crop=8, key="png", identity="__key__")
-    return [(sample["__key__"], sample["png"].noisy) for sample in pairs]
+    return {sample["__key__"]: sample["png"].noisy for sample in pairs}
 
-if __name__ == "__main__":
-    torch.distributed.init_process_group("gloo")
-    torch.save(read(sys.argv[2:]), f"{sys.argv[1]}/{torch.distributed.get_rank()}.pt")
-    torch.distributed.destroy_process_group()
-"""
+
+def read_in_a_group(urls: list[str], folder: Path) -> None:
+    distributed.init_process_group("gloo")
+    torch.save(read(urls), folder / f"{distributed.get_rank()}.pt")
+    distributed.destroy_process_group()
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_torchrun_on_two_nodes_reads_every_sample_of_the_shards_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two launchers on one machine, a process each. Importing torch there takes most of the time."""
+def test_torchrun_on_two_nodes_reads_every_sample_of_the_shards_once(tmp_path: Path) -> None:
+    """torchrun's launchers, two on one machine with a process each, forked, for importing torch takes seconds."""
     wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
     urls = [str(tmp_path / f"pictures-{k}.tar") for k in range(3)]
     for k, url in enumerate(urls):
         with wds.TarWriter(url) as tar:
             for i in range(3):
                 tar.write({"__key__": f"{k}-{i}", "png": np.full((16, 16, 3), 60 * k + 20 * i, np.uint8)})
-
-    script = tmp_path / "read.py"
-    script.write_text(READ)
-    scope: dict[str, Any] = {"__name__": "read"}
-    exec(READ, scope)
-    alone = dict(scope["read"](urls))
+    alone = read(urls)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"127.0.0.1:{free.getsockname()[1]}"
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    launch = ["--nnodes", "2", "--nproc-per-node", "1", "--rdzv-backend", "c10d", "--rdzv-endpoint", endpoint]
-    started = []
-    for node in ("0", "1"):
-        command = [*launch, "--node-rank", node, str(script), str(tmp_path), *urls]
-        started.append(multiprocessing.get_context("fork").Process(target=torchrun, args=(command,)))
-        started[-1].start()
+    nodes = LaunchConfig(
+        2, 2, 1, rdzv_backend="c10d", rdzv_endpoint=endpoint, run_id="shards", max_restarts=0, start_method="fork"
+    )
+    launch = elastic_launch(nodes, read_in_a_group)
+    started = [multiprocessing.get_context("fork").Process(target=launch, args=(urls, tmp_path)) for _ in range(2)]
+    for process in started:
+        process.start()
     for process in started:
         process.join(400)
     assert [process.exitcode for process in started] == [0, 0]
-    nodes = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]
-    assert [len(own) for own in nodes] == [6, 3] and len(alone) == 9
-    assert sorted(key for own in nodes for key, _ in own) == sorted(alone)
-    assert all(torch.equal(noisy, alone[key]) for own in nodes for key, noisy in own)
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
+    assert [len(first), len(second), len(alone)] == [6, 3, 9]
+    assert first.keys() | second.keys() == alone.keys()
+    assert all(torch.equal(noisy, alone[key]) for own in (first, second) for key, noisy in own.items())
 
 
 @pytest.mark.parametrize("chosen", ["sampler", "batch sampler", "replacement", "no loader"])

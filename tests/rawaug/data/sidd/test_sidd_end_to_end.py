@@ -96,6 +96,7 @@ SMALL = [
 """Of the recipe's network, steps and five arms; 1,280 blocks, so that the benchmark takes the file: 5 s of CPU."""
 
 
+@pytest.mark.long
 def test_sidd_full_trains_scores_and_writes_what_the_benchmark_takes(
     sidd: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
