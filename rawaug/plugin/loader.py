@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
+from rawaug.devices import find_device
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import augmentation, crop_size, placed, random_place
@@ -57,7 +58,8 @@ class WrappedLoader:
         keys: tuple[str, ...] | None,
     ) -> None:
         self.loader, self.key, self.crop, self.keys = loader, key, crop, keys
-        self.device = torch.device(device) if device is not None else augment.device
+        named = find_device(device) if isinstance(device, str) else device
+        self.device = named if named is not None else augment.device
         self.augment = augment.to(self.device)
         self._share: Any = None
         self._next = self._at = Position(0, 0)
@@ -191,7 +193,8 @@ def wrap(
             :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
             :class:`RawPair` takes their place, all else passes through.
         augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
-        device: where the pairs are made, by default where ``augment`` is. Pictures travel there as uint8, if they are.
+        device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
+            :func:`rawaug.devices.find_device` knows, ``auto`` among them. Pictures travel there as uint8, if they are.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
         crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
             different sizes. By default whole pictures, without their last row or column where a side is odd.
@@ -199,7 +202,8 @@ def wrap(
 
     Raises:
         TypeError: if ``augment`` is none of these.
-        ValueError: if the crop is odd, or, on iteration, if there are no pictures, or they do not form a batch.
+        ValueError: if the crop is odd, the machine has no such device, or, on iteration, if there are no pictures, or
+            they do not form a batch.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP

@@ -127,6 +127,16 @@ def test_a_wrapped_loader_can_be_copied_and_pickled(augment: RawAugment, srgb: T
         wrapped.nothing  # noqa: B018 (raises)
 
 
+@pytest.mark.usefixtures("no_gpu")
+@pytest.mark.parametrize(
+    ("device", "said"), [("cuda", "this machine has none; use cpu or auto"), ("cdua", "nearest: cuda")]
+)
+def test_a_device_that_is_not_there_is_said_at_once(augment: RawAugment, device: str, said: str) -> None:
+    with pytest.raises(ValueError, match=rf"device '{device}'.*{said}"):
+        wrap([], augment, device=device)
+    assert wrap([], augment, device="auto").device.type == "cpu"
+
+
 def test_fabric_sets_up_the_loader_that_is_wrapped(augment: RawAugment, srgb: Tensor) -> None:
     fabric = Fabric(accelerator="cpu", devices=1)
     loader = fabric.setup_dataloaders(batches_of(srgb, 3))
