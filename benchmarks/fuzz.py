@@ -104,11 +104,13 @@ class Worker:
         self.process = context.Process(target=work, args=(theirs, str(self.log)), daemon=True)
         self.process.start()
         theirs.close()
-        if not self.asked.poll(START_SECONDS):
-            self.process.kill()
-            raise OSError(f"the reader process failed to start: {self.log.read_text()[-500:]}")
-        self.asked.recv()
-        return self.process
+        with contextlib.suppress(EOFError):  # it ended
+            if self.asked.poll(START_SECONDS):
+                self.asked.recv()
+                return self.process
+        self.process.kill()
+        said = self.log.read_text()[-500:] if self.log.is_file() else "it wrote nothing"
+        raise OSError(f"the reader process failed to start: {said}")
 
     def stop(self) -> None:
         """End the process, if there is one."""

@@ -8,8 +8,8 @@ but for its zoom, and the same in every row; a row differs in the way from sRGB 
 cycleisp_sidd noise. ``without tone``: the sRGB curve alone. ``without consistent gains``: gains of another camera
 in another light. ``without the wide hull``: one camera's matrix. ``pairs of 41.18 dB``: noise scaled, in training
 alone, to the pairs of Conde et al. ``real``: trained on crops of real RAW frames in place of pictures. --rows picks
-rows. Each network is scored on every test set. What is finished, for the same settings, is taken from OUT, so that a
-stopped run can be started again.
+rows. Each network is scored on every test set. What is finished is taken from OUT, so that a stopped run can be
+started again; another recipe or number of steps needs another OUT.
 """
 
 from __future__ import annotations
@@ -58,10 +58,8 @@ def settings(recipe: str | None, steps: int | None) -> tuple[DownstreamConfig, N
     if recipe is not None:
         found = read_yaml(find_recipe(recipe))
         train = TrainConfig(**{**found["train"], "workers": 0})
-        config, noise = (
-            replace(CONFIG, denoiser=DenoiserConfig(**found["denoiser"]), train=train),
-            noise_model(found["noise"]),
-        )
+        config = replace(CONFIG, denoiser=DenoiserConfig(**found["denoiser"]), train=train)
+        noise = noise_model(found["noise"])
     return replace(config, train=replace(config.train, steps=steps or config.train.steps)), noise
 
 
