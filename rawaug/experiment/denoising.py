@@ -317,7 +317,7 @@ class _Run:
 
 def _settings(part: Any) -> dict[str, Any]:
     """Of a part of the recipe; keys that came later are left out where they are null: older runs stay what they are."""
-    later = ("start", "denoiser", "learning_rate", "steps", "search", "candidate_of")
+    later = ("start", "denoiser", "learning_rate", "weigh", "steps", "search", "candidate_of")
     return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
 
 

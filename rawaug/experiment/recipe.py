@@ -14,7 +14,7 @@ from rawaug.data.pair_pictures import OWN_PICTURES
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.train_config import DenoiserConfig, TrainConfig, Weighing
 
 HELD_OUT = "auto"
 """``data.validation`` that is a part of ``data.pairs``."""
@@ -97,6 +97,7 @@ class ArmConfig:
         candidate_of: of such an arm: whose it is.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
+        weigh: in place of ``train.weigh``; null takes that one.
         steps: at most, where fewer than ``train.steps`` are enough, as for fine-tuning; null takes them all.
     """
 
@@ -113,6 +114,7 @@ class ArmConfig:
     candidate_of: str | None = None
     denoiser: DenoiserConfig | None = None
     learning_rate: float | None = None
+    weigh: Weighing | None = None
     steps: int | None = None
 
     def __post_init__(self) -> None:
@@ -226,9 +228,10 @@ class Recipe:
 
     def loop_of(self, arm: str) -> TrainConfig:
         """How the arm is trained."""
-        rate, steps = self.arms[arm].learning_rate, self.arms[arm].steps
-        train = self.train if rate is None else replace(self.train, learning_rate=rate)
-        return train if steps is None else replace(train, steps=min(steps, train.steps))
+        own = self.arms[arm]
+        steps = None if own.steps is None else min(own.steps, self.train.steps)
+        given: dict[str, Any] = {"learning_rate": own.learning_rate, "weigh": own.weigh, "steps": steps}
+        return replace(self.train, **{key: value for key, value in given.items() if value is not None})
 
     @property
     def self_supervised(self) -> bool:

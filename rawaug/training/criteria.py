@@ -4,13 +4,15 @@ r"""The distance between a denoised and a clean RAW: a norm, and its weighting o
 ``weigh``       what is compared
 ==============  ====================================================================================================
 linear          the RAW itself: shadows, whose errors are small, hardly count
+normalised      the RAW in units of the noise's deviation at each pixel, which is that of the network's input
 stabilised      :math:`2 \sqrt{y / s + r / s^2 + 3/8}`, where noise has deviation 1 in shadow and light alike
 mixed           the mean of both, the linear one divided by the noise's mean deviation in the picture
 ==============  ====================================================================================================
 
 with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, both
 being near a square root. The minimum of l1 is the median, which a curve does not move; that of l2 is the mean, and in
-the stabilised domain it is not the mean of the RAW.
+the stabilised domain it is not the mean of the RAW. So where targets are noisy, with l2, only ``linear`` and
+``normalised`` are unbiased: their factors do not depend on the target.
 """
 
 from __future__ import annotations
@@ -64,6 +66,12 @@ def linear(loss: Criterion, sample: Sample) -> Criterion:
     return loss
 
 
+def normalised(loss: Criterion, sample: Sample) -> Criterion:
+    """``loss`` in units of the noise's deviation at each pixel."""
+    deviation = sample.variance.sqrt().clamp_min(1e-6)
+    return lambda denoised, clean: loss(denoised / deviation, clean / deviation)
+
+
 def stabilised(loss: Criterion, sample: Sample) -> Criterion:
     """``loss`` where the noise has deviation 1 in shadow and light alike."""
     levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
@@ -79,6 +87,7 @@ def mixed(loss: Criterion, sample: Sample) -> Criterion:
 
 WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
     "linear": linear,
+    "normalised": normalised,
     "stabilised": stabilised,
     "mixed": mixed,
 }

@@ -11,6 +11,9 @@ from rawaug.registry import LOSSES, require_between
 MOST = 2**31
 """Of steps, samples and processes."""
 
+Weighing = Literal["linear", "normalised", "stabilised", "mixed"]
+"""How the loss weighs light and shade, see :mod:`rawaug.training.criteria`."""
+
 
 @dataclass
 class DenoiserConfig:
@@ -41,7 +44,8 @@ class TrainConfig:
         schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
         halve_every: steps between halvings.
         loss: l1, l2 or charbonnier, or {name, settings}.
-        weigh: loss weighting of light and shade: linear, stabilised or mixed, see :mod:`rawaug.training.criteria`.
+        weigh: loss weighting of light and shade: linear, normalised, stabilised or mixed, see
+            :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept.
@@ -60,7 +64,7 @@ class TrainConfig:
     schedule: Literal["cosine", "step"] = "cosine"
     halve_every: int = 20000
     loss: str | dict[str, Any] = "l1"
-    weigh: Literal["linear", "stabilised", "mixed"] = "linear"
+    weigh: Weighing = "linear"
     ema: float = 0.99
     clip_norm: float = 0.1
     validate_every: int = 100

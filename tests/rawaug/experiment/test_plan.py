@@ -199,3 +199,13 @@ def test_an_arm_takes_at_most_its_own_steps() -> None:
     assert [recipe.loop_of(arm).steps for arm in recipe.arms] == [40, 10, 40]
     with pytest.raises(ValueError, match="steps must be at least 1, or null for"):
         ArmConfig(steps=0)
+
+
+def test_an_arm_has_a_rate_and_a_weighing_of_its_own() -> None:
+    recipe = Recipe(
+        camera="universal",
+        train=TrainConfig(learning_rate=7e-4, weigh="mixed"),
+        arms={"scratch": ArmConfig(), "tuned": ArmConfig(learning_rate=3e-4, weigh="stabilised")},
+    )
+    loops = [recipe.loop_of(arm) for arm in recipe.arms]
+    assert [(loop.learning_rate, loop.weigh) for loop in loops] == [(7e-4, "mixed"), (3e-4, "stabilised")]

@@ -36,6 +36,27 @@ def test_linear_is_the_loss_itself() -> None:
     assert weighed(loss, "linear", SAMPLE) is loss
 
 
+def test_normalised_is_the_loss_in_units_of_the_noise_of_each_pixel() -> None:
+    expected = float((0.1 / SAMPLE.variance.sqrt()).mean())
+    assert weighed(L1(), "normalised", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_with_noisy_targets_normalised_is_unbiased_and_stabilised_is_not() -> None:
+    """The constant with the smallest l2 distance from noisy shots of a dark patch is its clean signal."""
+    clean, generator = 2e-3, torch.Generator().manual_seed(1)
+    deviation = (SHOT * clean + READ) ** 0.5
+    shots = clean + deviation * torch.randn(2, 1, 4, 128, 128, generator=generator)  # input, target
+    sample = Sample(shots[0], shots[1], (SHOT * shots[0] + READ).clamp_min(READ))
+    levels = torch.linspace(0.0, 2 * clean, 81)
+
+    def best(weigh: str) -> float:
+        loss = weighed(L2(), weigh, sample)
+        return float(levels[torch.stack([loss(y.expand_as(shots[1]), shots[1]) for y in levels]).argmin()])
+
+    assert best("normalised") == pytest.approx(clean, rel=0.03)
+    assert abs(best("stabilised") - clean) > 0.06 * clean
+
+
 def test_stabilised_is_the_loss_of_the_roots() -> None:
     for clean, denoised in ((0.1, 0.12), (0.7, 0.65)):
         expected = abs(root(denoised) - root(clean))
@@ -63,5 +84,5 @@ def test_shadows_count_more_the_more_is_stabilised() -> None:
 
 
 def test_an_unknown_weighing_is_named() -> None:
-    with pytest.raises(ValueError, match=r"train\.weigh 'cubic' is unknown; use one of linear, stabilised, mixed"):
+    with pytest.raises(ValueError, match=r"train\.weigh 'cubic' is unknown; use one of linear, normalised, stabil"):
         weighed(L1(), "cubic", SAMPLE)
