@@ -71,13 +71,16 @@ def served(pictures: Path, chromium: str) -> Iterator[str]:
     process.start()
     out.close()
     assert process.pid is not None
-    with open(said.fileno(), closefd=False) as lines:
-        address, _, hint = lines.readline().partition(" ")
-        assert hint == "(Ctrl-C stops it)\n"
-        yield address
-        os.kill(process.pid, signal.SIGINT)
-        process.join(60)
-        assert process.exitcode == 0
+    try:
+        with open(said.fileno(), closefd=False) as lines:
+            address, _, hint = lines.readline().partition(" ")
+            assert hint == "(Ctrl-C stops it)\n"
+            yield address
+            os.kill(process.pid, signal.SIGINT)
+            process.join(60)
+            assert process.exitcode == 0
+    finally:
+        process.kill()
 
 
 @pytest.fixture(scope="module")
