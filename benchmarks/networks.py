@@ -2,7 +2,7 @@
 
     python -m benchmarks.networks [--networks UNet PMRID] [--batch 16] [--crop 128] [--quick]
     python -m benchmarks.networks --device cuda --crop 256 --workers 8 --compile default reduce-overhead
-    python -m benchmarks.networks --minutes 20 --pictures PHOTOS --validation RAW_DIR     hours: every network trained
+    python -m benchmarks.networks --minutes 20 --pictures PHOTOS --validation RAW_DIR --figure OUT.png      two hours
 
 A training step is forward, backward and Adam on a batch of packed RAW pairs. Without augmentation the batch is ready;
 with it, RawAugment makes it of sRGB first; with ``--workers``, RawPairs makes it in the workers of a loader. On a GPU
@@ -10,7 +10,7 @@ the networks have the sizes of :data:`GPU_SIZES` and train in bf16. ``--compile`
 torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its
 own, whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes``
 each network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes,
-and scored on the validation frames.
+and scored on the validation frames, beside NonLocalMeans and, with ``--pmrid FILE``, PMRID's published weights.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -33,6 +32,7 @@ from torch.utils.flop_counter import FlopCounterMode
 import denoisers
 import rawaug
 from benchmarks.augment import machine, memory_used
+from benchmarks.equal_minutes import chart, references, trained
 from benchmarks.loader import fastest
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -53,7 +53,7 @@ GPU_SIZES: dict[str, dict[str, Any]] = {
 """The networks in their published sizes, the U-Net's included."""
 
 SIDE = 512
-"""Packed pixels on the side of the picture that inference is timed on, a mosaic megapixel; and of validation frames."""
+"""Packed pixels on the side of the picture that inference is timed on, a mosaic megapixel."""
 
 
 def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str, float]:
@@ -72,42 +72,6 @@ def inference(network: denoisers.Denoiser, args: argparse.Namespace) -> dict[str
             figures[f"s/Mpix, {threads} thread(s)"] = seconds / megapixels
         torch.set_num_threads(before)
     return figures
-
-
-def trained(name: str, args: argparse.Namespace) -> dict[str, float]:
-    """PSNR on validation, in RAW and sRGB, after ``args.minutes`` of training; steps are fitted to the time."""
-    from rawaug.data import open_pairs, open_pictures
-    from rawaug.evaluation.scores import frozen_sample
-    from rawaug.noise import noise_model
-    from rawaug.training.loop import train
-    from rawaug.training.stream import PictureCrops, TrainingStream
-    from rawaug.training.train_config import DenoiserConfig, TrainConfig
-    from rawaug.training.validation import validate, watched
-
-    noise = noise_model(["any camera", "cycleisp_sidd"])
-    pictures = open_pictures(args.pictures, min_side=args.crop + 6)
-    augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
-    crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
-    cfa = augment.isp.cfa
-    middles = [pair.middle(SIDE) for pair in open_pairs(args.validation, split="validation")]
-    frames = [watched(frozen_sample(pair, noise, cfa, 0), pair, cfa) for pair in middles]
-    stream = TrainingStream(None, crops, args.batch, 1.0, seed=0)
-    config = TrainConfig(batch=args.batch, crop=args.crop, learning_rate=1e-3, weigh="stabilised", clip_norm=1.0)
-    network = DenoiserConfig(name, SIZES[name] | ({} if name == "PMRID" else {"domain": "ksigma"}))
-
-    def run(steps: int) -> tuple[denoisers.Denoiser, float]:
-        config.steps, config.validate_every, config.checkpoint_every = steps, steps, steps
-        config.ema = 0.999 if steps > 5000 else 0.99
-        with tempfile.TemporaryDirectory() as folder:
-            began = time.perf_counter()
-            model = train(stream, frames, network, config, Path(folder), device=args.device.type, label=name)
-            return model, time.perf_counter() - began
-
-    _, probe = run(30)
-    steps = max(30, round(30 * 60.0 * args.minutes / probe))
-    model, seconds = run(steps)
-    scores = validate(model, frames, torch.device("cpu"))
-    return {"minutes": seconds / 60, "steps": steps, "psnr": scores["psnr"], "psnr_srgb": scores["psnr_srgb"]}
 
 
 Step = Callable[[rawaug.RawPair], None]
@@ -188,15 +152,14 @@ def ensemble(network: denoisers.Denoiser, args: argparse.Namespace) -> float:
 def measure(name: str, args: argparse.Namespace, size: dict[str, Any] | None = None) -> dict[str, float]:
     """Of one network, in the size of the table if none is given."""
     torch.set_num_threads(args.threads)
-    if args.minutes:
-        return trained(name, args)
     size = (GPU_SIZES if args.device.type == "cuda" else SIZES)[name] if size is None else size
     network = denoisers.build(name, **size | ({"width": args.width} if args.width else {}))
     network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    costs = inference(network.eval(), args)
+    costs = {"parameters": sum(p.numel() for p in network.parameters()), **inference(network.eval(), args)}
+    if args.minutes:
+        return costs | trained(name, SIZES[name], args)
     steps = training(network.train(), args)
-    parameters = sum(p.numel() for p in network.parameters())
-    return {"parameters": parameters, **costs, **steps, "8 views / 1": ensemble(network.eval(), args)}
+    return {**costs, **steps, "8 views / 1": ensemble(network.eval(), args)}
 
 
 def main() -> None:
@@ -209,6 +172,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=0.0, help="train each for so long, and score it")
     parser.add_argument("--pictures", default="demo:", help="sRGB pictures of --minutes")
     parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
+    parser.add_argument("--pmrid", help="file of PMRID's published weights, to be scored beside --minutes")
+    parser.add_argument("--figure", type=Path, help="draw --minutes' PSNR over seconds a megapixel into this PNG")
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--crop", type=int, default=128, help="side of the sRGB crops")
     parser.add_argument("--side", type=int, default=SIDE, help="of the packed picture that inference is timed on")
@@ -227,6 +192,12 @@ def main() -> None:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as own:
             figures[name] = own.submit(measure, name, args).result()
         print(f"  {name:6s}", "  ".join(f"{what} {value:.4g}" for what, value in figures[name].items()))
+    if args.minutes:
+        figures["references"] = references(args)
+        for name, scores in figures["references"].items():
+            print(f"  {name}", "  ".join(f"{what} {value:.4g}" for what, value in scores.items()))
+    if args.minutes and args.figure:
+        chart({name: figures[name] for name in args.networks}, figures["references"], args.figure)
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1) + "\n")
 
