@@ -104,11 +104,11 @@ def chart(networks: Mapping[str, Mapping[str, float]], references: Mapping[str, 
             axes.plot(seconds, row[key], "o", color="C0")
             label = f"{name}, {row['parameters'] / 1e6:.2f} M"
             axes.annotate(label, (seconds, row[key]), xytext=(6, 4), textcoords="offset points", fontsize=8)
-        for label, row in references.items():
+        for (label, row), (x, side) in zip(references.items(), ((1.0, "right"), (0.0, "left")), strict=False):
             axes.axhline(row[key], color="0.6", linewidth=1)
-            axes.annotate(
-                label, (1.0, row[key]), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8
-            )
+            place_of = {"xycoords": ("axes fraction", "data"), "ha": side, "va": "bottom"}
+            axes.annotate(label, (x, row[key]), fontsize=8, **place_of)
         axes.set(xlabel="seconds a megapixel, one thread", ylabel="PSNR (dB)", title=title)
         axes.margins(0.25)
+        axes.set_xlim(left=0)
     figure.savefig(place, dpi=120)
