@@ -101,14 +101,10 @@ def chart(networks: Mapping[str, Mapping[str, float]], references: Mapping[str, 
     for axes, key, title in zip(figure.subplots(1, 2), ("psnr", "psnr_srgb"), ("RAW", "developed sRGB"), strict=True):
         for name, row in networks.items():
             seconds = next(value for what, value in row.items() if what.startswith("s/Mpix"))
-            axes.plot(seconds, row[key], "o", color="C0")
-            label = f"{name}, {row['parameters'] / 1e6:.2f} M"
-            axes.annotate(label, (seconds, row[key]), xytext=(6, 4), textcoords="offset points", fontsize=8)
-        for (label, row), (x, side) in zip(references.items(), ((1.0, "right"), (0.0, "left")), strict=False):
-            axes.axhline(row[key], color="0.6", linewidth=1)
-            place_of = {"xycoords": ("axes fraction", "data"), "ha": side, "va": "bottom"}
-            axes.annotate(label, (x, row[key]), fontsize=8, **place_of)
+            axes.plot(seconds, row[key], "o", markersize=8, label=f"{name}, {row['parameters'] / 1e6:.2f} M")
+        for (label, row), style in zip(references.items(), ("--", ":"), strict=False):
+            axes.axhline(row[key], color="0.4", linestyle=style, label=label)
         axes.set(xlabel="seconds a megapixel, one thread", ylabel="PSNR (dB)", title=title)
-        axes.margins(0.25)
         axes.set_xlim(left=0)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right")
     figure.savefig(place, dpi=120)
