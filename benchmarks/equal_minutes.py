@@ -10,10 +10,10 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 import denoisers
@@ -24,6 +24,7 @@ from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
 from rawaug.data.sample import Sample
 from rawaug.evaluation.scores import classical_method, frozen_sample, score_method
+from rawaug.experiment.denoiser_sweep import published_pmrid
 from rawaug.noise import noise_model
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, TrainingStream
@@ -43,7 +44,11 @@ def middles(args: argparse.Namespace) -> list[Pair]:
 
 
 def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[str, float]:
-    """PSNR of one network, in dB, after ``args.minutes`` of training on what ``recipes/pretrain.yaml`` describes."""
+    """PSNR in dB of one network after ``args.minutes`` of training on what ``recipes/pretrain.yaml`` describes.
+
+    Args:
+        size: the network's settings, but for its domain.
+    """
     noise = noise_model(NOISE)
     pictures = Remembered(open_pictures(args.pictures, min_side=args.crop + 6), CACHE)
     augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
@@ -75,9 +80,7 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     noise, cfa = noise_model(NOISE), CFA.RGGB
     methods = {"NonLocalMeans": classical_method("NonLocalMeans", noise, 0)}
     if args.pmrid:
-        published = denoisers.PMRID()
-        published.load_state_dict(load_file(args.pmrid))
-        published.eval()
+        published = published_pmrid(args.pmrid)
 
         def pmrid(_: Pair, sample: Sample) -> Tensor:
             return denoisers.tiled(published, sample.noisy, sample.variance).clamp(0.0, 1.0)
@@ -86,10 +89,7 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     rows = {}
     for label, method in methods.items():
         scores = [score for score, *_ in score_method(method, middles(args), noise, cfa, 0, label)]
-        rows[label] = {
-            "psnr": sum(score.psnr for score in scores) / len(scores),
-            "psnr_srgb": sum(score.psnr_srgb or float("nan") for score in scores) / len(scores),
-        }
+        rows[label] = {key: fmean(getattr(score, key) for score in scores) for key in ("psnr", "psnr_srgb")}
     return rows
 
 

@@ -152,12 +152,13 @@ def ensemble(network: denoisers.Denoiser, args: argparse.Namespace) -> float:
 def measure(name: str, args: argparse.Namespace, size: dict[str, Any] | None = None) -> dict[str, float]:
     """Of one network, in the size of the table if none is given."""
     torch.set_num_threads(args.threads)
-    size = (GPU_SIZES if args.device.type == "cuda" else SIZES)[name] if size is None else size
-    network = denoisers.build(name, **size | ({"width": args.width} if args.width else {}))
+    sizes = GPU_SIZES if args.device.type == "cuda" and not args.minutes else SIZES
+    size = (sizes[name] if size is None else size) | ({"width": args.width} if args.width else {})
+    network = denoisers.build(name, **size)
     network = network.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     costs = {"parameters": sum(p.numel() for p in network.parameters()), **inference(network.eval(), args)}
     if args.minutes:
-        return costs | trained(name, SIZES[name], args)
+        return costs | trained(name, size, args)
     steps = training(network.train(), args)
     return {**costs, **steps, "8 views / 1": ensemble(network.eval(), args)}
 

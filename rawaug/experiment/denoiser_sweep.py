@@ -151,7 +151,7 @@ def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
         model, info = denoisers.load(find(name))
         makers[Path(name).stem] = _network(model.to(device), CFA(info.get("cfa", "RGGB")), clip=False)
     if settings.pmrid is not None:
-        makers["PMRID as published"] = _network(_published(settings.pmrid).to(device), CFA.RGGB, clip=True)
+        makers["PMRID as published"] = _network(published_pmrid(settings.pmrid).to(device), CFA.RGGB, clip=True)
     return makers
 
 
@@ -170,7 +170,7 @@ def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:
     return make
 
 
-def _published(path: str) -> denoisers.PMRID:
+def published_pmrid(path: str) -> denoisers.PMRID:
     """PMRID with the weights of its authors.
 
     Raises:
