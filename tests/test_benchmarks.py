@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import denoisers
-from benchmarks import augment, denoise, networks, shards
+from benchmarks import augment, denoise, equal_minutes, networks, shards
+from rawaug.io import read_picture
 
 CPU = torch.device("cpu")
 
@@ -95,3 +96,22 @@ def test_folders_are_compared_by_names_and_bytes(tmp_path: Path) -> None:
     assert shards.digest(tmp_path / "a")[0] != one[0]
     (tmp_path / "b/000/000001.jpg").write_bytes(b"other")
     assert shards.digest(tmp_path / "b")[0] != other[0]
+
+
+def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(equal_minutes, "PROBE", 2)
+    monkeypatch.setattr(equal_minutes, "MIDDLE", 64)
+    args = argparse.Namespace(
+        pictures="demo:", validation="demo:validation", batch=2, crop=32, minutes=0.0, device=CPU, pmrid=None
+    )
+    row = equal_minutes.trained("DnCNN", {"width": 4, "depth": 3}, args)
+    assert row["steps"] == 2, "no fewer than the probe's"
+    references = equal_minutes.references(args)
+    frame = equal_minutes.middles(args)[0]
+    assert frame.raw.shape == (1, 64, 64) and references.keys() == {"NonLocalMeans"}
+    assert references["NonLocalMeans"]["psnr"] > row["psnr"] > 0, "a network of two steps is below a filter"
+    rows = {"DnCNN": row | {"parameters": 100.0, "s/Mpix, 1 thread(s)": 0.5}}
+    equal_minutes.chart(rows, references, tmp_path / "chart.png")
+    assert read_picture(tmp_path / "chart.png").shape == (3, 480, 1080)
