@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import denoisers
-from benchmarks import augment, denoise, equal_minutes, networks, shards
+from benchmarks import augment, crops, denoise, equal_minutes, networks, shards
+from rawaug.data.demo.demo_pairs import FRAME
 from rawaug.io import read_picture
 
 CPU = torch.device("cpu")
@@ -115,3 +116,12 @@ def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filte
     rows = {"DnCNN": row | {"parameters": 100.0, "s/Mpix, 1 thread(s)": 0.5}}
     equal_minutes.chart(rows, references, tmp_path / "chart.png")
     assert read_picture(tmp_path / "chart.png").shape == (3, 480, 1080)
+
+
+def test_pieces_of_frames_are_drawn_beside_a_filter(tmp_path: Path) -> None:
+    print_ = crops.page()
+    assert print_.raw.shape == (1, *FRAME) and print_.raw.std() > 0.05, "there is print on the paper"
+    crops.main(["demo:test", "--place", "page", "0", "0", "--iso", "6400", "--out", str(tmp_path / "crops.png")])
+    assert read_picture(tmp_path / "crops.png").shape == (3, 325, 1092), "noisy, filtered, by the network, clean"
+    with pytest.raises(SystemExit, match="page: 256 x 256 at 40, 0 is not within 288 x 448"):
+        crops.main(["demo:test", "--place", "page", "40", "0", "--out", str(tmp_path / "crops.png")])
