@@ -18,12 +18,13 @@ from torch import Tensor
 
 import denoisers
 import rawaug
+from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.pair import Pair
 from rawaug.data.remembered import Remembered
 from rawaug.data.sample import Sample
-from rawaug.evaluation.scores import classical_method, frozen_sample, score_method
+from rawaug.evaluation.scores import classical_method, frozen_sample, network_method, score_method
 from rawaug.experiment.denoiser_sweep import published_pmrid
 from rawaug.noise import noise_model
 from rawaug.training.loop import train
@@ -34,6 +35,7 @@ from rawaug.training.validation import validate, watched
 NOISE = ["any camera", "cycleisp_sidd"]
 MIDDLE = 512
 """Mosaic pixels on the side of what is scored of each validation frame."""
+SHIPPED = "rawaug-small"
 PROBE, CACHE = 60, 2048
 """Steps that are timed, and MB of decoded pictures."""
 
@@ -76,9 +78,13 @@ def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[s
 
 
 def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """The same scores of NonLocalMeans and, where ``args.pmrid`` is a file, of PMRID's published weights."""
+    """The same scores of NonLocalMeans, of the shipped weights and, where ``args.pmrid`` is a file, of PMRID's."""
     noise, cfa = noise_model(NOISE), CFA.RGGB
-    methods = {"NonLocalMeans": classical_method("NonLocalMeans", noise, 0)}
+    shipped, info = denoisers.load(find(SHIPPED))
+    methods = {
+        "NonLocalMeans": classical_method("NonLocalMeans", noise, 0),
+        SHIPPED: network_method(shipped, cfa, CFA(info["cfa"])),
+    }
     if args.pmrid:
         published = published_pmrid(args.pmrid)
 
@@ -102,7 +108,7 @@ def chart(networks: Mapping[str, Mapping[str, float]], references: Mapping[str, 
         for name, row in networks.items():
             seconds = next(value for what, value in row.items() if what.startswith("s/Mpix"))
             axes.plot(seconds, row[key], "o", markersize=8, label=f"{name}, {row['parameters'] / 1e6:.2f} M")
-        for (label, row), style in zip(references.items(), ("--", ":"), strict=False):
+        for (label, row), style in zip(references.items(), ("--", "-", ":"), strict=False):
             axes.axhline(row[key], color="0.4", linestyle=style, label=label)
         axes.set(xlabel="seconds a megapixel, one thread", ylabel="PSNR (dB)", title=title)
         axes.set_xlim(left=0)

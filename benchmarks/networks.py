@@ -10,7 +10,8 @@ the networks have the sizes of :data:`GPU_SIZES` and train in bf16. ``--compile`
 torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its
 own, whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes``
 each network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes,
-and scored on the validation frames, beside NonLocalMeans and, with ``--pmrid FILE``, PMRID's published weights.
+and scored on the validation frames, beside NonLocalMeans, ``rawaug-small`` and, with ``--pmrid FILE``, PMRID's
+published weights.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filte
     assert row["steps"] == 2, "no fewer than the probe's"
     references = equal_minutes.references(args)
     frame = equal_minutes.middles(args)[0]
-    assert frame.raw.shape == (1, 64, 64) and references.keys() == {"NonLocalMeans"}
+    assert frame.raw.shape == (1, 64, 64) and references.keys() == {"NonLocalMeans", "rawaug-small"}
     assert references["NonLocalMeans"]["psnr"] > row["psnr"] > 0, "a network of two steps is below a filter"
     rows = {"DnCNN": row | {"parameters": 100.0, "s/Mpix, 1 thread(s)": 0.5}}
     equal_minutes.chart(rows, references, tmp_path / "chart.png")
