@@ -1,4 +1,4 @@
-r"""R2R's average: ``mean over k of f(y + alpha m_k)``, with ``m_k`` drawn with the noise's own variance.
+r"""R2R's average: ``mean over k of f(y + alpha m_k)``, with ``m_k`` drawn with the noise's own variance at ``f(y)``.
 
 Domain: packed RAW. A network that was trained on recorrupted frames gets the input it knows, and the average removes
 most of what the added noise costs. Source: Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
@@ -15,7 +15,7 @@ from denoisers.domains import levels_of
 
 
 class Recorrupted(nn.Module):
-    """A denoiser averaged over several draws of extra noise: called as the denoiser is, ``draws`` times the work.
+    """A denoiser averaged over several draws of extra noise: called as the denoiser is, ``draws + 1`` times the work.
 
     Args:
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
@@ -39,7 +39,8 @@ class Recorrupted(nn.Module):
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
         shot_var, read_var = levels_of(noisy, variance)
-        deviation = self.alpha * (shot_var * noisy + read_var).clamp_min(0.0).sqrt()
+        signal = self.model(noisy, variance)
+        deviation = self.alpha * (shot_var * signal.clamp_min(0.0) + read_var).sqrt()
         generator = torch.Generator().manual_seed(self.seed)
         total = torch.zeros_like(noisy)
         for _ in range(self.draws):

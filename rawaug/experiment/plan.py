@@ -21,7 +21,7 @@ from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import ESTIMATORS
-from rawaug.training.noisy_frames import noisy_frame
+from rawaug.training.noisy_frames import noise_of
 
 MOST_HELD_OUT = 16
 """Largest number of frames that are held out for validation: a fifth of them, but at least one."""
@@ -190,4 +190,4 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
         isp = None if recipe.camera is None else DictionaryISP.from_pretrained(find_weights(recipe.camera))
         levels = None if isp is None else isp.info.get("noise")
         for pair in [*(pairs if real else []), *validation]:
-            noisy_frame(pair, levels)
+            noise_of(pair, levels)

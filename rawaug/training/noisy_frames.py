@@ -23,7 +23,8 @@ from rawaug.noise import ShotReadModel, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided, to_rgb_tensor
 from rawaug.seeding import keyed_generator
-from rawaug.training.estimators import R2R, SelfSupervised
+from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
+from rawaug.training.pilot import first_estimate
 from rawaug.training.stream import turned_crop
 
 CACHED = 64
@@ -36,12 +37,14 @@ class NoisyFrame(NamedTuple):
     Args:
         name: for reports.
         shots: noisy mosaics of it ``(K, H, W)``.
+        signal: the scene without noise, ``(1, H, W)``, as far as it is known: see :mod:`rawaug.training.pilot`.
         shot_var, read_var: the levels of their noise.
         cfa: their pattern.
     """
 
     name: str
     shots: Tensor
+    signal: Tensor
     shot_var: float
     read_var: float
     cfa: CFA
@@ -62,8 +65,8 @@ def noisy_only(pair: Pair) -> Pair:
     return replace(pair, raw=pair.noisy, srgb=(srgb * 255.0).round().to(torch.uint8), registered=True)
 
 
-def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
-    """A real noisy frame.
+def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
+    """(shot_var, read_var) of a real noisy frame.
 
     Args:
         pair: as :func:`noisy_only` leaves it.
@@ -73,14 +76,20 @@ def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
         ValueError: if the levels are unknown, or the law does not reach the pair's ISO.
     """
     if pair.shot_var is not None and pair.read_var is not None:
-        return NoisyFrame(pair.name, pair.raw, pair.shot_var, pair.read_var, pair.cfa)
+        return pair.shot_var, pair.read_var
     if camera is None:
         raise ValueError(f'{pair.name}: has no noise levels; measure them with noise: "camera"')
     try:
-        shot_var, read_var = camera_law(camera).at(pair.iso)
+        return camera_law(camera).at(pair.iso)
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
-    return NoisyFrame(pair.name, pair.raw, shot_var, read_var, pair.cfa)
+
+
+def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
+    """A real noisy frame, with its noise as :func:`noise_of` finds it, and a first estimate of its signal."""
+    shot_var, read_var = noise_of(pair, camera)
+    signal = first_estimate(pair.raw, shot_var, read_var, pair.cfa)
+    return NoisyFrame(pair.name, pair.raw, signal, shot_var, read_var, pair.cfa)
 
 
 class FrozenPictures(Sequence[NoisyFrame]):
@@ -122,8 +131,9 @@ class FrozenPictures(Sequence[NoisyFrame]):
             seed = torch.randint(2**62, (1,), generator=keyed_generator(self.seed, "shot", index, shot))
             pair = self.augment.apply(srgb, params._replace(noise={**params.noise, "seed": seed}))
             shots.append(bayer.unpack(pair.noisy, self.augment.isp.cfa)[0])
+        signal = bayer.unpack(pair.clean, self.augment.isp.cfa)[0]
         shot_var, read_var = (params.noise[name].item() for name in ("shot_var", "read_var"))
-        return NoisyFrame(f"picture {index}", torch.cat(shots), shot_var, read_var, self.augment.isp.cfa)
+        return NoisyFrame(f"picture {index}", torch.cat(shots), signal, shot_var, read_var, self.augment.isp.cfa)
 
 
 class NoisyCrops:
@@ -145,10 +155,11 @@ class NoisyCrops:
         if min(frame.shots.shape[-2:]) < self.crop + 6:
             size = f"{frame.shots.shape[-2]} x {frame.shots.shape[-1]}"
             raise ValueError(f"{frame.name}: a frame of {size} is too small for train.crop={self.crop}")
-        images = turned_crop(aligned(frame.shots, frame.cfa, self.cfa), self.crop, self.cfa, generator)
-        shots = bayer.pack(images[:, None], self.cfa)
-        drawn = self.estimator.sample(shots.shape[1:], generator)
-        return self.estimator.apply(shots, frame.shot_var, frame.read_var, drawn)
+        images = torch.cat([frame.shots, frame.signal])
+        images = turned_crop(aligned(images, frame.cfa, self.cfa), self.crop, self.cfa, generator)
+        packed = bayer.pack(images[:, None], self.cfa)
+        drawn = self.estimator.sample(packed.shape[1:], generator)
+        return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
 
 
 def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Sample]:
@@ -159,9 +170,10 @@ def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Samp
     """
     samples = []
     for frame in frames:
-        packed = bayer.pack(aligned(frame.shots[:1], frame.cfa, cfa)[:, None], cfa)
+        images = torch.cat([frame.shots[:1], frame.signal])
+        packed = bayer.pack(aligned(images, frame.cfa, cfa)[:, None], cfa)
         estimator = R2R()
         drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
-        sample = estimator.apply(packed, frame.shot_var, frame.read_var, drawn)
+        sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
         samples.append(Sample(*(x[None] for x in sample)))
     return samples

@@ -26,7 +26,8 @@ def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
         return image
 
     Recorrupted(network, ALPHA, draws=2)(noisy, variance)
-    (first, first_map), (second, _) = seen
+    (whole, whole_map), (first, first_map), (second, _) = seen
+    assert torch.equal(whole, noisy) and torch.equal(whole_map, variance), "the signal, where the noise is drawn"
     added = (first - noisy) / (ALPHA * variance.sqrt())
     assert float(added.mean()) == pytest.approx(0.0, abs=0.03) and float(added.std()) == pytest.approx(1.0, abs=0.03)
     torch.testing.assert_close(first_map, (1 + ALPHA**2) * (SHOT_VAR * first + READ_VAR), rtol=1e-3, atol=1e-7)
@@ -34,9 +35,10 @@ def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
 
 
 def test_the_average_of_many_is_that_of_the_network_over_the_noise() -> None:
-    """Of y^2 it is y^2 plus the variance of what was added: one draw is far from it, and the draws are a mean."""
+    """Of y^2 it is y^2 plus the variance of what was added, which is that at y^2: one draw is far from it, and the
+    draws are a mean."""
     noisy, variance = frame()
-    expected = noisy**2 + ALPHA**2 * variance
+    expected = noisy**2 + ALPHA**2 * (SHOT_VAR * noisy**2 + READ_VAR)
 
     def error(draws: int) -> float:
         return float((Recorrupted(lambda z, _: z**2, ALPHA, draws)(noisy, variance) - expected).square().mean())

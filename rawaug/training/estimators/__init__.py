@@ -10,12 +10,9 @@ r2r                ``y + a m``               ``y - m / a``         E[x | input],
 neighbor2neighbor  one pixel of each cell    its neighbour         E[neighbour | input]: biased where neighbours differ
 =================  ========================  ====================  =====================================================
 
-``m`` is drawn with the noise's own variance, ``shot_var y + read_var``, held at 0. That it is taken at the noisy signal
-is right on average: r2r's input and target stay uncorrelated given x, since E[shot_var y + read_var] is the variance at
-x. Holding it at 0 adds to that mean where y often falls below ``-read_var / shot_var``, that is in shadows of cameras
-whose shot noise is strong beside their read noise: at x = 0 the slope of r2r's target on its input, which should be 0,
-is -0.0002 where ``sqrt(read_var) / shot_var`` is 5, -0.004 at 2 and -0.07 at 1. What the sensor clipped at black (as
-SIDD's published frames are) or at white is lost to every estimator.
+``m`` is drawn with the noise's own variance at x, ``shot_var x + read_var``. Of pictures x is known; of real frames
+there is a first estimate (:mod:`rawaug.training.pilot`), and what that errs by is left as a bias, most of it at edges.
+What the sensor clipped at black (as SIDD's published frames are) or at white is lost to every estimator.
 
 Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, that of l1 their median.
 
@@ -29,7 +26,7 @@ from rawaug.training.estimators.neighbor2neighbor import NEIGHBOURS, Neighbor2Ne
 from rawaug.training.estimators.noise2noise import Noise2Noise
 from rawaug.training.estimators.noisier import Noisier
 from rawaug.training.estimators.r2r import R2R
-from rawaug.training.estimators.self_supervised import SelfSupervised, variance_of
+from rawaug.training.estimators.self_supervised import NoisyCrop, SelfSupervised, variance_of
 from rawaug.training.estimators.supervised import Supervised
 
 __all__ = [
@@ -39,6 +36,7 @@ __all__ = [
     "NeighborSample",
     "Noise2Noise",
     "Noisier",
+    "NoisyCrop",
     "SelfSupervised",
     "Supervised",
     "neighbours",

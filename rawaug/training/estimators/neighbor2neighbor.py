@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rawaug.registry import ESTIMATORS
 from rawaug.training.criteria import Criterion
-from rawaug.training.estimators.self_supervised import SelfSupervised, variance_of
+from rawaug.training.estimators.self_supervised import NoisyCrop, SelfSupervised, variance_of
 
 
 class NeighborSample(NamedTuple):
@@ -51,9 +51,10 @@ class Neighbor2Neighbor(SelfSupervised):
         """The choice of every cell; the planes share it, so that their colours belong together."""
         return torch.randint(len(NEIGHBOURS), (1, shape[-2] // 2, shape[-1] // 2), generator=generator)
 
-    def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> NeighborSample:
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> NeighborSample:
         """See :meth:`SelfSupervised.apply`."""
-        return NeighborSample(shots[0], variance_of(shots[0], shot_var, read_var), drawn)
+        noisy = crop.shots[0]
+        return NeighborSample(noisy, variance_of(noisy, crop.shot_var, crop.read_var), drawn)
 
     def loss(self, model: Any, sample: NeighborSample, criterion: Criterion, progress: float = 1.0) -> Tensor:
         """See :meth:`Supervised.loss`."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from rawaug.data.sample import Sample
 from rawaug.registry import ESTIMATORS
-from rawaug.training.estimators.self_supervised import SelfSupervised, variance_of
+from rawaug.training.estimators.self_supervised import NoisyCrop, SelfSupervised, variance_of
 
 
 @ESTIMATORS.register("noise2noise")
@@ -20,7 +20,7 @@ class Noise2Noise(SelfSupervised):
         """Which of the two is the input: 0 or 1."""
         return torch.randint(2, (), generator=generator)
 
-    def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> Sample:
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
         """See :meth:`SelfSupervised.apply`."""
-        noisy, target = shots[drawn], shots[1 - drawn]
-        return Sample(noisy, target, variance_of(noisy, shot_var, read_var))
+        noisy, target = crop.shots[drawn], crop.shots[1 - drawn]
+        return Sample(noisy, target, variance_of(noisy, crop.shot_var, crop.read_var))

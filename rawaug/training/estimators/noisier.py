@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from denoisers.network import Denoiser
 from rawaug.data.sample import Sample
 from rawaug.registry import ESTIMATORS
-from rawaug.training.estimators.self_supervised import SelfSupervised, positive, recorrupted
+from rawaug.training.estimators.self_supervised import NoisyCrop, SelfSupervised, positive, recorrupted
 
 
 @ESTIMATORS.register("noisier")
@@ -26,11 +26,10 @@ class Noisier(SelfSupervised):
     def __init__(self, alpha: float = 1.0, correct: bool = False) -> None:
         self.alpha, self.correct = positive(alpha), correct
 
-    def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> Sample:
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
         """See :meth:`SelfSupervised.apply`."""
-        noisy = shots[0]
-        noisier, variance = recorrupted(noisy, shot_var, read_var, self.alpha, drawn)
-        return Sample(noisier, noisy, variance)
+        noisier, variance = recorrupted(crop, self.alpha, drawn)
+        return Sample(noisier, crop.shots[0], variance)
 
     def corrected(self, model: Denoiser) -> Denoiser:
         """See :meth:`Supervised.corrected`."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from denoisers.recorrupted import Recorrupted
 from rawaug.data.sample import Sample
 from rawaug.registry import ESTIMATORS
-from rawaug.training.estimators.self_supervised import SelfSupervised, drawing_variance, positive, recorrupted
+from rawaug.training.estimators.self_supervised import NoisyCrop, SelfSupervised, positive, recorrupted
 
 
 @ESTIMATORS.register("r2r")
@@ -27,12 +27,10 @@ class R2R(SelfSupervised):
             raise ValueError(f"average must be at least 0, got {average}")
         self.alpha, self.average = positive(alpha), average
 
-    def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> Sample:
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
         """See :meth:`SelfSupervised.apply`."""
-        noisy = shots[0]
-        noisier, variance = recorrupted(noisy, shot_var, read_var, self.alpha, drawn)
-        target = noisy - drawing_variance(noisy, shot_var, read_var).sqrt() * drawn / self.alpha
-        return Sample(noisier, target, variance)
+        noisier, variance = recorrupted(crop, self.alpha, drawn)
+        return Sample(noisier, crop.shots[0] - crop.deviation * drawn / self.alpha, variance)
 
     def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
         """See :meth:`Supervised.at_test`."""

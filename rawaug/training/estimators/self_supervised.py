@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,21 +12,32 @@ from rawaug.training.estimators.supervised import Supervised
 
 
 def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """The noise map of a frame, computed from the noisy signal clipped at black as in every test; its shape."""
+    """``read_var + shot_var max(y, 0)``: the noise map of a frame, as in every test; its shape."""
     return read_var + shot_var * noisy.clamp_min(0.0)
 
 
-def drawing_variance(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """The variance with which noise is put on top of ``noisy``: ``shot_var y + read_var``, at least 0.
+class NoisyCrop(NamedTuple):
+    """What is known of one scene.
 
-    The signal is not clipped at black first: of the noisy values around a dark ``x`` half lie below it, and the mean
-    of the variance must be that at ``x``. It is as long as ``y`` rarely falls below ``-read_var / shot_var``.
+    Args:
+        shots: packed noisy crops of it ``(K, 4, h, w)``.
+        signal: it without noise ``(4, h, w)``, known or estimated: the noise's variance is that at ``signal``.
+        shot_var, read_var: the levels of the noise.
     """
-    return (shot_var * noisy + read_var).clamp_min(0.0)
+
+    shots: Tensor
+    signal: Tensor
+    shot_var: float
+    read_var: float
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of the noise of a shot, ``(4, h, w)``."""
+        return variance_of(self.signal, self.shot_var, self.read_var).sqrt()
 
 
 class SelfSupervised(Supervised, ABC):
-    """Base: ``apply(shots, levels, sample(shape, generator))`` makes a training sample of noisy frames.
+    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
 
     ``shots`` is how many noisy frames of one scene it needs.
     """
@@ -39,14 +50,14 @@ class SelfSupervised(Supervised, ABC):
         return torch.randn(shape, generator=generator)
 
     @abstractmethod
-    def apply(self, shots: Tensor, shot_var: float, read_var: float, drawn: Tensor) -> Any:
-        """The training sample of packed noisy crops ``(K, 4, h, w)``, K >= ``shots``; pure."""
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Any:
+        """The training sample of a crop with at least ``shots`` shots; pure."""
 
 
-def recorrupted(noisy: Tensor, shot_var: float, read_var: float, alpha: float, drawn: Tensor) -> tuple[Tensor, Tensor]:
+def recorrupted(crop: NoisyCrop, alpha: float, drawn: Tensor) -> tuple[Tensor, Tensor]:
     """``y + alpha m``, clipped at white, and the variance map of all its noise."""
-    noisier = (noisy + alpha * drawing_variance(noisy, shot_var, read_var).sqrt() * drawn).clamp(max=1.0)
-    return noisier, (1.0 + alpha**2) * variance_of(noisier, shot_var, read_var)
+    noisier = (crop.shots[0] + alpha * crop.deviation * drawn).clamp(max=1.0)
+    return noisier, (1.0 + alpha**2) * variance_of(noisier, crop.shot_var, crop.read_var)
 
 
 def positive(alpha: float) -> float:

@@ -15,6 +15,7 @@ from rawaug.training.estimators import (
     Neighbor2Neighbor,
     Noise2Noise,
     Noisier,
+    NoisyCrop,
     SelfSupervised,
     Supervised,
     neighbours,
@@ -34,6 +35,10 @@ def scene_and_shots(shots: int = 1, clean: Tensor | None = None, seed: int = 0) 
     return clean, clean + noise
 
 
+def crop_of(shots: Tensor, signal: Tensor, shot_var: float = SHOT_VAR, read_var: float = READ_VAR) -> NoisyCrop:
+    return NoisyCrop(shots, signal.expand_as(shots[0]), shot_var, read_var)
+
+
 def slope(target: Tensor, given: Tensor) -> float:
     """Of the best linear estimate of ``target``: its covariance with ``given`` over the variance of ``given``."""
     given = given - given.mean()
@@ -44,7 +49,7 @@ def trained_slope(estimator: SelfSupervised) -> tuple[float, float]:
     """Slope that l2 training converges to, and the one that clean targets would give."""
     clean, shots = scene_and_shots(estimator.shots)
     drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(7))
-    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    sample = estimator.apply(crop_of(shots, clean), drawn)
     return slope(sample.clean, sample.noisy), slope(clean, sample.noisy)
 
 
@@ -54,17 +59,22 @@ def test_unbiased_targets_teach_what_clean_ones_would(estimator: SelfSupervised)
     assert taught == pytest.approx(right, abs=0.01)
 
 
+@pytest.mark.parametrize("signal", [0.0, 0.02, 0.1])
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
-def test_in_the_dark_targets_of_r2r_do_not_follow_its_input(alpha: float) -> None:
-    """At black the clean signal is constant, so that the slope has to be 0; noise drawn as of the clipped signal, which
-    half of the time is brighter than the scene, makes it -0.15 at these levels and alpha 0.5."""
-    shot_var, read_var = 5e-3, 1e-4
-    generator = torch.Generator().manual_seed(0)
-    dark = read_var**0.5 * torch.randn(1, 4, 512, 512, generator=generator)
+def test_the_mean_of_r2rs_target_is_the_signal_whatever_its_input_is(alpha: float, signal: float) -> None:
+    """Of a known constant scene every input teaches the same; noise drawn with the variance at the noisy signal is
+    uncorrelated with the input too, but its targets go down by 0.5 to 1 standard deviations at both ends."""
+    shot_var, read_var = 8e-3, 3e-4
+    clean = torch.full((4, 512, 512), signal)
+    deviation = (shot_var * signal + read_var) ** 0.5
+    shots = clean + deviation * torch.randn(1, *clean.shape, generator=torch.Generator().manual_seed(0))
     estimator = R2R(alpha)
-    drawn = estimator.sample(dark.shape[1:], torch.Generator().manual_seed(7))
-    sample = estimator.apply(dark, shot_var, read_var, drawn)
-    assert slope(sample.clean, sample.noisy) == pytest.approx(0.0, abs=0.005)
+    drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(7))
+    sample = estimator.apply(crop_of(shots, clean, shot_var, read_var), drawn)
+    offset = (sample.noisy - clean) / (deviation * (1 + alpha**2) ** 0.5)
+    for low, high in ((-9.0, -1.5), (-1.5, -0.5), (-0.5, 0.5), (0.5, 1.5), (1.5, 9.0)):
+        error = ((sample.clean - clean) / deviation)[(offset > low) & (offset < high)]
+        assert abs(float(error.mean())) < 5 * (1 + alpha**-2) ** 0.5 / len(error) ** 0.5
 
 
 def test_in_the_dark_noisier_adds_the_noise_that_is_there() -> None:
@@ -72,7 +82,7 @@ def test_in_the_dark_noisier_adds_the_noise_that_is_there() -> None:
     dark = read_var**0.5 * torch.randn(1, 4, 400, 400, generator=torch.Generator().manual_seed(0))
     estimator = Noisier(1.0)
     drawn = estimator.sample(dark.shape[1:], torch.Generator().manual_seed(7))
-    added = estimator.apply(dark, shot_var, read_var, drawn).noisy - dark[0]
+    added = estimator.apply(crop_of(dark, torch.zeros(1), shot_var, read_var), drawn).noisy - dark[0]
     assert float(added.var()) == pytest.approx(read_var, rel=0.02)
 
 
@@ -90,7 +100,7 @@ def test_targets_keep_the_mean_in_the_shadows() -> None:
     tolerance = 4 * (5 * READ_VAR / clean.numel()) ** 0.5
     for estimator in (Noisier(), Noise2Noise(), R2R(0.5)):
         drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(3))
-        target = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn).clean
+        target = estimator.apply(crop_of(shots, clean), drawn).clean
         assert float((target - clean).mean()) == pytest.approx(0.0, abs=tolerance)
 
 
@@ -99,7 +109,7 @@ def test_the_variance_map_is_that_of_the_input(alpha: float) -> None:
     clean, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
     for estimator in (Noisier(alpha), R2R(alpha)):
         drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(5))
-        sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+        sample = estimator.apply(crop_of(shots, clean), drawn)
         assert float(sample.variance.mean()) == pytest.approx(float((sample.noisy - clean).var()), rel=0.02)
 
 
@@ -107,7 +117,7 @@ def test_inputs_are_clipped_at_white_and_targets_are_not() -> None:
     shots = torch.ones(1, 4, 32, 32)
     for estimator in (Noisier(), R2R()):
         drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-        sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+        sample = estimator.apply(crop_of(shots, shots[0]), drawn)
         assert sample.noisy.max() == 1.0 and sample.noisy.min() < 1.0
     assert sample.clean.max() > 1.0  # r2r's
 
@@ -116,7 +126,7 @@ def test_the_same_draw_gives_the_same_bits() -> None:
     clean, shots = scene_and_shots(2)
     for estimator in (Noisier(), R2R(), Noise2Noise(), Neighbor2Neighbor()):
         drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(1))
-        first, again = (estimator.apply(shots, SHOT_VAR, READ_VAR, drawn) for _ in range(2))
+        first, again = (estimator.apply(crop_of(shots, clean), drawn) for _ in range(2))
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
@@ -159,10 +169,10 @@ def test_neighbours_of_odd_planes_leave_the_last_line_out() -> None:
 
 def test_the_neighbours_loss_of_the_identity() -> None:
     """f = identity on a flat field: the second term's differences cancel, the first is twice the noise's variance."""
-    _, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
+    clean, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
     estimator = Neighbor2Neighbor(gamma=5.0)
     drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    sample = estimator.apply(crop_of(shots, clean), drawn)
     batch = type(sample)(*(x[None] for x in sample))
     identity: Any = lambda noisy, variance: noisy  # noqa: E731
     loss = estimator.loss(identity, batch, torch.nn.functional.mse_loss)
@@ -171,10 +181,10 @@ def test_the_neighbours_loss_of_the_identity() -> None:
 
 def test_no_gradient_passes_through_the_neighbours_of_the_denoised_frame() -> None:
     """f = w y, whose loss and gradient can be written down; with a gradient through f(y) it would be another."""
-    _, shots = scene_and_shots(1)
+    clean, shots = scene_and_shots(1)
     estimator = Neighbor2Neighbor(gamma=3.0)
     drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-    sample = estimator.apply(shots, SHOT_VAR, READ_VAR, drawn)
+    sample = estimator.apply(crop_of(shots, clean), drawn)
     batch = type(sample)(*(x[None] for x in sample))
     first, second = neighbours(batch.noisy, batch.choice)
     w = torch.tensor(0.7, requires_grad=True)

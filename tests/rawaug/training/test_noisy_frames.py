@@ -19,7 +19,15 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
 from rawaug.plugin.augment import RawAugment
-from rawaug.training.estimators import R2R, Neighbor2Neighbor, Noise2Noise, Noisier, SelfSupervised, variance_of
+from rawaug.training.estimators import (
+    R2R,
+    Neighbor2Neighbor,
+    Noise2Noise,
+    Noisier,
+    NoisyCrop,
+    SelfSupervised,
+    variance_of,
+)
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
 from rawaug.training.stream import TrainingStream
@@ -46,8 +54,8 @@ def test_two_epochs_see_the_same_base_noise(pictures: list[torch.Tensor], augmen
         def sample(self, shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
             return torch.tensor(0)
 
-        def apply(self, shots: torch.Tensor, shot_var: float, read_var: float, drawn: torch.Tensor) -> Any:
-            return shots[0]
+        def apply(self, crop: NoisyCrop, drawn: torch.Tensor) -> Any:
+            return crop.shots[0]
 
     frame = FrozenPictures(pictures, augment, seed=3)[0]
     known = set(frame.shots.flatten().tolist())
@@ -119,7 +127,7 @@ def test_frames_as_shot_need_measured_levels() -> None:
 @pytest.mark.parametrize("cfa", list(CFA))
 def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
     rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None].expand(3, 40, 48)
-    frame = NoisyFrame("colours", bayer.mosaic(rgb, cfa), 0.0, 0.0, cfa)
+    frame = NoisyFrame("colours", bayer.mosaic(rgb, cfa), bayer.mosaic(rgb, cfa), 0.0, 0.0, cfa)
     crops = NoisyCrops([frame], Noisier(), 16, CFA.BGGR)
     expected = torch.tensor([0.2, 0.5, 0.5, 0.8])[:, None, None].expand(4, 8, 8)
     for seed in range(16):
@@ -127,7 +135,7 @@ def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
 
 
 def test_what_an_estimator_lacks_is_named() -> None:
-    frame = NoisyFrame("small", torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
+    frame = NoisyFrame("small", torch.zeros(1, 32, 32), torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
     with pytest.raises(ValueError, match="small: Noise2Noise needs 2 shots"):
         NoisyCrops([frame], Noise2Noise(), 16, CFA.RGGB).draw(torch.Generator())
     with pytest.raises(ValueError, match="small: a frame of 32 x 32 is too small"):
@@ -166,7 +174,7 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     y, x = torch.meshgrid(torch.linspace(0, 6, 128), torch.linspace(0, 6, 128), indexing="ij")
     clean = (0.4 + 0.15 * torch.sin(x) * torch.cos(y)).expand(3, -1, -1)
     shots = clean + torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0)) * (0.01 * clean + 1e-3).sqrt()
-    frame = NoisyFrame("smooth", shots[:2], 0.01, 1e-3, CFA.RGGB)
+    frame = NoisyFrame("smooth", shots[:2], clean[:1], 0.01, 1e-3, CFA.RGGB)
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     config = TrainConfig(steps=80, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
