@@ -17,7 +17,7 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frames
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 from rawaug.training.validation import Watched, watched
 
@@ -69,7 +69,7 @@ def training_stream(
     synthetic: Source | None = None
     if isinstance(estimator, SelfSupervised):
         if pairs and arm.augmented < 1.0:
-            frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+            frames = noisy_frames(pairs, isp.info.get("noise"))
             real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
         if arm.augmented:
             augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
@@ -99,7 +99,7 @@ def validation_samples(
     """
     augment = RawAugment(isp, noise)
     if recipe.self_supervised:
-        frames = [noisy_frame(pair, isp.info.get("noise")) for pair in pairs]
+        frames = noisy_frames(pairs, isp.info.get("noise"))
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
         return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
     if pairs:

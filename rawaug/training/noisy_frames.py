@@ -22,6 +22,7 @@ from rawaug.data.sample import Sample
 from rawaug.noise import ShotReadModel, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided, to_rgb_tensor
+from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
 from rawaug.training.pilot import first_estimate
@@ -90,6 +91,11 @@ def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
     shot_var, read_var = noise_of(pair, camera)
     signal = first_estimate(pair.raw, shot_var, read_var, pair.cfa)
     return NoisyFrame(pair.name, pair.raw, signal, shot_var, read_var, pair.cfa)
+
+
+def noisy_frames(pairs: Sequence[Pair], camera: Mapping[str, Any] | None) -> list[NoisyFrame]:
+    """:func:`noisy_frame` of each, half a second a megapixel."""
+    return [noisy_frame(pair, camera) for pair in progress(pairs, label="signal of noisy frames", unit="frame")]
 
 
 class FrozenPictures(Sequence[NoisyFrame]):
