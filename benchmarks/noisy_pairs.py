@@ -9,6 +9,7 @@ levels. ``--data.pairs pairs:OUT`` reads them.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,18 +37,19 @@ def write_pair(folder: RawFolder, index: int, noise: NoiseModel, seed: int, out:
     sample = frozen_sample(pair, noise, pair.cfa, seed)
     frame = replace(read_raw(folder.files[index]), black=(BLACK,) * 4, white=WHITE, noise_profile=None)
     noisy = replace(frame, mosaic=bayer.unpack(sample.noisy, pair.cfa)[0], noise_profile=levels)
-    write_dng(out / f"{pair.name}_noisy.dng", noisy)
-    write_dng(out / f"{pair.name}_clean.dng", frame)
+    name = pair.name.replace("/", "_")  # a path where two files have the same stem
+    write_dng(out / f"{name}_noisy.dng", noisy)
+    write_dng(out / f"{name}_clean.dng", frame)
     return levels
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", help="a folder of RAW files")
     parser.add_argument("out", type=Path)
     parser.add_argument("--noise", default="cycleisp_sidd")
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     options.out.mkdir(parents=True, exist_ok=True)
     folder, noise = RawFolder(options.data, camera_jpeg=False), noise_model(options.noise)
     for index in progress(range(len(folder)), label="pairs", unit="pair"):

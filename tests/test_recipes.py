@@ -12,6 +12,7 @@ import yaml
 from rawaug.cli import main
 from rawaug.experiment.kinds import kind_of
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, smoke
+from rawaug.training.estimators import Supervised
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 ALL = {file.relative_to(FOLDER).with_suffix("").as_posix(): kind_of(file) for file in sorted(FOLDER.rglob("*.yaml"))}
@@ -93,7 +94,7 @@ def test_its_smoke_form_runs(name: str, tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.usefixtures("tiny")
 def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = [
         "--train.validate-every", "1", "--train.batch", "2", "--train.crop", "32", "--data.test-count", "1",
@@ -118,6 +119,9 @@ def test_seeds_steps_and_device_work_and_nothing_is_done_twice(
     said = capsys.readouterr().out
     assert said.count("already trained") == 2 and "already evaluated" not in said
     assert weights.stat().st_mtime_ns == before
+    monkeypatch.setattr(Supervised, "revision", 1)
+    assert main([*command, "--seeds", "1", "--overwrite"]) == 0
+    assert "already trained" not in capsys.readouterr().out, "another estimator of the same name"
 
 
 def test_what_cannot_be_run_is_refused_before_anything_is_fitted(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import ESTIMATORS
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frames
+from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 from rawaug.training.validation import Watched, watched
 
@@ -45,10 +45,18 @@ def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
     return other
 
 
+def frames_of(recipe: Recipe, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
+    """The real frames as the arms take them: the pairs, or a :class:`NoisyFrame` of each where no arm sees clean ones.
+
+    Arms and seeds share them, so that the signal of a noisy frame is estimated once.
+    """
+    return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs] if recipe.self_supervised else pairs
+
+
 def training_stream(
     recipe: Recipe,
     arm: ArmConfig,
-    pairs: Sequence[Pair],
+    frames: Sequence[Any],
     pictures: Any,
     isp: DictionaryISP,
     noise: NoiseModel,
@@ -57,8 +65,7 @@ def training_stream(
     """The training samples of one arm.
 
     Args:
-        pairs: the real frames, as :func:`rawaug.training.noisy_frames.noisy_only` leaves them if the arm is
-            self-supervised.
+        frames: the real ones, see :func:`frames_of`.
         pictures: the sRGB pictures.
         isp, noise: make RAW of them.
         seed: of the run.
@@ -68,16 +75,15 @@ def training_stream(
     real: Source | None = None
     synthetic: Source | None = None
     if isinstance(estimator, SelfSupervised):
-        if pairs and arm.augmented < 1.0:
-            frames = noisy_frames(pairs, isp.info.get("noise"))
+        if frames and arm.augmented < 1.0:
             real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
         if arm.augmented:
             augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
             frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
             synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
     else:
-        if pairs:
-            real = RealCrops(pairs, noise, config.crop, isp.cfa)
+        if frames:
+            real = RealCrops(frames, noise, config.crop, isp.cfa)
         if arm.augmented:
             synthetic = picture_source(recipe, arm, pictures, isp, noise)
     return TrainingStream(real, synthetic, config.batch, arm.augmented, seed)
@@ -90,21 +96,20 @@ def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: Dictionar
 
 
 def validation_samples(
-    recipe: Recipe, pairs: Sequence[Pair], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
 ) -> list[Watched]:
     """The frozen samples by which weights are chosen, the same in every arm and run.
 
     Args:
-        pairs: of validation, none for samples made from ``pictures``; noisy alone if the arms are self-supervised.
+        frames: of validation, see :func:`frames_of`; none for samples made from ``pictures``.
     """
     augment = RawAugment(isp, noise)
     if recipe.self_supervised:
-        frames = noisy_frames(pairs, isp.info.get("noise"))
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
         return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
-    if pairs:
+    if frames:
         side = recipe.data.validation_crop
-        middles = (pair.middle(side) if side else pair for pair in pairs)
+        middles = (pair.middle(side) if side else pair for pair in frames)
         return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in middles]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))

@@ -37,7 +37,7 @@ from rawaug.evaluation.scores import (
     summary,
 )
 from rawaug.evaluation.tables import Row, draw, print_table
-from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.arms import estimator_of, frames_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
@@ -127,6 +127,7 @@ class _Run:
         self.plan = plan = planned(recipe, given)
         self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
         self.pairs: list[Pair] = []
+        self.frames: dict[str, Sequence[Any]] = {}
         self.unreadable: list[str] = []
 
     def read(self) -> None:
@@ -154,6 +155,9 @@ class _Run:
         for seed in range(recipe.seed, recipe.seed + recipe.seeds):
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
+            if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
+                parts = {"pairs": self.pairs, "validation": self.validation}
+                self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
             for arm in recipe.arms:
                 models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
                 if _leads():
@@ -203,8 +207,8 @@ class _Run:
                 return model
         if _leads():
             _discard_other_checkpoint(place, key)
-        stream = training_stream(recipe, recipe.arms[arm], self.pairs, self.pictures, isp, noise, seed)
-        validation = validation_samples(recipe, self.validation, self.pictures, isp, noise)
+        stream = training_stream(recipe, recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed)
+        validation = validation_samples(recipe, self.frames["validation"], self.pictures, isp, noise)
         label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
         where, choose = (recipe.device, recipe.devices), bool(self.validation)
         model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
@@ -226,6 +230,7 @@ class _Run:
         settings = _settings(recipe.arms[arm])
         samples = [isp.info["key"], recipe.noise, settings, data.pairs, stamps(self.pairs), pictures]
         samples += [] if start is None else [start.sha256]
+        samples += [revision] if (revision := estimator_of(recipe.arms[arm]).revision) else []
         validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *samples), validation)
 

@@ -38,7 +38,8 @@ def require_runnable(recipe: Recipe, overwrite: bool = False) -> None:
     require_precision(recipe.train.precision)
     if recipe.train.compile:
         require_compiler(find_device(recipe.device))
-    require_classical([spec for spec in recipe.classical if name_and_settings(spec)[0] != "BM3D"])
+    estimate = ["NonLocalMeans"] if recipe.self_supervised else []  # of what noisy frames show
+    require_classical([spec for spec in (*recipe.classical, *estimate) if name_and_settings(spec)[0] != "BM3D"])
     require_free(recipe, overwrite)
 
 

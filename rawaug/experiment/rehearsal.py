@@ -19,7 +19,7 @@ from rawaug.commands.fit import fit
 from rawaug.data.pair import Pair
 from rawaug.data.readable import each_readable
 from rawaug.evaluation.scores import classical_method, network_method, score_method
-from rawaug.experiment.arms import estimator_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.arms import estimator_of, frames_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
 from rawaug.experiment.recipe import Recipe
 from rawaug.extras import extra
@@ -62,11 +62,14 @@ def rehearse(recipe: Recipe, plan: Plan, classical: Sequence[Spec]) -> None:
     require_usable(recipe, pairs, validation)
     isp = _isp(recipe, pairs)
     noise = noise_for(isp, recipe.noise)
+    side = max(SIDE, recipe.train.crop + 8)
+    frames = frames_of(recipe, [pair.middle(side) for pair in pairs], isp)
+    watched_frames = frames_of(recipe, [pair.middle(SIDE) for pair in validation[:1]], isp)
     for arm in recipe.arms:
         start = start_of(recipe.network_of(arm))
         own = in_pattern(isp, isp.cfa if start is None else start.cfa)
-        net = _one_step(recipe, arm, pairs, plan.pictures, own, noise)
-        watched = validation_samples(recipe, [pair.middle(SIDE) for pair in validation[:1]], plan.pictures, own, noise)
+        net = _one_step(recipe, arm, frames, plan.pictures, own, noise)
+        watched = validation_samples(recipe, watched_frames, plan.pictures, own, noise)
         validate(net, watched[:1], torch.device("cpu"))
         _score(network_method(net.eval(), isp.cfa, own.cfa), test, noise, isp)
     for spec in classical:
@@ -83,7 +86,7 @@ def _isp(recipe: Recipe, pairs: Sequence[Pair]) -> DictionaryISP:
 
 
 def _one_step(
-    recipe: Recipe, arm: str, pairs: Sequence[Pair], pictures: Any, isp: DictionaryISP, noise: NoiseModel
+    recipe: Recipe, arm: str, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
 ) -> Denoiser:
     """The network of an arm after one step on its device; on a CPU with one real and one augmented sample."""
     with extra("train"):
@@ -92,7 +95,7 @@ def _one_step(
     config = recipe.loop_of(arm)
     if config.batch % recipe.devices:
         raise ValueError(f"train.batch={config.batch} must be a multiple of devices={recipe.devices}")
-    stream = training_stream(recipe, recipe.arms[arm], pairs, pictures, isp, noise, recipe.seed)
+    stream = training_stream(recipe, recipe.arms[arm], frames, pictures, isp, noise, recipe.seed)
     fabric: Any = Fabric(accelerator=recipe.device, devices=1, precision=config.precision)
     estimator, net = estimator_of(recipe.arms[arm]), first_network(recipe.network_of(arm), recipe.seed)
     indices = sorted({0, config.batch - 1}) if fabric.device.type == "cpu" else range(config.batch // recipe.devices)

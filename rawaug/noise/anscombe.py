@@ -55,8 +55,8 @@ def _counts(z: Tensor, sigma: float) -> Tensor:
     """Expected photons for the mean z, with read noise of ``sigma`` photons."""
     counts, means = (t.to(z) for t in _table(sigma))
     right = torch.searchsorted(means, z.contiguous()).clamp_(1, len(means) - 1)
-    t = (z - means[right - 1]) / (means[right] - means[right - 1])
-    low = torch.lerp(counts[right - 1], counts[right], t.clamp(min=0))
+    step = (means[right] - means[right - 1]).clamp_min(torch.finfo(z.dtype).tiny)  # the first ones at a high sigma: 0
+    low = torch.lerp(counts[right - 1], counts[right], ((z - means[right - 1]) / step).clamp(0, 1))
     high = z.square() / 4 - 0.125 - sigma**2
     return torch.where(z > means[-1], high, low)
 

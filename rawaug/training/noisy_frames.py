@@ -8,8 +8,9 @@ and what an estimator adds change from step to step.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,23 +33,31 @@ CACHED = 64
 """Pictures whose frames are kept: more than this and frames are made when asked for."""
 
 
-class NoisyFrame(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class NoisyFrame:
     """One scene.
 
     Args:
         name: for reports.
         shots: noisy mosaics of it ``(K, H, W)``.
-        signal: the scene without noise, ``(1, H, W)``, as far as it is known: see :mod:`rawaug.training.pilot`.
         shot_var, read_var: the levels of their noise.
         cfa: their pattern.
+        clean: the scene without noise ``(1, H, W)``, where it was made from a picture; None for a real frame.
     """
 
     name: str
     shots: Tensor
-    signal: Tensor
     shot_var: float
     read_var: float
     cfa: CFA
+    clean: Tensor | None = None
+
+    @cached_property
+    def signal(self) -> Tensor:
+        """The scene without noise ``(1, H, W)``; of a real frame an estimate, half a second a megapixel at first."""
+        if self.clean is not None:
+            return self.clean
+        return first_estimate(self.shots[:1], self.shot_var, self.read_var, self.cfa)
 
 
 def noisy_only(pair: Pair) -> Pair:
@@ -87,15 +96,8 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
-    """A real noisy frame, with its noise as :func:`noise_of` finds it, and a first estimate of its signal."""
-    shot_var, read_var = noise_of(pair, camera)
-    signal = first_estimate(pair.raw, shot_var, read_var, pair.cfa)
-    return NoisyFrame(pair.name, pair.raw, signal, shot_var, read_var, pair.cfa)
-
-
-def noisy_frames(pairs: Sequence[Pair], camera: Mapping[str, Any] | None) -> list[NoisyFrame]:
-    """:func:`noisy_frame` of each, half a second a megapixel."""
-    return [noisy_frame(pair, camera) for pair in progress(pairs, label="signal of noisy frames", unit="frame")]
+    """A real noisy frame, with its noise as :func:`noise_of` finds it."""
+    return NoisyFrame(pair.name, pair.raw, *noise_of(pair, camera), pair.cfa)
 
 
 class FrozenPictures(Sequence[NoisyFrame]):
@@ -137,13 +139,15 @@ class FrozenPictures(Sequence[NoisyFrame]):
             seed = torch.randint(2**62, (1,), generator=keyed_generator(self.seed, "shot", index, shot))
             pair = self.augment.apply(srgb, params._replace(noise={**params.noise, "seed": seed}))
             shots.append(bayer.unpack(pair.noisy, self.augment.isp.cfa)[0])
-        signal = bayer.unpack(pair.clean, self.augment.isp.cfa)[0]
+        clean = bayer.unpack(pair.clean, self.augment.isp.cfa)[0]
         shot_var, read_var = (params.noise[name].item() for name in ("shot_var", "read_var"))
-        return NoisyFrame(f"picture {index}", torch.cat(shots), signal, shot_var, read_var, self.augment.isp.cfa)
+        return NoisyFrame(f"picture {index}", torch.cat(shots), shot_var, read_var, self.augment.isp.cfa, clean)
 
 
 class NoisyCrops:
     """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
+
+    Where the estimator adds noise, the signal of real frames is estimated here, before processes share them.
 
     Raises:
         ValueError: if a real frame is smaller than the crop, or has fewer shots than the estimator needs.
@@ -151,6 +155,9 @@ class NoisyCrops:
 
     def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:
         self.frames, self.estimator, self.crop, self.cfa = frames, estimator, crop, cfa
+        if estimator.adds_noise and not isinstance(frames, FrozenPictures):
+            for frame in progress(frames, label="signal of noisy frames", unit="frame"):
+                _ = frame.signal
 
     def draw(self, generator: torch.Generator) -> Any:
         """One crop of a random frame."""
@@ -161,18 +168,19 @@ class NoisyCrops:
         if min(frame.shots.shape[-2:]) < self.crop + 6:
             size = f"{frame.shots.shape[-2]} x {frame.shots.shape[-1]}"
             raise ValueError(f"{frame.name}: a frame of {size} is too small for train.crop={self.crop}")
-        images = torch.cat([frame.shots, frame.signal])
-        images = turned_crop(aligned(images, frame.cfa, self.cfa), self.crop, self.cfa, generator)
-        packed = bayer.pack(images[:, None], self.cfa)
+        signal = frame.signal if self.estimator.adds_noise else frame.shots[:1]
+        mosaics = [aligned(mosaic, frame.cfa, self.cfa) for mosaic in (frame.shots, signal)]
+        packed = bayer.pack(turned_crop(mosaics, self.crop, self.cfa, generator)[:, None], self.cfa)
         drawn = self.estimator.sample(packed.shape[1:], generator)
         return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
 
 
 def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Sample]:
-    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``: an unbiased score that no clean frame is needed for.
+    """Whole noisy frames as r2r pairs ``(1, 4, h, w)``: a score that no clean frame is needed for.
 
     The error against a target of independent noise is the error against the clean frame plus that noise's variance, a
-    constant: the weights that score best are the best, though the decibels are lower than against a clean frame.
+    constant: the weights that score best are the best, as far as the estimate of the signal is right, though the
+    decibels are lower than against a clean frame.
     """
     samples = []
     for frame in frames:

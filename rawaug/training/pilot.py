@@ -4,10 +4,11 @@ r"""A first estimate of a noisy frame's clean signal: how strong is the noise at
 
 Estimators put noise ``m`` of the noise's own variance on top of a frame. Taken at the noisy signal ``y`` itself, that
 variance is right on average, but it is large where the noise happens to be positive: ``m`` then depends on the noise,
-which their derivation excludes. At ``shot_var`` 0.008, ``read_var`` 3e-4 and a signal of 0.02, the mean of r2r's target
-departs from the clean signal by 0.34 standard deviations of the noise (root mean square over its input), though the two
-are uncorrelated; taken at the clean signal, by none. On frames of the demo camera the part of r2r's target that depends
-on the noise of its input is 0.28 to 0.32 standard deviations with ``y``, 0.06 (flat areas) to 0.11 (edges) with x0.
+which their derivation excludes. At ``shot_var`` 0.008, ``read_var`` 3e-4, a signal of 0.02 and alpha 0.5, the mean of
+r2r's target departs from the clean signal by 0.34 standard deviations of the noise (root mean square over six classes
+of the input), though input and target are uncorrelated; taken at the clean signal, by none. On frames of the demo
+camera with these levels, the part of r2r's target that the noise of its input explains is 0.28 (edges) to 0.32 (flat
+areas) standard deviations with ``y``, 0.11 and 0.06 with x0.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def first_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) ->
     """Of a mosaic ``(1, H, W)``, its shape; without shot noise the frame itself, whose variance needs no signal.
 
     Raises:
-        ModuleNotFoundError: if scikit-image is not installed.
+        ImportError: if scikit-image is not installed.
     """
     if not shot_var > 0:
         return noisy

@@ -51,8 +51,9 @@ class RealCrops:
     def draw(self, generator: torch.Generator) -> Sample:
         """One crop of a random frame."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        images = pair.raw if pair.noisy is None else torch.cat([pair.raw, pair.noisy])
-        images = turned_crop(bayer.aligned(images, pair.cfa, self.cfa), self.crop, self.cfa, generator)
+        mosaics = [pair.raw] if pair.noisy is None else [pair.raw, pair.noisy]
+        mosaics = [bayer.aligned(mosaic, pair.cfa, self.cfa) for mosaic in mosaics]
+        images = turned_crop(mosaics, self.crop, self.cfa, generator)
         packed = bayer.pack(images[:, None], self.cfa)
         params = self.noise.sample(1, generator)
         if pair.noisy is not None:
@@ -76,17 +77,20 @@ class PictureCrops:
         return Sample(pair.noisy, pair.clean, pair.variance)
 
 
-def turned_crop(images: Tensor, crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:
-    """A random ``(C, crop, crop)`` of mosaics ``(C, H, W)``, in a random one of eight turns, its pattern kept.
+def turned_crop(mosaics: Sequence[Tensor], crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:
+    """The same random place of mosaics ``(C, H, W)``, one after the other, in a random one of eight turns.
+
+    The pattern is kept: ``(C + ..., crop, crop)``.
 
     A larger crop is turned, then cut to size, so that lines lost to the CFA do not show.
     """
     side = crop + 4
-    height, width = images.shape[-2:]
+    height, width = mosaics[0].shape[-2:]
     top = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
     left = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
-    turned = bayer.turn_keeping_cfa(bayer.crop(images, top, left, side, side), cfa, view)
+    images = torch.cat([bayer.crop(mosaic, top, left, side, side) for mosaic in mosaics])
+    turned = bayer.turn_keeping_cfa(images, cfa, view)
     return bayer.crop(turned, 0, 0, crop, crop)
 
 

@@ -23,6 +23,8 @@ class Noisier(SelfSupervised):
             is ``z + (1 + 1/alpha^2) R(z)``: its last convolution times a constant.
     """
 
+    adds_noise = True
+
     def __init__(self, alpha: float = 1.0, correct: bool = False) -> None:
         self.alpha, self.correct = positive(alpha), correct
 

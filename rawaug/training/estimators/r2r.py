@@ -18,9 +18,11 @@ class R2R(SelfSupervised):
 
     Args:
         alpha: small: the input is little noisier than the frame, the target much; 1: both have twice the variance.
-        average: at a test, denoise this many recorrupted copies of a frame and average them, as published; 0 denoises
-            the frame itself.
+        average: at a test, denoise this many recorrupted copies of a frame and average them, as published, and
+            denoise it once before to know its noise; 0 denoises the frame itself.
     """
+
+    adds_noise = True
 
     def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
         if average < 0:

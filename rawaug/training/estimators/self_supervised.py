@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,11 +39,14 @@ class NoisyCrop(NamedTuple):
 class SelfSupervised(Supervised, ABC):
     """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
 
-    ``shots`` is how many noisy frames of one scene it needs.
+    ``shots`` is how many noisy frames of one scene it needs; ``adds_noise`` says that it uses a crop's ``signal``,
+    which of a real frame has to be estimated.
     """
 
     shots = 1
+    adds_noise: ClassVar[bool] = False
     sees_clean = False
+    revision = 1  # weights are chosen on r2r pairs, whatever the estimator
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
         """All that is random, for a packed crop of ``shape`` (4, h, w): white noise of variance 1."""

@@ -16,10 +16,12 @@ from rawaug.training.criteria import Criterion
 class Supervised:
     """Clean targets: samples come ready, ``loss = criterion(model(noisy, variance), clean)``.
 
-    ``sees_clean`` says whether it needs clean frames: in a recipe such estimators and others do not mix.
+    ``sees_clean`` says whether it needs clean frames: in a recipe such estimators and others do not mix. ``revision``
+    counts the changes of what it makes of the same frames: weights of another one are trained anew.
     """
 
     sees_clean: ClassVar[bool] = True
+    revision: ClassVar[int] = 0
 
     def loss(self, model: Any, sample: Any, criterion: Criterion, progress: float = 1.0) -> Tensor:
         """Of a batch, a scalar; ``progress`` is the share of the training that is over."""

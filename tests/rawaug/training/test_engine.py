@@ -33,8 +33,7 @@ from rawaug.training.loop import train
 from rawaug.training.validation import Watched
 
 generator = torch.Generator().manual_seed(0)
-shot = torch.rand(1, 64, 64, generator=generator)
-frame = NoisyFrame("frame", shot, shot, 1e-3, 1e-4, CFA.RGGB)
+frame = NoisyFrame("frame", torch.rand(1, 64, 64, generator=generator), 1e-3, 1e-4, CFA.RGGB)
 config = TrainConfig(
     steps=steps, batch=4, crop=32, warmup=2, loss="l2", ema=0.9, validate_every=1, checkpoint_every=3,
     learning_rate=3e-3,

@@ -63,7 +63,7 @@ def test_unbiased_targets_teach_what_clean_ones_would(estimator: SelfSupervised)
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
 def test_the_mean_of_r2rs_target_is_the_signal_whatever_its_input_is(alpha: float, signal: float) -> None:
     """Of a known constant scene every input teaches the same; noise drawn with the variance at the noisy signal is
-    uncorrelated with the input too, but its targets go down by 0.5 to 1 standard deviations at both ends."""
+    uncorrelated with the input too, but its targets go down by up to a standard deviation at both ends."""
     shot_var, read_var = 8e-3, 3e-4
     clean = torch.full((4, 512, 512), signal)
     deviation = (shot_var * signal + read_var) ** 0.5

@@ -13,7 +13,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pair import Pair
-from rawaug.experiment.arms import training_stream, validation_samples
+from rawaug.experiment.arms import frames_of, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
@@ -108,8 +108,9 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
 
     def seen(pairs: list[Pair]) -> list[torch.Tensor]:
         known = [noisy_only(pair) for pair in pairs]
-        stream = training_stream(recipe, recipe.arms["r2r"], known, pictures, isp, noise, seed=0)
-        watched = validation_samples(recipe, known, pictures, isp, noise)
+        frames = frames_of(recipe, known, isp)
+        stream = training_stream(recipe, recipe.arms["r2r"], frames, pictures, isp, noise, seed=0)
+        watched = validation_samples(recipe, frames, pictures, isp, noise)
         assert watched[0].develop is None
         return [*stream[0], *stream[1], *watched[0][:3]]
 
@@ -127,15 +128,65 @@ def test_frames_as_shot_need_measured_levels() -> None:
 @pytest.mark.parametrize("cfa", list(CFA))
 def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
     rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None].expand(3, 40, 48)
-    frame = NoisyFrame("colours", bayer.mosaic(rgb, cfa), bayer.mosaic(rgb, cfa), 0.0, 0.0, cfa)
+    frame = NoisyFrame("colours", bayer.mosaic(rgb, cfa), 0.0, 0.0, cfa)
     crops = NoisyCrops([frame], Noisier(), 16, CFA.BGGR)
     expected = torch.tensor([0.2, 0.5, 0.5, 0.8])[:, None, None].expand(4, 8, 8)
     for seed in range(16):
         assert torch.equal(crops.draw(torch.Generator().manual_seed(seed)).clean, expected)
 
 
+class Whole(SelfSupervised):
+    """Gives the crop as it comes."""
+
+    adds_noise = True
+
+    def apply(self, crop: NoisyCrop, drawn: torch.Tensor) -> Any:
+        return crop
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_the_signal_is_cut_and_turned_with_the_shots(cfa: CFA) -> None:
+    mosaic = torch.rand(1, 40, 48, generator=torch.Generator().manual_seed(0))
+    crops = NoisyCrops([NoisyFrame("known", mosaic, 1e-3, 1e-5, cfa, clean=mosaic)], Whole(), 16, CFA.BGGR)
+    for seed in range(16):
+        crop = crops.draw(torch.Generator().manual_seed(seed))
+        assert torch.equal(crop.signal, crop.shots[0])
+
+
+def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: RawAugment) -> None:
+    frame = FrozenPictures(pictures, augment, seed=3)[0]
+    below_white = frame.signal < 0.6
+    deviation = variance_of(frame.signal, frame.shot_var, frame.read_var).sqrt()
+    noise = ((frame.shots - frame.signal) / deviation)[below_white]
+    assert float(noise.mean()) == pytest.approx(0.0, abs=0.03) and float(noise.var()) == pytest.approx(1.0, rel=0.05)
+
+
+def test_held_out_frames_are_recorrupted_at_their_signal() -> None:
+    clean = torch.full((1, 128, 128), 0.02)
+    shot = clean + 0.02 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    (sample,) = held_out([NoisyFrame("known", shot, 8e-3, 3e-4, CFA.RGGB, clean)], CFA.RGGB)
+    added = (sample.noisy - bayer.pack(shot[None], CFA.RGGB)) / (0.5 * (8e-3 * 0.02 + 3e-4) ** 0.5)
+    assert float(added.var()) == pytest.approx(1.0, rel=0.03)
+
+
+def test_real_frames_are_estimated_once_and_only_for_estimators_that_add_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimated: list[int] = []
+
+    def counted(noisy: torch.Tensor, *_: Any) -> torch.Tensor:
+        estimated.append(1)
+        return noisy
+
+    monkeypatch.setattr("rawaug.training.noisy_frames.first_estimate", counted)
+    frame = NoisyFrame("real", torch.rand(1, 40, 48), 1e-3, 1e-5, CFA.RGGB)
+    NoisyCrops([frame], Neighbor2Neighbor(), 16, CFA.RGGB).draw(torch.Generator())
+    assert not estimated
+    for estimator in (R2R(), Noisier()):
+        NoisyCrops([frame], estimator, 16, CFA.RGGB).draw(torch.Generator())
+    assert len(estimated) == 1
+
+
 def test_what_an_estimator_lacks_is_named() -> None:
-    frame = NoisyFrame("small", torch.zeros(1, 32, 32), torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
+    frame = NoisyFrame("small", torch.zeros(1, 32, 32), 1e-3, 1e-5, CFA.RGGB)
     with pytest.raises(ValueError, match="small: Noise2Noise needs 2 shots"):
         NoisyCrops([frame], Noise2Noise(), 16, CFA.RGGB).draw(torch.Generator())
     with pytest.raises(ValueError, match="small: a frame of 32 x 32 is too small"):
@@ -174,7 +225,7 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     y, x = torch.meshgrid(torch.linspace(0, 6, 128), torch.linspace(0, 6, 128), indexing="ij")
     clean = (0.4 + 0.15 * torch.sin(x) * torch.cos(y)).expand(3, -1, -1)
     shots = clean + torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0)) * (0.01 * clean + 1e-3).sqrt()
-    frame = NoisyFrame("smooth", shots[:2], clean[:1], 0.01, 1e-3, CFA.RGGB)
+    frame = NoisyFrame("smooth", shots[:2], 0.01, 1e-3, CFA.RGGB)
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     config = TrainConfig(steps=80, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})

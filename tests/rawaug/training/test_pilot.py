@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from rawaug import bayer
+from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.training.estimators import R2R, NoisyCrop
 from rawaug.training.pilot import first_estimate
@@ -46,3 +47,9 @@ def test_noise_without_shots_needs_no_estimate(monkeypatch: pytest.MonkeyPatch) 
     noisy = torch.rand(1, 8, 8)
     monkeypatch.delattr("rawaug.training.pilot.NonLocalMeans")
     assert first_estimate(noisy, 0.0, READ_VAR, demo_pairs("train", count=1)[0].cfa) is noisy
+
+
+def test_it_is_finite_where_shot_noise_is_far_below_read_noise() -> None:
+    dark = 1e-2 * torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0))
+    assert first_estimate(dark, 1e-6, 1e-4, CFA.RGGB).isfinite().all()
+    assert first_estimate(torch.zeros(1, 256, 256), 1e-6, 1e-4, CFA.RGGB).isfinite().all()
