@@ -21,7 +21,8 @@ class NoisyCrop(NamedTuple):
 
     Args:
         shots: packed noisy crops of it ``(K, 4, h, w)``.
-        signal: it without noise ``(4, h, w)``, known or estimated: the noise's variance is that at ``signal``.
+        signal: it without noise ``(4, h, w)``, known or estimated: the noise's variance is that at ``signal``. For an
+            estimator whose ``adds_noise`` is False it is not estimated, and the first shot stands in its place.
         shot_var, read_var: the levels of the noise.
     """
 
