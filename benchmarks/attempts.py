@@ -24,7 +24,7 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
     from rawaug import DictionaryISP
     from rawaug.commands.info import describe
     from rawaug.data.mat import read_value
-    from rawaug.data.rawir import read_packed
+    from rawaug.data.published import read_packed
     from rawaug.data.sidd.frames import colour_of, mosaic_of
     from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
     from rawaug.plugin.params import load_params
@@ -73,7 +73,7 @@ def _set_up(path: Path) -> None:
     from rawaug.experiment.kinds import KINDS, kind_of
     from rawaug.experiment.plain_yaml import read_yaml
     from rawaug.experiment.recipe import Recipe
-    from rawaug.training.start import first_network
+    from rawaug.training.state import first_network
 
     try:
         kind, (parser, run) = KINDS[kind_of(path)], _run_parser(kind_of(path))

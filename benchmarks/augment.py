@@ -31,10 +31,10 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.data.demo.demo_pairs import demo_photographs
-from rawaug.isp.baselines.cycleisp import CycleISP
-from rawaug.isp.baselines.upi import UPI, unprocess_pixels
+from rawaug.data.demo.pairs import demo_photographs
 from rawaug.isp.model import DictionaryISP
+from rawaug.paper.baselines.cycleisp import CycleISP
+from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
 
 COUNTED = 3 + 4 + 4

@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 import denoisers
-from denoisers.pretrained import find
+from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import DemoCamera, open_pairs
-from rawaug.data.demo.demo_pairs import FRAME
-from rawaug.data.pair import Pair
+from rawaug.data.demo.pairs import FRAME
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import Method, classical_method, network_method, row_of
 from rawaug.evaluation.tables import PANEL, Row, draw
 from rawaug.noise import NoiseModel, noise_model

@@ -37,7 +37,7 @@ def _make_dngs(folder: Path, real: list[Path]) -> list[Path]:
 
     from rawaug.bayer import CFA
     from rawaug.io import GainMap, RawFrame, read_raw, write_dng
-    from rawaug.io.shot import Exposure
+    from rawaug.io.raw import Exposure
 
     gains = torch.rand(1, 3, 4, generator=torch.Generator().manual_seed(0)) + 1
     frame = RawFrame(

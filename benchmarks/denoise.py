@@ -23,7 +23,7 @@ from torch import Tensor
 import denoisers
 from benchmarks.augment import machine, memory_used
 from benchmarks.loader import fastest
-from denoisers.pretrained import DEFAULT
+from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.commands.denoise import denoise_file
 from rawaug.commands.frame_denoisers import frame_denoiser

@@ -18,18 +18,17 @@ from torch import Tensor
 
 import denoisers
 import rawaug
-from denoisers.pretrained import find
+from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.pair import Pair
-from rawaug.data.remembered import Remembered
-from rawaug.data.sample import Sample
+from rawaug.data.folders import Remembered
+from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.scores import classical_method, frozen_sample, network_method, score_method
 from rawaug.experiment.denoiser_sweep import published_pmrid
 from rawaug.noise import noise_model
+from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, TrainingStream
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.validation import validate, watched
 
 NOISE = ["any camera", "cycleisp_sidd"]

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import torch
 
-from rawaug.data.demo.demo_pairs import demo_files
-from rawaug.explore.look import Look
-from rawaug.explore.markup import as_html
+from rawaug.data.demo.pairs import demo_files
+from rawaug.explore.page import as_html
+from rawaug.explore.view_state import Look
 from rawaug.explore.views import VIEWS, denoised
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.drawing import Drawing
+from rawaug.plugin.sampling_config import Drawing
 
 CAMERAS = ("Nikon D750", "Canon EOS 6D", "Sony ILCE-7M3", "Nikon D90", "Canon EOS 5D Mark II", "Nikon D800")
 

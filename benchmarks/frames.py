@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from rawaug.data import open_pairs
-from rawaug.experiment.methods import ROWS, fit_family, score_rows
 from rawaug.isp.fit import FitConfig
+from rawaug.paper.methods import ROWS, fit_family, score_rows
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 

@@ -19,12 +19,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from rawaug.io.picture_files import decode_srgb, read_picture
+from rawaug.io.pictures import decode_srgb, read_picture
 from rawaug.isp.cameras import colour_matrix, published_cameras
-from rawaug.isp.dictionary import CameraDictionary
-from rawaug.isp.hull import colour_coordinates, nearest_in_hull, psnr, second_moment
+from rawaug.isp.dictionary import CameraDictionary, colour_coordinates, nearest_in_hull, psnr, second_moment
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone_curves import tone_names, tone_tables
+from rawaug.isp.tone import tone_names, tone_tables
 from rawaug.isp.universal import (
     COLOURS,
     DECIBEL,

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rawaug import bayer
-from rawaug.data.raw_folder import RawFolder
+from rawaug.data.folders import RawFolder
 from rawaug.evaluation.scores import frozen_levels, frozen_sample
 from rawaug.io import read_raw, write_dng
 from rawaug.noise import NoiseModel, noise_model

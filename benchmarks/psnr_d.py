@@ -27,19 +27,19 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.evaluation.scores import classical_method, score_method
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.experiment.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import find_recipe
 from rawaug.files import write_json
-from rawaug.isp.baselines import UPI
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper.baselines import UPI
+from rawaug.paper.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.pictures import even_sided
+from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import PictureCrops, RealCrops, Source
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
 
 CONFIG = DownstreamConfig(
     denoiser=DenoiserConfig("UNet", {"width": 16, "scales": 4}), train=TrainConfig(steps=1500, batch=8, crop=64)

@@ -31,7 +31,7 @@ from rawaug.commands.pair_shards import shard_tasks
 from rawaug.data import demo_pictures
 from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.drawing import Drawing
+from rawaug.plugin.sampling_config import Drawing
 
 COPIES = 8
 """Of the built-in pictures, so that a run takes seconds."""

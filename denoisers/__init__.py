@@ -10,44 +10,34 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from denoisers.block_matching import BM3D
-    from denoisers.catalogue import DENOISERS, build
-    from denoisers.cycleisp_denoiser import CycleISPDenoiser
-    from denoisers.dhdn import DHDN
-    from denoisers.dncnn import DnCNN
-    from denoisers.ensemble import SelfEnsemble
-    from denoisers.nafnet import NAFNet
+    from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
+    from denoisers.cycleisp import CycleISPDenoiser
+    from denoisers.files import DENOISERS, build, from_pretrained, load, save
+    from denoisers.inference import SelfEnsemble, tiled
     from denoisers.network import Denoiser
-    from denoisers.non_local_means import NonLocalMeans
+    from denoisers.networks import DHDN, DnCNN, NAFNet, UNet
     from denoisers.pmrid import PMRID
-    from denoisers.pretrained import from_pretrained
-    from denoisers.stabilised import Stabilised
-    from denoisers.tiling import tiled
-    from denoisers.total_variation import TotalVariation
-    from denoisers.unet import UNet
-    from denoisers.wavelet import Wavelet
-    from denoisers.weight_files import load, save
 
 _MODULES = {
-    "BM3D": "denoisers.block_matching",
-    "DENOISERS": "denoisers.catalogue",
-    "CycleISPDenoiser": "denoisers.cycleisp_denoiser",
-    "DHDN": "denoisers.dhdn",
+    "BM3D": "denoisers.classical",
+    "DENOISERS": "denoisers.files",
+    "CycleISPDenoiser": "denoisers.cycleisp",
+    "DHDN": "denoisers.networks",
     "Denoiser": "denoisers.network",
-    "DnCNN": "denoisers.dncnn",
-    "NAFNet": "denoisers.nafnet",
-    "NonLocalMeans": "denoisers.non_local_means",
+    "DnCNN": "denoisers.networks",
+    "NAFNet": "denoisers.networks",
+    "NonLocalMeans": "denoisers.classical",
     "PMRID": "denoisers.pmrid",
-    "SelfEnsemble": "denoisers.ensemble",
-    "Stabilised": "denoisers.stabilised",
-    "TotalVariation": "denoisers.total_variation",
-    "UNet": "denoisers.unet",
-    "Wavelet": "denoisers.wavelet",
-    "build": "denoisers.catalogue",
-    "from_pretrained": "denoisers.pretrained",
-    "load": "denoisers.weight_files",
-    "save": "denoisers.weight_files",
-    "tiled": "denoisers.tiling",
+    "SelfEnsemble": "denoisers.inference",
+    "Stabilised": "denoisers.classical",
+    "TotalVariation": "denoisers.classical",
+    "UNet": "denoisers.networks",
+    "Wavelet": "denoisers.classical",
+    "build": "denoisers.files",
+    "from_pretrained": "denoisers.files",
+    "load": "denoisers.files",
+    "save": "denoisers.files",
+    "tiled": "denoisers.inference",
 }
 """Public name to the module that defines it."""
 

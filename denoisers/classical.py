@@ -5,6 +5,16 @@ Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and is 
 :class:`denoisers.Stabilised` for shot noise; alone it works at the mean level.
 
 Domain: packed RAW, any scale, not clipped; the work is done on the CPU.
+
+Non-local means: the mean of pixels weighed by how alike their patches are (Buades et al., CVPR 2005).
+
+Translation-invariant wavelet shrinkage: thresholded transforms, averaged over shifts (Coifman and Donoho, 1995).
+
+Total variation: the ``x`` of least ``|x - y|^2 / 2 + w TV(x)`` (Chambolle, JMIV 2004).
+
+BM3D: alike blocks stacked and shrunk together in a 3-D transform (Dabov et al., TIP 2007).
+
+Shot noise made white, denoised, and made RAW again: ``T^-1(f(T y))`` (Makitalo and Foi, TIP 2013).
 """
 
 from __future__ import annotations
@@ -12,11 +22,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, ClassVar
+from itertools import product
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from rawaug.registry import FILTERS
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -88,3 +101,158 @@ class Classical(ABC):
         if (reason := self.missing()) is not None:
             raise ImportError(reason)
         return import_module(name)
+
+
+@FILTERS.register("NonLocalMeans")
+class NonLocalMeans(Classical):
+    """Non-local means (scikit-image, fast mode): patches of 5 x 5 over all four planes, sought 6 pixels around."""
+
+    needs = ("skimage",)
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        denoise_nl_means = self.library("skimage.restoration").denoise_nl_means
+        settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
+        return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
+
+
+@FILTERS.register("Wavelet")
+class Wavelet(Classical):
+    """Translation-invariant Haar shrinkage (scikit-image, PyWavelets): hard threshold at 3 sigma, mean of 16 shifts."""
+
+    needs = ("skimage", "pywt")
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
+        height, width, channels = planes.shape
+        # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
+        sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
+        settings = {
+            "sigma": [sigma] * channels,
+            "wavelet": "haar",
+            "method": "VisuShrink",
+            "mode": "hard",
+            "wavelet_levels": min(4, min(height, width).bit_length() - 1),
+            "rescale_sigma": False,
+            "channel_axis": -1,
+        }
+        mean = np.zeros_like(planes)
+        for shift in product(range(4), repeat=2):
+            shrunk = denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
+            mean += np.roll(shrunk, np.negative(shift), (0, 1)) / 16
+        return mean
+
+
+@FILTERS.register("TotalVariation")
+class TotalVariation(Classical):
+    """Total variation (scikit-image, Chambolle's projection), each plane by itself."""
+
+    needs = ("skimage",)
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`."""
+        denoise_tv_chambolle = self.library("skimage.restoration").denoise_tv_chambolle
+        return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
+
+
+_HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]], np.float32)
+"""R, Gr, Gb, B to luminance and three differences; orthonormal (white noise stays white), its own inverse."""
+
+
+@FILTERS.register("BM3D")
+class BM3D(Classical):
+    """BM3D (the ``bm3d`` wheel of its authors), blocks matched on the mean of the four planes.
+
+    The wheel is for non-commercial use only and therefore no requirement of this package: ``pip install bm3d``.
+    """
+
+    smallest = 16
+    needs = ("bm3d",)
+    advice = "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'"
+
+    def denoise(self, planes: Planes) -> Planes:
+        """See :meth:`Classical.denoise`.
+
+        Raises:
+            ImportError: if the wheel is not installed.
+        """
+        bm3d = self.library("bm3d")
+        # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
+        return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
+
+
+class Transform(Protocol):
+    """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
+
+    def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        """``(B, 4, h, w)`` RAW with var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
+
+    def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
+        """The estimate in the transform's domain back to RAW."""
+
+
+class Stabilised:
+    """A denoiser of white noise on RAW with shot noise: ``inverse(denoiser(forward(noisy), 1))``.
+
+    Args:
+        denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
+        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``: the generalised Anscombe
+            transform with its exact unbiased inverse.
+
+    Example:
+        >>> class Scale:
+        ...     def forward(self, y, shot_var, read_var):
+        ...         return y / read_var.sqrt().reshape(-1, 1, 1, 1)
+        ...     def inverse(self, z, shot_var, read_var):
+        ...         return z * read_var.sqrt().reshape(-1, 1, 1, 1)
+        >>> from denoisers import TotalVariation
+        >>> denoiser = Stabilised(TotalVariation(), Scale())
+        >>> denoiser(torch.rand(1, 4, 16, 16), torch.full((1, 4, 16, 16), 1e-4)).shape
+        torch.Size([1, 4, 16, 16])
+    """
+
+    def __init__(self, denoiser: Classical, transform: Transform) -> None:
+        self.denoiser = denoiser
+        self.transform = transform
+
+    def __call__(
+        self,
+        noisy: Tensor,
+        variance: Tensor | None = None,
+        *,
+        shot_var: Tensor | None = None,
+        read_var: Tensor | None = None,
+    ) -> Tensor:
+        """Denoise ``(B, 4, h, w)``.
+
+        Args:
+            noisy: packed RAW.
+            variance: its map shot_var max(noisy, 0) + read_var, from which the two are derived if not given.
+            shot_var, read_var: ``(B,)``.
+
+        Raises:
+            ValueError: if neither is given, the map is no such line, or the two are not one number a picture.
+        """
+        if shot_var is None or read_var is None:
+            shot_var, read_var = _levels(noisy, variance)
+        for name, value in (("shot_var", shot_var), ("read_var", read_var)):
+            if value.shape != noisy.shape[:1]:
+                raise ValueError(f"{name} must have shape ({len(noisy)},), one per picture, got {tuple(value.shape)}")
+        stable = self.transform.forward(noisy, shot_var, read_var)
+        return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot_var, read_var)
+
+
+def _levels(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The line through a variance map, shot_var and read_var ``(B,)``, by least squares."""
+    if variance is None:
+        raise ValueError("give the variance map, or shot_var and read_var")
+    light, variance = noisy.clamp(min=0).double().flatten(1), variance.double().flatten(1)
+    mean, level = light.mean(1, keepdim=True), variance.mean(1, keepdim=True)
+    spread = ((light - mean) ** 2).sum(1)
+    slope = ((light - mean) * (variance - level)).sum(1) / spread.clamp(min=1e-30)
+    shot_var, read_var = slope.clamp(min=0), (level[:, 0] - slope * mean[:, 0]).clamp(min=0)
+    expected = shot_var[:, None] * light + read_var[:, None]
+    if not torch.allclose(expected, variance, rtol=1e-2, atol=1e-12):
+        raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
+    return shot_var.to(noisy), read_var.to(noisy)

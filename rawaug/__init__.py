@@ -13,9 +13,8 @@ from rawaug._version import __version__
 if TYPE_CHECKING:
     from rawaug.bayer import CFA
     from rawaug.commands.fit import fit
-    from rawaug.isp.config import ISPConfig
+    from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
     from rawaug.isp.model import DictionaryISP
-    from rawaug.isp.setting import ISPParams, ISPResult
     from rawaug.plugin.augment import RawAugment
     from rawaug.plugin.dataset import RawPairs, RawPairStream
     from rawaug.plugin.loader import WrappedLoader, wrap
@@ -26,8 +25,8 @@ _MODULES = {
     "AugmentParams": "rawaug.plugin.params",
     "DictionaryISP": "rawaug.isp.model",
     "ISPConfig": "rawaug.isp.config",
-    "ISPParams": "rawaug.isp.setting",
-    "ISPResult": "rawaug.isp.setting",
+    "ISPParams": "rawaug.isp.config",
+    "ISPResult": "rawaug.isp.config",
     "RawAugment": "rawaug.plugin.augment",
     "RawPair": "rawaug.plugin.params",
     "RawPairStream": "rawaug.plugin.dataset",

@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rawaug._version import __version__
-from rawaug.extras import MissingExtra
-from rawaug.printable import printable
-from rawaug.shortages import shortage, without_traceback
+from rawaug.errors import MissingExtra, printable, shortage, without_traceback
 
 BAD_INPUT = 2
 OWN = {

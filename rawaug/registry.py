@@ -5,6 +5,8 @@ so is one that another installed package offers as an entry point in the group `
 when a name is first asked for, an entry point when its own name is: importing this module loads nothing.
 
 Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
+
+Names of cameras, as published tables spell them: maker and model. Look-up ignores case and spaces.
 """
 
 from __future__ import annotations
@@ -239,16 +241,40 @@ DENOISERS = Registry("denoiser", "rawaug.denoisers", "denoisers")
 FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
 """Subclasses of :class:`denoisers.classical.Classical`."""
 NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
-"""Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.by_name`."""
+"""Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.cameras`."""
 DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
 """``reader(path, split) -> Sequence[Pair]``; what ``kind:path`` opens as pairs."""
 PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")
 """``reader(path, min_side) -> sequence of sRGB (3, H, W)``; what ``kind:path`` opens as pictures."""
-ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training.estimators")
+ESTIMATORS = Registry("estimator", "rawaug.estimators", "rawaug.training")
 """Subclasses of :class:`rawaug.training.estimators.Supervised`: what a training step learns from."""
 LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
 """Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
-BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.isp.baselines")
-"""Subclasses of :class:`rawaug.isp.baselines.base.BaselineISP`."""
+BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
+"""Subclasses of :class:`rawaug.paper.baselines.base.BaselineISP`."""
 COMMANDS = Registry("command", "rawaug.commands", "rawaug.commands")
 """Functions behind ``rawaug NAME``: arguments and help are those of the signature and the docstring."""
+
+
+def spelled(name: str, known: Iterable[str]) -> str:
+    """The one of ``known`` that ``name`` is; of several the first.
+
+    Raises:
+        ValueError: if there is no such name; similar ones are suggested.
+
+    Example:
+        >>> spelled("nikon  d750", ["Nikon D750", "Nikon D7500"])
+        'Nikon D750'
+    """
+    by_key: dict[str, str] = {}
+    for candidate in known:
+        by_key.setdefault(_key(candidate), candidate)
+    if _key(name) in by_key:
+        return by_key[_key(name)]
+    similar = difflib.get_close_matches(_key(name), by_key, n=3)
+    hint = f"; similar: {', '.join(by_key[key] for key in similar)}" if similar else ""
+    raise ValueError(f"camera {name!r} is not listed{hint}")
+
+
+def _key(name: str) -> str:
+    return " ".join(name.casefold().split())

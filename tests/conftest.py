@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, settings
 
 from rawaug import registry
 from rawaug.data import demo_pairs, demo_pictures
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 
 torch.set_num_threads(1)
 settings.register_profile("rawaug", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -11,7 +11,7 @@ import torch
 
 import denoisers
 from benchmarks import augment, crops, denoise, equal_minutes, networks, shards
-from rawaug.data.demo.demo_pairs import FRAME
+from rawaug.data.demo.pairs import FRAME
 from rawaug.io import read_picture
 
 CPU = torch.device("cpu")

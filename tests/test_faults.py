@@ -24,12 +24,11 @@ from rawaug.cli import main
 from rawaug.commands import pair_files, pair_maker
 from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
-from rawaug.files import replacing, write_json, write_tensors
+from rawaug.errors import shortage
+from rawaug.files import NAME, locked, replacing, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
-from rawaug.lock import NAME, locked
-from rawaug.shortages import shortage
+from rawaug.training.config import TrainConfig
 from rawaug.training.state import TrainingState
-from rawaug.training.train_config import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forks, signals and limits of Linux")

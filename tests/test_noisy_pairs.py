@@ -10,7 +10,7 @@ import torch
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.raw_folder import RawFolder
+from rawaug.data.folders import RawFolder
 from rawaug.evaluation.scores import frozen_levels, frozen_sample
 from rawaug.io import RawFrame, write_dng
 from rawaug.noise import Compose, RowNoise, noise_model

@@ -20,18 +20,24 @@ from typing import Any
 
 from torch import Tensor
 
-from denoisers.pretrained import DEFAULT
+from denoisers.files import DEFAULT
 from rawaug import bayer
-from rawaug.commands.folder_settings import require_same_settings
-from rawaug.commands.frame_denoisers import FrameDenoiser, NetworkDenoiser, frame_denoiser
-from rawaug.commands.frame_noise import Noise, as_json, levels_of, stored_noise
-from rawaug.data.raw_folder import EXTENSIONS
-from rawaug.files import require_writable
+from rawaug.commands.frame_denoisers import (
+    FrameDenoiser,
+    NetworkDenoiser,
+    Noise,
+    as_json,
+    frame_denoiser,
+    levels_of,
+    stored_noise,
+)
+from rawaug.commands.pair_maker import require_same_settings
+from rawaug.data.folders import EXTENSIONS
+from rawaug.errors import printable
+from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
 from rawaug.io.raw import develop
-from rawaug.lock import one_at_a_time
-from rawaug.printable import printable
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 

@@ -9,14 +9,13 @@ from typing import Any, Literal
 import torch
 
 import denoisers
-from denoisers.pretrained import FOLDER
+from denoisers.files import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.pair import Pair
+from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.readable import Readable
-from rawaug.devices import find_device
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
@@ -35,6 +34,7 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import print_scores
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS, ESTIMATORS, Spec

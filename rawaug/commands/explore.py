@@ -5,9 +5,9 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from rawaug.data.demo.demo_pairs import demo_files
-from rawaug.data.picture_folder import EXTENSIONS
-from rawaug.explore.gradio_page import address, build, listening, server_of
+from rawaug.data.demo.pairs import demo_files
+from rawaug.data.folders import EXTENSIONS
+from rawaug.explore.page import address, build, listening, server_of
 from rawaug.registry import COMMANDS
 
 

@@ -1,4 +1,14 @@
-"""``rawaug export``: a denoiser as an ONNX file, for programs that have no PyTorch; an ISP by :mod:`.export_isp`.
+"""ONNX files of modules whose pictures may have any size, and how they are run here.
+
+An ISP for programs without PyTorch: its numbers as JSON, a .cube, and its reverse pass as ONNX.
+
+- JSON: what ``rawaug info --json`` prints, and ``lut``, the table of the .cube.
+- .cube (Adobe's format, 33 nodes along each axis): sRGB to linear camera RGB, up to lens shading and mosaic.
+- ONNX: ``srgb (1, 3, h, w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and
+  ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``, packed R, Gr, Gb, B; the JSON has a typical matrix and gains. ONNX
+  Runtime and PyTorch are compared before the file is left there.
+
+``rawaug export``: a denoiser as an ONNX file, for programs that have no PyTorch; an ISP by :mod:`.export_isp`.
 
 Inputs ``noisy`` and, where the network reads it, ``variance``; output ``denoised``: float32 packed RAW (R, Gr, Gb, B)
 ``(1, 4, h, w)`` of any h, w >= 2, that is any even mosaic. Variance is ``shot_var max(noisy, 0) + read_var``, of each
@@ -7,27 +17,201 @@ value. The file is run by ONNX Runtime on a frame with noise and compared with P
 
 from __future__ import annotations
 
+import json
+import logging
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import denoisers
-from denoisers.pretrained import FOLDER, find
+from denoisers.files import FOLDER, find
 from rawaug import bayer
-from rawaug.bayer import CFA
-from rawaug.commands.export_isp import export_isp
-from rawaug.commands.onnx_files import feeds, require_equal, require_onnx, session_of, to_onnx
+from rawaug.bayer import CFA, pack_rgb
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import find_weights, read_header, replacing
 from rawaug.io import read_raw
+from rawaug.isp.config import ISPParams
+from rawaug.isp.description import description, reverse_table, typical_setting
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.registry import COMMANDS
+from rawaug.seeding import keyed_generator
+
+TOLERANCE = 1e-4
+"""Largest difference between ONNX Runtime and PyTorch, white at 1."""
+NEEDED = ("onnx", "onnxscript", "onnxruntime")
+
+
+def require_onnx(way_out: str = "") -> None:
+    """Raise ValueError if a package that writes or runs ONNX is missing; ``way_out`` ends the message."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"export to ONNX needs {', '.join(missing)}: pip install 'rawaug[export]'{way_out}")
+
+
+def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path) -> None:
+    """One ONNX file of float32; height and width of four-dimensional inputs are free.
+
+    Args:
+        model: called with the inputs in order.
+        inputs: by name, of a typical size.
+        output: its name.
+        path: the file.
+    """
+    free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
+    with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
+        warnings.simplefilter("ignore")
+        shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
+        program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
+        onnx = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
+        assert onnx is not None
+        onnx.save(str(path), external_data=False)
+
+
+@contextmanager
+def errors_only(name: str) -> Iterator[None]:
+    """A logger and those below it say nothing less than an error."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def session_of(path: Path) -> Any:
+    """ONNX Runtime on the CPU, on as many threads as PyTorch has."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def feeds(names: Sequence[str], values: Sequence[Tensor]) -> dict[str, Any]:
+    """What a session is run with."""
+    return {name: value.numpy() for name, value in zip(names, values, strict=True)}
+
+
+def require_equal(result: Any, expected: Tensor, path: Path) -> float:
+    """The largest difference between ONNX Runtime's result and PyTorch's.
+
+    Raises:
+        ValueError: if it is above :data:`TOLERANCE`, or not a number.
+    """
+    difference = (torch.from_numpy(result) - expected).abs().max().item()
+    if not difference <= TOLERANCE:
+        raise ValueError(f"{path}: ONNX Runtime differs from PyTorch by {difference:.1e}, more than {TOLERANCE}")
+    return difference
+
+
+NODES = 33
+"""Of the table along each axis."""
+
+
+def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[float] | None = None) -> list[Path]:
+    """Write an ISP to ``out``, by its extension .json, .cube or .onnx; without one, a folder with all three.
+
+    Args:
+        isp: the ISP.
+        out: the file, or a folder to make.
+        white_balance: as-shot multipliers R, G, B of the setting; the fit's typical one by default.
+
+    Returns:
+        The files, each written whole.
+
+    Raises:
+        ValueError: for another extension; for ONNX, if a package is missing or ONNX Runtime differs from PyTorch.
+    """
+    out = Path(out)
+    if out.suffix not in ("", *WRITERS):
+        raise ValueError(f"{out}: an ISP is exported to {', '.join(WRITERS)}, or to a folder with all of them")
+    files = [out] if out.suffix else [out / f"isp{suffix}" for suffix in WRITERS]
+    if any(file.suffix == ".onnx" for file in files):
+        require_onnx("; .json and .cube files can be written without, one by one")
+    for file in files:
+        WRITERS[file.suffix](isp, file, white_balance)
+    return files
+
+
+def _write_json(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+    table = reverse_table(isp, typical_setting(isp, white_balance), NODES)
+    values = [[round(value, 7) for value in row] for row in table.tolist()]
+    content = description(isp, white_balance) | {"lut": {"size": NODES, "fastest": "red", "values": values}}
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(content) + "\n")
+
+
+def _write_cube(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+    setting = typical_setting(isp, white_balance)
+    gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
+    lines = [
+        f'TITLE "rawaug {path.stem}: sRGB to linear camera RGB"',
+        f"# gains R G B {gains}, included; lens shading and mosaic are not",
+        f"LUT_3D_SIZE {NODES}",
+        "DOMAIN_MIN 0.0 0.0 0.0",
+        "DOMAIN_MAX 1.0 1.0 1.0",
+        *(" ".join(f"{value:.7f}" for value in row) for row in reverse_table(isp, setting, NODES).tolist()),
+    ]
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n")
+
+
+def _write_onnx(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+    setting = typical_setting(isp, white_balance)
+    srgb = torch.rand(1, 3, 70, 90, generator=keyed_generator(0, "export"))
+    inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
+    with replacing(path) as partial:
+        to_onnx(ReversePass(isp).eval(), inputs, "raw", partial)
+        (result,) = session_of(partial).run(None, feeds(list(inputs), list(inputs.values())))
+        with torch.no_grad():
+            expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
+        require_equal(result, expected, path)
+
+
+WRITERS: dict[str, Callable[[DictionaryISP, Path, Sequence[float] | None], None]] = {
+    ".json": _write_json,
+    ".cube": _write_cube,
+    ".onnx": _write_onnx,
+}
+"""By extension."""
+
+
+class ReversePass(nn.Module):
+    """The reverse pass of an ISP as a function of tensors alone: sRGB, matrix and gains to packed RAW, any size.
+
+    Args:
+        isp: whose tone, shading and mosaic are taken; tone curves of a dictionary are mixed as is typical.
+    """
+
+    def __init__(self, isp: DictionaryISP) -> None:
+        super().__init__()
+        self.isp = isp
+
+    def forward(self, srgb: Tensor, matrix: Tensor, gains: Tensor) -> Tensor:
+        """``(1, 3, h, w)``, ``(1, 3, 3)`` and ``(1, 3)`` to ``(1, 4, h/2, w/2)``."""
+        none, tones = matrix.new_zeros(len(matrix), 0), self.isp.typical_tones().expand(len(matrix), -1)
+        params = ISPParams(none, none, matrix, gains, tones)
+        return pack_rgb(self.isp.reverse_pixels(srgb, params, _places(srgb)), self.isp.cfa)
+
+
+def _places(image: Tensor) -> Tensor:
+    """Coordinates of :func:`rawaug.isp.stages.place_in_frame`, computed from a tensor, so that any size is traced."""
+    ones = torch.ones_like(image[:, :1])
+    rows, columns = ones.cumsum(2), ones.cumsum(3)
+    height, width = rows[..., -1:, -1:], columns[..., -1:, -1:]
+    half_diagonal = 0.5 * (height.square() + width.square()).sqrt()
+    return torch.cat([rows - 0.5 - height / 2, columns - 0.5 - width / 2], dim=1) / half_diagonal
+
 
 SIDE = 512
 """Mosaic pixels on the longer side of what both are run on and timed on."""
@@ -82,7 +266,7 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
 
     Raises:
         FileNotFoundError, ValueError: if the denoiser or the frame cannot be read, a package is missing, ``out`` is not
-            named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`rawaug.commands.onnx_files.TOLERANCE`.
+            named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`rawaug.commands.export.TOLERANCE`.
     """
     out = Path(out)
     if out.suffix != ".onnx":

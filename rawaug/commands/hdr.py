@@ -13,8 +13,7 @@ from torch import Tensor
 
 from rawaug.files import require_writable
 from rawaug.io import read_picture, write_picture
-from rawaug.io.picture_exposure import read_exposure
-from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.io.pictures import MAX_PIXELS, read_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import COMMANDS

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import denoisers
-from denoisers.pretrained import FOLDER
+from denoisers.files import FOLDER
 from rawaug._version import __version__
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.description import description, tone_curve

@@ -31,11 +31,10 @@ import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
-from rawaug.extras import extra
+from rawaug.errors import extra
 from rawaug.files import digest, read_header, replacing, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
-from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
-from rawaug.isp.stages import place_in_frame
+from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
 

@@ -1,25 +1,48 @@
-"""The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
+"""The settings that the files of an output folder were made with, so that it never holds files of two settings.
+
+The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
 
 The draws of a pair depend on (seed, picture's name, number) alone.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from rawaug._version import __version__
-from rawaug.files import find_weights, sha256
+from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.io.apart import apart
-from rawaug.io.picture_files import MAX_PIXELS, decode_picture
+from rawaug.io.pictures import MAX_PIXELS, decode_picture
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.drawing import Drawing, draw_key
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.sampling_config import Drawing, draw_key
 from rawaug.registry import Spec
+
+
+def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
+    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``.
+
+    Raises:
+        ValueError: if the existing files were made with other settings.
+    """
+    if path.is_file() and not overwrite:
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+        for key in known | settings:
+            value, asked = known.get(key), settings.get(key)
+            if asked != value:
+                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
+        return
+    write_json(settings, path)
+
 
 Format = Literal["dng", "npz", "tiff", "webdataset"]
 

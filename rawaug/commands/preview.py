@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.extras import extra
+from rawaug.errors import extra
 from rawaug.files import require_writable
 from rawaug.io import encode_srgb, read_picture
-from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.io.pictures import MAX_PIXELS
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading
-from rawaug.isp.stages import place_in_frame
-from rawaug.isp.tone_curves import STEPS
+from rawaug.isp.stages import LensShading, place_in_frame
+from rawaug.isp.tone import STEPS
 from rawaug.patterns import pattern
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided

@@ -24,19 +24,17 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.commands import pair_shards
-from rawaug.commands.folder_settings import require_same_settings
 from rawaug.commands.pair_files import picture_tasks, replay
-from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task
+from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
-from rawaug.data.picture_folder import EXTENSIONS
+from rawaug.data.folders import EXTENSIONS
+from rawaug.errors import printable
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import find_weights, sha256
+from rawaug.files import NAME, find_weights, locked, sha256
 from rawaug.io.apart import prepare
-from rawaug.io.picture_files import MAX_PIXELS
-from rawaug.lock import NAME, locked
+from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
-from rawaug.plugin.drawing import Drawing
-from rawaug.printable import printable
+from rawaug.plugin.sampling_config import Drawing
 from rawaug.progress import progress
 from rawaug.registry import COMMANDS
 
@@ -119,7 +117,7 @@ def synth(
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
         drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso`` and ``cfa``, as in
-            :class:`rawaug.plugin.drawing.Drawing`.
+            :class:`rawaug.plugin.sampling_config.Drawing`.
 
     Raises:
         FileNotFoundError: if there is no such folder, picture or ISP.

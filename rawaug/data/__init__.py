@@ -15,23 +15,16 @@ from torch.utils.data import ConcatDataset
 
 from rawaug.data.check import DataReport, check
 from rawaug.data.demo.camera import DemoCamera
-from rawaug.data.demo.dead_leaves import dead_leaves
-from rawaug.data.demo.demo_pairs import demo_pairs, demo_photographs, demo_pictures
+from rawaug.data.demo.drawn import Shapes, dead_leaves
+from rawaug.data.demo.pairs import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
-from rawaug.data.fivek import fivek_pairs
-from rawaug.data.lazy import LazyPairs
-from rawaug.data.pair import Pair
+from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
-from rawaug.data.picture_folder import PictureFolder
-from rawaug.data.raw_folder import RawFolder
-from rawaug.data.rawir import Rawir
-from rawaug.data.rgb2raw import Rgb2Raw
-from rawaug.data.shapes import Shapes
-from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
+from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.published import Rawir, Rgb2Raw, Zurich, fivek_pairs
+from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission, write_submission
 from rawaug.data.sidd.frames import SiddFrames
-from rawaug.data.sidd.submission import check_submission, write_submission
-from rawaug.data.zurich import Zurich
-from rawaug.io.picture_files import MAX_PIXELS
+from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
@@ -85,7 +78,7 @@ def open_pairs(
             full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
         max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
-            for :data:`rawaug.io.picture_files.MAX_PIXELS`. Pairs given as a sequence keep theirs.
+            for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -136,7 +129,7 @@ def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int 
     Args:
         spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
         min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
-        max_pixels: larger ones likewise; None for :data:`rawaug.io.picture_files.MAX_PIXELS`.
+        max_pixels: larger ones likewise; None for :data:`rawaug.io.pictures.MAX_PIXELS`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.

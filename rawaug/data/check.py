@@ -18,21 +18,18 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data import picture_folder, raw_folder
+from rawaug.data import folders as picture_folder
+from rawaug.data import folders as raw_folder
 from rawaug.data.dnd import Dnd
-from rawaug.data.fivek import CAMERAS, fivek_numbers
-from rawaug.data.pair import Pair
+from rawaug.data.folders import PictureFolder
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
-from rawaug.data.picture_folder import PictureFolder
-from rawaug.data.rawir import Rawir
-from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks
-from rawaug.data.sidd.frames import SiddFrames
-from rawaug.data.sidd.scenes import is_scene
-from rawaug.data.sidd.submission import check_submission
-from rawaug.data.zurich import Zurich
+from rawaug.data.pairs import Pair
+from rawaug.data.published import CAMERAS, Rawir, Zurich, fivek_numbers
+from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission
+from rawaug.data.sidd.frames import SiddFrames, is_scene
+from rawaug.errors import printable
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.apart import apart
-from rawaug.printable import printable
 
 _SHOWN = 6
 _PAIRS = "pairs:"

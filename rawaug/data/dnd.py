@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.data.colour import color_matrix, white_balance
+from rawaug.data.development import color_matrix, white_balance
 from rawaug.data.mat import read_array, read_value
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.registry import DATASETS
 
 FRAMES, BOXES = 50, 20

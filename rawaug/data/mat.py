@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rawaug.extras import extra
+from rawaug.errors import extra
 from rawaug.io.apart import apart
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"

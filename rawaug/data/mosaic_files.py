@@ -35,14 +35,14 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.data.folders import EXTENSIONS
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
-from rawaug.data.raw_folder import EXTENSIONS
-from rawaug.data.statements import KINDS, Statements, levels, shown
-from rawaug.extras import extra
+from rawaug.data.mosaic_metadata import KINDS, Statements, levels, shown
+from rawaug.errors import extra
 from rawaug.io import read_raw
 from rawaug.io.apart import apart
-from rawaug.io.picture_files import MAX_PIXELS, read_plane
-from rawaug.io.tiff_tags import opened_tiff
+from rawaug.io.pictures import MAX_PIXELS, read_plane
+from rawaug.io.tiff import opened_tiff
 
 ARRAYS = (".npz", ".tif", ".tiff", ".png", ".mat")
 READABLE = (*EXTENSIONS, *ARRAYS)

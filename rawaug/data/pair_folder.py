@@ -16,12 +16,11 @@ from typing import NamedTuple
 
 import torch
 
-from rawaug.data.colour import develop_mosaic
-from rawaug.data.lazy import LazyPairs
+from rawaug.data.development import develop_mosaic
+from rawaug.data.folders import RawFolder
 from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
-from rawaug.data.pair import Pair
-from rawaug.data.raw_folder import RawFolder
-from rawaug.data.statements import Statements
+from rawaug.data.mosaic_metadata import Statements
+from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"

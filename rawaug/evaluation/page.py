@@ -22,9 +22,9 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
+from rawaug.errors import extra
 from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, levels_note, table_rows
-from rawaug.extras import extra
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp import conditioning
+from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.metrics import PATCH, patch_psnr, psnr
 from rawaug.seeding import keyed_generator

@@ -18,13 +18,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import denoisers
+from denoisers.classical import Stabilised
 from denoisers.network import Denoiser
-from denoisers.stabilised import Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
 from rawaug.noise import NoiseModel, anscombe

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pair import Pair
-from rawaug.extras import extra
-from rawaug.printable import printable
+from rawaug.data.pairs import Pair
+from rawaug.errors import extra, printable
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""

@@ -18,19 +18,17 @@ import torch
 from torch import Tensor
 
 import denoisers
-from denoisers.pretrained import DEFAULT, find
+from denoisers.files import DEFAULT, find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.lazy import SomePairs
-from rawaug.data.pair import Pair
-from rawaug.data.readable import each_readable
-from rawaug.data.sample import Sample
-from rawaug.devices import find_device
+from rawaug.data.folders import each_readable
+from rawaug.data.pairs import Pair, Sample, SomePairs
 from rawaug.evaluation.page import write_figure_page
 from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
 from rawaug.evaluation.tables import METRICS
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
+from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.registry import Spec
 
@@ -47,7 +45,7 @@ class DenoiserSweep:
         data: frames of clean RAW: folders, files, or ``kind:path``.
         count: how many frames of each are used; all if null.
         crop: side of the middle of each frame that is scored; null for the whole frame.
-        camera: whose noise is added, see :mod:`rawaug.noise.by_name`.
+        camera: whose noise is added, see :mod:`rawaug.noise.cameras`.
         isos: the ISOs, each within what was measured for that camera.
         denoisers: names of shipped ones, or files of ``rawaug run``.
         classical: classical denoisers; BM3D is left out, with a line that says so, where its wheel is not installed.

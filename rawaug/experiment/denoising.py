@@ -15,15 +15,13 @@ from types import MappingProxyType
 from typing import Any
 
 import denoisers
+from denoisers.files import find
 from denoisers.network import Denoiser
-from denoisers.pretrained import find
 from rawaug.bayer import CFA
 from rawaug.commands.fit import fit
-from rawaug.data.identity import stamps
-from rawaug.data.pair import Pair
-from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
-from rawaug.data.picture_folder import reports
-from rawaug.devices import find_device
+from rawaug.data.folders import reports
+from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
+from rawaug.errors import extra
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -37,24 +35,22 @@ from rawaug.evaluation.scores import (
     summary,
 )
 from rawaug.evaluation.tables import Row, draw, print_table
-from rawaug.experiment.arms import estimator_of, frames_of, in_pattern, training_stream, validation_samples
+from rawaug.experiment.arms import chosen, estimator_of, frames_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.rehearsal import rehearse
 from rawaug.experiment.run_folder import claim, run_folder
-from rawaug.experiment.search import chosen
-from rawaug.extras import extra
-from rawaug.files import find_weights, fingerprint, replacing, sha256, write_json
+from rawaug.files import find_weights, fingerprint, one_at_a_time, replacing, sha256, write_json
 from rawaug.io.apart import reading_within
 from rawaug.isp.model import DictionaryISP
-from rawaug.lock import one_at_a_time
+from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
+from rawaug.training.config import weights_key
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
-from rawaug.training.start import first_network, start_of
-from rawaug.training.train_config import weights_key
+from rawaug.training.state import first_network, start_of
 
 SHOWN = 3
 """Test frames in the picture."""

@@ -9,11 +9,11 @@ from importlib.util import find_spec
 
 import torch
 
-from rawaug.devices import find_device
+from rawaug.errors import MissingExtra, extra
 from rawaug.evaluation.scores import require_classical
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.run_folder import require_free
-from rawaug.extras import MissingExtra, extra
+from rawaug.kernels.runtime import find_device
 from rawaug.registry import name_and_settings
 
 NEEDED = ("lightning_fabric", "tensorboard", "matplotlib", "PIL")

@@ -6,19 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rawaug.experiment.ablation import Ablation, ablate, smoke_ablation
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
 from rawaug.experiment.denoising import dry_run, run
-from rawaug.experiment.learned_parts import LearnedParts, smoke_learned, weigh_parts
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import Recipe, smoke
-from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
 from rawaug.experiment.tables_rehearsed import (
     rehearse_ablation,
     rehearse_comparison,
     rehearse_learned,
     rehearse_sweep,
 )
+from rawaug.paper.ablation import Ablation, ablate, smoke_ablation
+from rawaug.paper.component_ablation import LearnedParts, smoke_learned, weigh_parts
+from rawaug.paper.reconstruction import Comparison, compare, smoke_comparison
 
 
 class Kind(NamedTuple):

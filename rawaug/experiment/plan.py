@@ -9,13 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.identity import shared_frame
-from rawaug.data.lazy import SomePairs, names_of
-from rawaug.data.pair import Pair
-from rawaug.data.pair_pictures import OWN_PICTURES, PairPictures
-from rawaug.data.readable import Readable, left_out
-from rawaug.data.remembered import Remembered
-from rawaug.data.select import selected
+from rawaug.data.folders import Readable, Remembered, left_out
+from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, selected, shared_frame
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights

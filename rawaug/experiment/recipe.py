@@ -8,13 +8,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
-from rawaug.data.pair import Pair
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pair_pictures import OWN_PICTURES
+from rawaug.data.pairs import OWN_PICTURES, Pair
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
 from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
-from rawaug.training.train_config import DenoiserConfig, TrainConfig, Weighing
+from rawaug.training.config import DenoiserConfig, TrainConfig, Weighing
 
 HELD_OUT = "auto"
 """``data.validation`` that is a part of ``data.pairs``."""

@@ -16,13 +16,13 @@ from torch.utils.data import default_collate
 
 from denoisers.network import Denoiser
 from rawaug.commands.fit import fit
-from rawaug.data.pair import Pair
-from rawaug.data.readable import each_readable
+from rawaug.data.folders import each_readable
+from rawaug.data.pairs import Pair
+from rawaug.errors import extra
 from rawaug.evaluation.scores import classical_method, network_method, score_method
 from rawaug.experiment.arms import estimator_of, frames_of, in_pattern, training_stream, validation_samples
 from rawaug.experiment.plan import Plan, require_usable
 from rawaug.experiment.recipe import Recipe
-from rawaug.extras import extra
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
@@ -30,7 +30,7 @@ from rawaug.plugin.augment import noise_for
 from rawaug.registry import LOSSES, Spec
 from rawaug.training.criteria import weighed
 from rawaug.training.noisy_frames import noisy_only
-from rawaug.training.start import first_network, start_of
+from rawaug.training.state import first_network, start_of
 from rawaug.training.validation import validate
 
 READ_SECONDS = 5.0

@@ -12,9 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rawaug.files import require_writable, write_json
-from rawaug.lock import NAME
-from rawaug.training.train_config import SAME_WEIGHTS
+from rawaug.files import NAME, require_writable, write_json
+from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
 FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
@@ -33,7 +32,7 @@ def run_folder(settings: Any) -> Path:
         ValueError: if the name leads out of ``out``, or is that of ``out`` itself.
 
     Example:
-        >>> from rawaug.experiment.ablation import Ablation
+        >>> from rawaug.paper.ablation import Ablation
         >>> run_folder(Ablation(name="../mine"))
         Traceback (most recent call last):
         ValueError: name '../mine': must be a folder within runs; give a name without .. and not beginning with /

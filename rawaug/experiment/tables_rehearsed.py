@@ -15,19 +15,19 @@ from typing import Any
 from torch import Tensor
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.demo.demo_pairs import FRAME
-from rawaug.data.pair import Pair
-from rawaug.data.readable import each_readable
+from rawaug.data.demo.pairs import FRAME
+from rawaug.data.folders import each_readable
+from rawaug.data.pairs import Pair
 from rawaug.experiment import rehearsal
-from rawaug.experiment.ablation import Ablation, measure
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, clean_middle, prepared_sweep, scored
-from rawaug.experiment.downstream import DownstreamConfig, psnr_d
-from rawaug.experiment.learned_parts import LearnedParts, photographs, variant_scores
-from rawaug.experiment.methods import Fitted, cycle_psnr, fit_family, score_rows
 from rawaug.experiment.plan import used
-from rawaug.experiment.reconstruction import Comparison, PreparedComparison
 from rawaug.experiment.run_folder import require_free, run_folder
-from rawaug.experiment.varied_frames import varied_frames
+from rawaug.paper.ablation import Ablation, measure
+from rawaug.paper.component_ablation import LearnedParts, photographs, variant_scores
+from rawaug.paper.downstream import DownstreamConfig, psnr_d
+from rawaug.paper.methods import Fitted, cycle_psnr, fit_family, score_rows
+from rawaug.paper.reconstruction import Comparison, PreparedComparison
+from rawaug.paper.synthetic_frames import varied_frames
 
 FITTED = 2
 """Frames that the methods are fitted to."""

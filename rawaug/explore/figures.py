@@ -10,11 +10,11 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.explore.look import Drawn
+from rawaug.errors import extra
 from rawaug.explore.quick_development import grey_curve
-from rawaug.extras import extra
+from rawaug.explore.view_state import Drawn
 from rawaug.io import encode_srgb
-from rawaug.isp.tone_curves import STEPS
+from rawaug.isp.tone import STEPS
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
 _ATOMS = 60

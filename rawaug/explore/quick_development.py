@@ -12,12 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rawaug.isp.config import ISPParams
 from rawaug.isp.description import tone_curve
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import ColorCorrection, LensShading, WhiteBalance
-from rawaug.isp.setting import ISPParams
-from rawaug.isp.stages import place_in_frame
-from rawaug.isp.tone_curves import STEPS
+from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
+from rawaug.isp.tone import STEPS
 
 _LEVELS = 2**14
 

@@ -16,21 +16,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from denoisers.files import DEFAULT, find, load
 from denoisers.network import Denoiser
-from denoisers.pretrained import DEFAULT, find
-from denoisers.weight_files import load
 from rawaug.bayer import CFA
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.explore import figures
-from rawaug.explore.look import Drawn, Look, drawn
 from rawaug.explore.quick_development import Development
+from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
-from rawaug.isp.setting import ISPParams
+from rawaug.isp.config import ISPParams
 from rawaug.metrics import psnr
 from rawaug.patterns import pattern
-from rawaug.plugin.drawing import draw_key
 from rawaug.plugin.pictures import even_sided
+from rawaug.plugin.sampling_config import draw_key
 
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768

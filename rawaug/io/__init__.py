@@ -5,7 +5,7 @@ None of them is loaded before a file is opened.
 
 from rawaug.io.dng import write_dng
 from rawaug.io.gain_map import GainMap
-from rawaug.io.picture_files import decode_srgb, encode_srgb, read_picture, write_picture
+from rawaug.io.pictures import decode_srgb, encode_srgb, read_picture, write_picture
 from rawaug.io.raw import RawFrame, develop, read_raw, read_raw_and_develop
 
 __all__ = [

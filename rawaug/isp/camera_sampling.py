@@ -20,9 +20,9 @@ import torch
 from numpy.typing import NDArray
 
 from rawaug.isp.cameras import XYZ_TO_SRGB
+from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import CameraDictionary, sparse_shares, sparse_weights
 from rawaug.isp.light import Array, LightRange, sample_lights
-from rawaug.isp.setting import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
 """Red and blue gains over green that are kept; a matrix made for D65 says nothing of light that needs more."""

@@ -15,9 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.isp.dictionary import CameraDictionary, ToneDictionary
-from rawaug.isp.hull import nearest_in_hull
-from rawaug.isp.setting import ISPParams
+from rawaug.isp.config import ISPParams
+from rawaug.isp.dictionary import CameraDictionary, ToneDictionary, nearest_in_hull
 from rawaug.isp.staged import StagedISP
 from rawaug.kernels.raw_torch import through_curves
 

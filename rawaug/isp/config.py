@@ -1,12 +1,24 @@
-"""What a dictionary ISP is made of: the configuration in the header of its file."""
+"""What a dictionary ISP is made of: the configuration in the header of its file.
+
+One camera setting per picture, and the result of a pass under it.
+
+ReverseISP: what every method of making RAW from sRGB can do, the dictionary ISP and the baselines alike.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
 
 from rawaug.bayer import CFA
-from rawaug.isp.stages import HIGHLIGHT_KNEE
 from rawaug.registry import require_between
+
+HIGHLIGHT_KNEE = 0.9
+"""Mean linear value above which Brooks' inverse gains bend towards 1."""
 
 MOST_ATOMS, MOST_CAMERAS, MOST_FEATURES, MOST_STAGES = 2048, 2**16, 1024, 32
 """More are refused before anything is built: a few bytes of a file can ask for any size."""
@@ -25,7 +37,7 @@ class ISPConfig:
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
         stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered
-            (:func:`rawaug.isp.stage.register`); ``curve`` stands in place of ``tone gamma``.
+            (:func:`rawaug.isp.stages.register`); ``curve`` stands in place of ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights.
@@ -76,3 +88,89 @@ class ISPConfig:
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))
 """The size with at most 0.2 M parameters."""
+
+
+class ISPParams(NamedTuple):
+    """One camera setting per picture; replays a pass. Leading dimension B everywhere.
+
+    Args:
+        colour_weights: ``(B, N)`` weights of the colour atoms.
+        gain_weights: ``(B, M)`` weights of the gain atoms; ``(B, 0)`` where the gains follow from a light.
+        matrix: ``(B, 3, 3)`` sRGB to camera.
+        gains: ``(B, 3)`` white balance times digital gain, forward direction.
+        tone_weights: ``(B, K)`` weights of the tone curves; ``(B, 0)`` where the tone is learned.
+    """
+
+    colour_weights: Tensor
+    gain_weights: Tensor
+    matrix: Tensor
+    gains: Tensor
+    tone_weights: Tensor
+
+
+@dataclass
+class ISPResult:
+    """Result of a pass: ``raw`` ``(B, 1, H, W)`` or ``srgb`` ``(B, 3, H, W)``, the parameters; x1..x5 on request."""
+
+    image: Tensor
+    params: ISPParams
+    intermediates: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def raw(self) -> Tensor:
+        """The mosaic of a reverse pass."""
+        return self.image
+
+    @property
+    def srgb(self) -> Tensor:
+        """The picture of a forward pass."""
+        return self.image
+
+
+class ReverseISP(nn.Module, ABC):
+    """A way from sRGB to RAW, and back where the method has one.
+
+    Attributes:
+        name: of the method.
+        bidirectional: whether it renders RAW as well, so that there is a :meth:`cycle`.
+        info: how it was fitted.
+    """
+
+    name: ClassVar[str]
+    bidirectional: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.info: dict[str, Any] = {}
+
+    @property
+    @abstractmethod
+    def cfa(self) -> CFA:
+        """Pattern of the RAW that it makes and takes."""
+
+    @property
+    @abstractmethod
+    def reverse_parameters(self) -> int:
+        """Number of parameters of the reverse pass."""
+
+    @abstractmethod
+    def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
+        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to the mosaic ``(B, 1, H, W)``.
+
+        Args:
+            srgb: pictures with even sides.
+            setting: of the camera, as the method takes it; its own choice by default.
+            place: coordinates in the full frame ``(1 or B, 2, H, W)``, for methods that depend on them.
+        """
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        """The mosaic under a setting drawn at random; the one of :meth:`make` where the method has no other."""
+        return self.make(srgb)
+
+    @abstractmethod
+    def cycle(self, srgb: Tensor) -> Tensor:
+        """sRGB to RAW and back, ``(B, 3, H, W)`` in [0, 1]."""
+
+    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor | None:
+        """The same without the mosaic between the passes; None for methods that are not pointwise."""
+        return None

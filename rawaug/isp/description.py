@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from rawaug.isp import conditioning
+from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading
-from rawaug.isp.setting import ISPParams
-from rawaug.isp.stage import node_colours
+from rawaug.isp.stages import LensShading, node_colours
 
 CODES = 256
 

@@ -28,10 +28,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from rawaug.isp.config import ISPParams, ISPResult
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import WhiteBalance
-from rawaug.isp.setting import ISPParams, ISPResult
-from rawaug.isp.stages import display_referred, inverse_gains
+from rawaug.isp.stages import WhiteBalance, display_referred, inverse_gains
 
 MIDDLE_GREY = 0.18
 """Linear light up to which highlights are not compressed."""

@@ -7,6 +7,10 @@ trilinear interpolation (65 nodes a side: above 75 dB against the network). Colo
 numbers a picture, and the mask is a function of the coordinates. Every site computes its own colour alone, which the
 mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
 has a table of its own.
+
+The reverse pass of an ISP with reordered stages, which cannot be baked into a table.
+
+Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.fast.BakedISP`; dozens of times slower.
 """
 
 from __future__ import annotations
@@ -22,14 +26,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rawaug import bayer
 from rawaug.bayer import CFA, unpack
-from rawaug.isp.chooser import Chooser
+from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
-from rawaug.isp.stage import Dials, Stage, Tables, node_colours
-from rawaug.isp.tone_curves import STEPS
-from rawaug.kernels import compiled, fallback, raw_torch
-from rawaug.kernels.threads import one_thread
+from rawaug.isp.stages import Dials, Stage, Tables, as_float, node_colours
+from rawaug.isp.thumbnail_encoder import Chooser
+from rawaug.isp.tone import STEPS
+from rawaug.kernels import compiled, raw_torch
+from rawaug.kernels import runtime as fallback
+from rawaug.kernels.raw_torch import frame_of
+from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
@@ -163,3 +170,49 @@ def _as_table(values: Tensor, nodes: int) -> Tensor:
     """``(1, C, N, N * N)`` on the cube to ``(N, N, N, 4)``, the channels that are missing 0."""
     channels_last = values[0].permute(1, 2, 0).reshape(nodes, nodes, nodes, -1)
     return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()
+
+
+class UnbakedISP(nn.Module):
+    """The reverse pass of an ISP as it is now; arguments, results and errors are those of ``BakedISP``."""
+
+    def __init__(self, isp: DictionaryISP) -> None:
+        super().__init__()
+        self.isp = deepcopy(isp)
+
+    @torch.no_grad()
+    def choose(self, srgb: Tensor) -> ISPParams:
+        """The setting that the encoders (or their constants) choose."""
+        return self.isp.choose(srgb)
+
+    @torch.no_grad()
+    def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """sRGB to clean packed RAW."""
+        return bayer.pack_rgb(self.colours(srgb, params, place, white), self.isp.cfa)
+
+    @torch.no_grad()
+    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+        """RAW of all three colours at every site, ``(B, 3, H, W)``."""
+        require_batch(srgb, params, place)
+        x5 = self.isp.reverse_pixels(as_float(srgb), params, None if place is None else _coordinates(srgb, place))
+        return x5.clamp(max=white)
+
+
+def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
+    """The fastest form that the ISP's stages allow.
+
+    Example:
+        >>> from rawaug.isp.config import ISPConfig
+        >>> type(reverse_pass(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))).__name__
+        'UnbakedISP'
+    """
+    return BakedISP(isp) if bakeable(isp.ordered_stages) else UnbakedISP(isp)
+
+
+def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:
+    """Of the pixels of turned crops in their full frames, ``(B, 2, H, W)``."""
+    height, width = srgb.shape[-2:]
+    corners = [frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()]
+    frames = torch.tensor(corners, device=srgb.device, dtype=torch.float32)
+    start, down, right = frames.reshape(-1, 3, 2, 1, 1).unbind(1)
+    rows = torch.arange(height, device=srgb.device)[:, None]
+    return start + down * rows + right * torch.arange(width, device=srgb.device)

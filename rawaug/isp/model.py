@@ -3,7 +3,7 @@ r"""The dictionary ISP: sRGB to RAW and back, six stages whose parameters come f
 ``y = f6^-1 . f5^-1 . f4^-1 . f3^-1 . f2^-1 . f1^-1 (x)`` and ``x = f1 . f2 . f3 . f4 . f5 . f6 (y)``
 
 Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022. The stages are in
-:mod:`rawaug.isp.paper_stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
+:mod:`rawaug.isp.stages`, the dictionaries in :mod:`rawaug.isp.dictionary`, the mosaic in :mod:`rawaug.bayer`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from rawaug import bayer
 from rawaug.files import find_weights
 from rawaug.isp import conditioning, stages
 from rawaug.isp.camera_sampling import CameraSampler
+from rawaug.isp.config import ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, convex_weights
-from rawaug.isp.encoder import thumbnail
-from rawaug.isp.isp_file import damaged, misfit, read_isp, write_isp
+from rawaug.isp.file import damaged, misfit, read_isp, write_isp
 from rawaug.isp.light import light_range
-from rawaug.isp.setting import ISPParams, ISPResult
-from rawaug.isp.staged import StagedISP
+from rawaug.isp.staged import StagedISP, thumbnail
 
 
 class DictionaryISP(StagedISP):

@@ -16,20 +16,45 @@ figure 2; the highlight-safe inverse gains are eq. 4 of Brooks et al., "Unproces
 CVPR 2019. f6 is in :mod:`rawaug.bayer`. Images are ``(B, 3, H, W)``, linear from x2 on, white at 1.
 
 Everything but f6 is pointwise, given the parameters: a set of pixels ``(B, 3, 1, P)`` is as good as a picture.
+
+What a stage of the ISP is: one image to the next in both directions, and its share of the baked pass.
+
+The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
+A stage that is the same for every picture goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
+on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` batch by batch (:meth:`Stage.adjust`).
+
+A new kind of stage is a class with :func:`register` above it, in a module that is imported before an ISP is made.
+
+The five stages of the paper between sRGB and the mosaic; their formulas are in :mod:`rawaug.isp.stages`.
+
+The tone stage without a network: a picture's curve is a mixture of known ones, or the one of a fitted camera.
+
+``x2 = T(x)`` with ``T = sum_k v_k T_k``, in place of the learned tone network and gamma of the paper. The way back
+looks the code up on the same curve; where the curve is flat, the lowest code is taken.
+
+A fit bends a standard's curve :math:`T_0`, whose slope it scales on each of 51 pieces of five codes:
+
+.. math:: T(s) = \int_0^s e^{l(u)} T_0'(u) \, du \Big/ \int_0^1 e^{l(u)} T_0'(u) \, du .
 """
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple, TypeVar
+
 import torch
 from torch import Tensor, nn
+
+from rawaug.isp.config import HIGHLIGHT_KNEE, ISPConfig, ISPParams
+from rawaug.isp.dictionary import ToneDictionary
+from rawaug.isp.tone import NODES, STEPS, to_code, to_linear
+from rawaug.kernels.raw_torch import frame_of
 
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
 
 _HALF_LEVEL = 0.5 / 255
-
-HIGHLIGHT_KNEE = 0.9
-"""Mean linear value above which Brooks' inverse gains bend towards 1."""
 
 
 def as_float(srgb: Tensor) -> Tensor:
@@ -226,3 +251,391 @@ class AttentionMask(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
         return 2.0 * torch.sigmoid(self.layers(x))
+
+
+class Tables(NamedTuple):
+    """What the baked pass looks up, at the nodes of an N x N x N cube.
+
+    Args:
+        cube: ``(1, 3, N, N * N)`` the nodes' colours.
+        x2: ``(1, 3, N, N * N)`` what the stages so far make of them.
+        attention: ``(1, 1, N, N * N)`` a gain for linear colours, or None.
+    """
+
+    cube: Tensor
+    x2: Tensor
+    attention: Tensor | None = None
+
+
+class Dials(NamedTuple):
+    """What the baked pass uses of a batch's settings.
+
+    Args:
+        matrix: ``(B, 3, 3)`` x2 to x3.
+        floor: ``(B, 1, 3)`` one over the gains.
+        frame: ``(B, 6)`` see :class:`rawaug.kernels.raw_torch.Camera`.
+        curves: ``(B, 1021)`` x to x2, in place of the table; or ``(B, 0)``.
+        shading: ``(3,)`` of the mask ``2^-(a y^2 + b x y + c x^2)``, or empty.
+    """
+
+    matrix: Tensor
+    floor: Tensor
+    frame: Tensor
+    curves: Tensor
+    shading: Tensor
+
+
+class Stage(nn.Module, ABC):
+    """A stage of the ISP; images are ``(B, 3, H, W)``.
+
+    Parameters whose names start with ``forward_`` are those of the forward pass, all others are the reverse pass's.
+
+    Args:
+        config: of the ISP.
+
+    Attributes:
+        name: in ``ISPConfig.stages`` and in files.
+        makes: k of ``x_k``, the image that the reverse pass makes: the stage's position in the usual order.
+        config: of the ISP, kept up to date by it.
+    """
+
+    name: ClassVar[str]
+    makes: ClassVar[int]
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__()
+        self.config = config
+
+    @abstractmethod
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        """``x_(k-1)`` to ``x_k``.
+
+        Args:
+            x: the image.
+            params: the pictures' settings; None where the setting is not chosen yet, for stages up to x2.
+            place: coordinates in the full frame ``(1 or B, 2, H, W)``; ``x`` is a full frame by default.
+        """
+
+    @abstractmethod
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        """``x_k`` to ``x_(k-1)``, arguments as in :meth:`reverse`."""
+
+    @abstractmethod
+    def bake(self, tables: Tables) -> Tables:
+        """The tables with what this stage does to every picture alike."""
+
+    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+        """The dials with what this stage does to these pictures.
+
+        Args:
+            dials: as the stages before set them.
+            params: the pictures' settings.
+            place: ``(B, 4 or 5)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
+            size: height and width of the pictures.
+        """
+        return dials
+
+    def describe(self) -> str:
+        """The stage's parameters in one line; empty if the settings hold them all."""
+        return ""
+
+    # -- fitting ----------------------------------------------------------------------------------------------------
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        """The few numbers of :meth:`coarse`."""
+        return {}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        """The reverse pass in a few numbers, from which a fit starts; nothing for what each frame has of its own."""
+        return x
+
+    def start_coarse(self, gamma: float, toe: float) -> None:
+        """Start as the curve ``(x + toe (1 - x))^gamma``."""
+
+    def start_fine(self) -> None:
+        """Start :meth:`reverse` from :meth:`coarse`."""
+
+    def start_forward(self) -> None:
+        """Start :meth:`forward` from :meth:`reverse`."""
+
+    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
+        """The parameters that the forward or the reverse pass is fitted by, with the stage's name before theirs."""
+        named = self.named_parameters()
+        return {f"{self.name}.{key}": p for key, p in named if key.startswith("forward_") == forward}
+
+
+STAGES: dict[str, type[Stage]] = {}
+"""Name to class."""
+
+Kind = TypeVar("Kind", bound=type[Stage])
+
+
+def register(kind: Kind) -> Kind:
+    """Let ISPs be made of stages of this class.
+
+    Raises:
+        ValueError: if another class has the name.
+    """
+    if STAGES.setdefault(kind.name, kind) is not kind:
+        raise ValueError(f"stage {kind.name!r} is registered already, by {STAGES[kind.name].__qualname__}")
+    return kind
+
+
+def stage_class(name: str) -> type[Stage]:
+    """The class of the stages called ``name``.
+
+    Raises:
+        ValueError: naming the known ones.
+    """
+    if name not in STAGES:
+        raise ValueError(f"stages: {name!r} is unknown; choose of {' '.join(STAGES)}")
+    return STAGES[name]
+
+
+def node_colours(nodes: int) -> Tensor:
+    """The colours ``(1, 3, N, N * N)`` at the nodes of a table, axes B, G, R."""
+    axis = torch.linspace(0.0, 1.0, nodes, dtype=torch.float32)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
+
+
+@register
+class ToneMap(Stage):
+    """f1: a tone network for each direction."""
+
+    name, makes = "tone", 1
+    toe: Tensor
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        self.reverse_network = ToneNetwork()
+        self.forward_network = ToneNetwork()
+        self.register_buffer("toe", torch.zeros(()), persistent=False)
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        y: Tensor = self.reverse_network(x)
+        return y
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        y: Tensor = self.forward_network(x)
+        return y
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables._replace(x2=self.reverse(tables.x2, None))
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        return {"toe": self.toe}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return x + self.toe * (1.0 - x)
+
+    def start_coarse(self, gamma: float, toe: float) -> None:
+        self.toe.fill_(toe)
+
+    def start_fine(self) -> None:
+        self.reverse_network.start_from(float(self.toe))
+
+
+@register
+class Gamma(Stage):
+    """f2: a power for each direction, 2.2 at first."""
+
+    name, makes = "gamma", 2
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        self.reverse_gamma = nn.Parameter(torch.tensor(2.2))
+        self.forward_gamma = nn.Parameter(torch.tensor(2.2))
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return gamma_expand(x, self.reverse_gamma)
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return gamma_compress(x, self.forward_gamma)
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables._replace(x2=self.reverse(tables.x2, None))
+
+    def describe(self) -> str:
+        return f"gamma: {self.reverse_gamma.item():.3f} reverse, {self.forward_gamma.item():.3f} forward"
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        return {"gamma": self.reverse_gamma}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return self.reverse(x, None)
+
+    @torch.no_grad()
+    def start_coarse(self, gamma: float, toe: float) -> None:
+        self.reverse_gamma.fill_(gamma)
+
+    @torch.no_grad()
+    def start_forward(self) -> None:
+        self.forward_gamma.copy_(self.reverse_gamma)
+
+
+@register
+class ColorCorrection(Stage):
+    """f3: the picture's matrix."""
+
+    name, makes = "colour", 3
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return correct_colour(x, chosen(params).matrix)
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return correct_colour(x, torch.linalg.pinv(chosen(params).matrix))
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables
+
+    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+        return dials._replace(matrix=params.matrix.to(dials.matrix))
+
+
+@register
+class WhiteBalance(Stage):
+    """f4: the picture's gains, with Brooks' care for highlights on the way back."""
+
+    name, makes = "gains", 4
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return inverse_gains(x, chosen(params).gains, self.config.knee)
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return apply_gains(x, chosen(params).gains)
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables
+
+    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+        return dials._replace(floor=1.0 / params.gains.to(dials.floor)[:, None])
+
+
+@register
+class LensShading(Stage):
+    """f5: a Gaussian mask over the frame and, if the settings say so, an attention mask for each direction."""
+
+    name, makes = "shading", 5
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        self.mask = GaussianMask()
+        self.reverse_attention = AttentionMask() if config.attention else None
+        self.forward_attention = AttentionMask() if config.attention else None
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        x = x * self.mask(placed(x, place))
+        return x if self.reverse_attention is None else x * self.reverse_attention(x)
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        x = x / self.mask(placed(x, place))
+        return x if self.forward_attention is None else x * self.forward_attention(x)
+
+    def bake(self, tables: Tables) -> Tables:
+        return (
+            tables if self.reverse_attention is None else tables._replace(attention=self.reverse_attention(tables.cube))
+        )
+
+    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+        centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
+        places = [[0, 0, *size]] * len(dials.frame) if place is None else place.tolist()
+        frame = dials.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(len(dials.frame), 6)
+        precision = self.mask.precision * (0.5 / math.log(2.0))
+        shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
+        return dials._replace(frame=frame, shading=shading)
+
+    def describe(self) -> str:
+        mean, precision = self.mask.mean.tolist(), self.mask.precision.flatten().tolist()
+        return f"shading: mean {mean}, precision {[round(p, 3) for p in precision]}"
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        return {f"mask.{key}": p for key, p in self.mask.named_parameters()}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return x * self.mask(placed(x, place))
+
+
+def chosen(params: ISPParams | None) -> ISPParams:
+    """``params``, which a stage after x2 cannot do without."""
+    if params is None:
+        raise ValueError("this stage needs the pictures' parameters; choose them first")
+    return params
+
+
+PIECES = 51
+
+
+@register
+class ToneCurve(Stage):
+    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet.
+
+    Raises:
+        ValueError: if there are no tone atoms, or the stages contain the learned curve as well.
+    """
+
+    name, makes = "curve", 2
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        if config.tone_atoms < 1 or {"tone", "gamma"} & set(config.stages):
+            raise ValueError(
+                f"stages: 'curve' takes tone_atoms, at least 1, and replaces tone and gamma; got "
+                f"{config.tone_atoms} and {' '.join(config.stages)}"
+            )
+        self.dictionary = ToneDictionary(config.tone_atoms)
+        self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return to_linear(x, self._curves(len(x), params))
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return to_code(x, self._curves(len(x), params))
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables._replace(x2=self.reverse(tables.x2, None))
+
+    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+        return dials._replace(curves=self.dictionary.combine(params.tone_weights.to(dials.matrix)))
+
+    def describe(self) -> str:
+        return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
+            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
+        )
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        return {} if self.slopes is None else {"slopes": self.slopes}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return self.reverse(x, None)
+
+    @torch.no_grad()
+    def start_coarse(self, gamma: float, toe: float) -> None:
+        code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
+        curve = (code + toe * (1.0 - code)) ** gamma
+        self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
+        self.slopes = torch.zeros(self.config.tone_atoms, PIECES)
+
+    @torch.no_grad()
+    def start_forward(self) -> None:
+        """The curves are those of the reverse pass from now on."""
+        self.dictionary.curves.copy_(self._bent())
+        self.slopes = None
+
+    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
+        return {} if forward or self.slopes is None else {f"{self.name}.slopes": self.slopes}
+
+    def _bent(self) -> Tensor:
+        """The curves under the slopes of a fit."""
+        if self.slopes is None:
+            return self.dictionary.curves
+        rises = self.dictionary.curves.diff(dim=1) * self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
+        heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
+        return heights / heights[:, -1:]
+
+    def _curves(self, batch: int, params: ISPParams | None) -> Tensor:
+        """One curve a picture; the typical one where none is chosen."""
+        weights = self.dictionary.typical[None]
+        if params is not None and params.tone_weights.shape[1]:
+            weights = params.tone_weights.to(weights)
+        weights = weights.expand(batch, -1)
+        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bent()

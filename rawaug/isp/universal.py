@@ -1,6 +1,7 @@
 """The universal ISP, from published figures alone: ``python -m rawaug.isp.universal --out universal.safetensors``.
 
-Colour atoms are chosen greedily among the published cameras (:mod:`rawaug.isp.hull`), so that their hull holds as many
+Colour atoms are chosen greedily among the published cameras (:mod:`rawaug.isp.dictionary`), so that their hull holds
+as many
 of all of them as it can on the colours of the package's photographs. Tone atoms are the published curves, or as many of
 them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a picture's
 setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and light.
@@ -16,15 +17,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rawaug.camera_names import spelled
 from rawaug.isp.camera_sampling import plausible
 from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import CameraDictionary
-from rawaug.isp.hull import colour_coordinates, extreme_points, greedy_atoms, nearest_in_hull, psnr
+from rawaug.isp.dictionary import (
+    CameraDictionary,
+    colour_coordinates,
+    extreme_points,
+    greedy_atoms,
+    nearest_in_hull,
+    psnr,
+)
 from rawaug.isp.light import sample_lights
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone_curves import STEPS, tone_names, tone_tables
+from rawaug.isp.tone import STEPS, tone_names, tone_tables
+from rawaug.registry import spelled
 from rawaug.seeding import keyed_generator
 
 COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 0.0503))

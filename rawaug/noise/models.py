@@ -25,9 +25,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from rawaug.kernels import compiled, fallback
-from rawaug.kernels.eager import eager
+from rawaug.kernels import compiled
+from rawaug.kernels import runtime as fallback
 from rawaug.kernels.philox import normals
+from rawaug.kernels.runtime import eager
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.poisson import poisson
 from rawaug.seeding import derived_seed, keyed_generator

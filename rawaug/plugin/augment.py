@@ -24,12 +24,12 @@ from torch.utils.data import get_worker_info
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.camera_sampling import EXPOSURE
+from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import perturb
+from rawaug.isp.fast import reverse_pass
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
-from rawaug.isp.unbaked import reverse_pass
 from rawaug.isp.universal import of_cameras
-from rawaug.kernels.eager import eager
+from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair

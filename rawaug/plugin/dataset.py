@@ -23,7 +23,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from rawaug import bayer
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.threads import one_thread
+from rawaug.kernels.runtime import one_thread
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.epochs import Passes, Visits
 from rawaug.plugin.params import AugmentParams, RawPair, require_keys

@@ -2,7 +2,7 @@
 
 Batch n of epoch e is drawn from a generator seeded with BLAKE2b(seed, "wrap", e, n), where the seed is the
 augmentation's: whatever the loader's workers do, the same batches make the same pairs. Each pass is a new epoch. In a
-distributed run each process has its share of the pictures (:mod:`rawaug.plugin.shares`), and the keys of processes but
+distributed run each process has its share of the pictures (:mod:`rawaug.plugin.epochs`), and the keys of processes but
 the first have their rank as well.
 """
 
@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from rawaug.devices import find_device
 from rawaug.isp.model import DictionaryISP
+from rawaug.kernels.runtime import find_device
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import augmentation, crop_size, placed, random_place
-from rawaug.plugin.epochs import checked_epoch
+from rawaug.plugin.epochs import checked_epoch, own_share, world_size
 from rawaug.plugin.params import RawPair, require_keys
 from rawaug.plugin.pictures import (
     even_sided,
@@ -33,7 +33,6 @@ from rawaug.plugin.pictures import (
     to_rgb_batch,
     to_rgb_tensor,
 )
-from rawaug.plugin.shares import own_share, world_size
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -194,7 +193,8 @@ def wrap(
             :class:`RawPair` takes their place, all else passes through.
         augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
         device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
-            :func:`rawaug.devices.find_device` knows, ``auto`` among them. Pictures travel there as uint8, if they are.
+            :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. Pictures travel there as uint8, if
+        they are.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
         crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
             different sizes. By default whole pictures, without their last row or column where a side is odd.

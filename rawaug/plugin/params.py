@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from rawaug.files import read_tensors, write_tensors
-from rawaug.isp.setting import ISPParams
+from rawaug.isp.config import ISPParams
 
 _KIND = "augment_params"
 

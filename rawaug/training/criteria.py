@@ -22,7 +22,7 @@ from collections.abc import Callable
 from torch import Tensor, nn
 
 from denoisers.domains import DOMAINS, Anscombe, levels_of
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Sample
 from rawaug.registry import LOSSES
 
 Criterion = Callable[[Tensor, Tensor], Tensor]

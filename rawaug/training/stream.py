@@ -15,8 +15,7 @@ from torch.utils.data import Dataset, Sampler
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Pair, Sample
 from rawaug.noise import NoiseModel
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import keyed_generator

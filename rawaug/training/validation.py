@@ -16,8 +16,7 @@ from torch import Tensor, nn
 import denoisers
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pair import Pair
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Pair, Sample
 from rawaug.metrics import psnr
 
 PARTS = ("low", "middle", "high")

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.block_matching import _HADAMARD
-from denoisers.classical import Classical
+from denoisers.classical import _HADAMARD, Classical
 
 SIGMA = 0.03
 OWN = [NonLocalMeans, Wavelet, TotalVariation]

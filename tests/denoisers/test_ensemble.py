@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from denoisers import SelfEnsemble, UNet
-from denoisers.ensemble import from_view, to_view
+from denoisers.inference import from_view, to_view
 from rawaug import bayer
 
 CFAS = list(bayer.CFA)

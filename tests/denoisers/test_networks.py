@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
-from denoisers.nafnet import NAFNet
 from denoisers.network import pad_to_multiple
+from denoisers.networks import NAFNet
 from denoisers.pmrid import PMRID
 
 Make = Callable[..., Any]

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from denoisers import UNet, from_pretrained, pretrained, save
+from denoisers import UNet, from_pretrained, save
+from denoisers import files as pretrained
 
 FIELDS = (
     "Licence",

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers.recorrupted import Recorrupted
+from denoisers.inference import Recorrupted
 
 SHOT_VAR, READ_VAR, ALPHA = 2e-3, 1e-4, 0.5
 

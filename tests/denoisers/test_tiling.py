@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from denoisers import DnCNN, SelfEnsemble, UNet, tiled
-from denoisers.tiling import _pieces
+from denoisers.inference import _pieces
 
 
 def pair(*shape: int) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from denoisers import DENOISERS, build, load, save
-from denoisers.unet import UNet
+from denoisers.networks import UNet
 
 SMALL: list[tuple[str, dict[str, Any]]] = [
     ("UNet", {"width": 4, "scales": 3, "variance_map": False}),

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug.devices import find_device
+from rawaug.kernels.runtime import find_device
 
 
 @pytest.mark.usefixtures("no_gpu")

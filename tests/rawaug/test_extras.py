@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rawaug.cli import main
-from rawaug.extras import MissingExtra, extra
+from rawaug.errors import MissingExtra, extra
 
 ROOT = Path(__file__).parents[2]
 SETUP = ConfigParser()

@@ -10,9 +10,9 @@ import torch
 
 from rawaug.commands.synth import print_synthesis, synth
 from rawaug.data import PictureFolder, check
+from rawaug.errors import printable
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import write_picture
-from rawaug.printable import printable
 
 NAMES = [
     "a space", "new\nline", "\"double\" and 'single'", "<script>alert(1)</script>".replace("/", "\u2215"), "-rf",

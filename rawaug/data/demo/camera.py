@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
-from rawaug.data.malvar import demosaic_malvar
-from rawaug.data.pair import Pair
+from rawaug.data.development import demosaic_malvar
+from rawaug.data.pairs import Pair
 from rawaug.io import decode_srgb, encode_srgb
 
 BLACK, WHITE = 512, 4095

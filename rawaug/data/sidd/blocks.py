@@ -1,37 +1,109 @@
-"""SIDD's blocks of 256 x 256: validation, benchmark, and those of SIDD+ (NTIRE 2020).
+"""The sRGB pictures of SIDD's blocks, as the sensor saw them.
+
+``ValidationGtBlocksSrgb.mat`` and its like hold uint8 (40 scene instances, 32 blocks, rows, columns, RGB). SIDD turns
+its pictures upright and not its mosaics, and the block files do not say how: of the eight turns, a frame's blocks take
+the one in which their green agrees best with the green of the mosaics.
+
+SIDD's blocks of 256 x 256: validation, benchmark, and those of SIDD+ (NTIRE 2020).
 
 ``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
 same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
-:data:`rawaug.data.sidd.scenes.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern
+:data:`rawaug.data.sidd.frames.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern
 of each frame in a line of ``siddplus_*bayer_patterns.csv``.
 
 Their pictures are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
 ``siddplus_valid_gt_srgb.mat``) if these are below the same folder, gains and colour matrix from the METADATA files of
 their scene instances. Where there is neither, the gains are 1, the matrix is the identity, the picture shows camera
 colour, and the pair says so (``rendered`` is False): it can test a denoiser, but no ISP.
+
+The file in which results go to the SIDD benchmark (RAW track), and a check of it.
+
+Published in two forms: a CSV with the columns ID (0 to 1279, block by block, frame by frame) and BLOCK (the bytes of
+the float32 block, row by row, in base64), for the pages on Kaggle; and ``SubmitRaw.mat`` of version 5 with the array
+``SubmitRaw`` (40, 32, 256, 256). Source: the example code of the dataset's first author, ``sidd_kaggle_submit``.
 """
 
 from __future__ import annotations
 
+import base64
 import csv
-from collections.abc import Callable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.captured_noise import captured_noise
-from rawaug.data.colour import develop_mosaic
-from rawaug.data.lazy import LazyPairs
+from rawaug.data.development import develop_mosaic
 from rawaug.data.mat import read_array
-from rawaug.data.pair import Pair
-from rawaug.data.sidd.block_pictures import read_block_pictures, turned_like
-from rawaug.data.sidd.frames import Colour, SiddFrames, colour_of, indexed, noise_level_functions, normalised
-from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
+from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.sidd.frames import (
+    HELD_BACK,
+    Colour,
+    SiddFrames,
+    SiddScene,
+    colour_of,
+    indexed,
+    noise_level_functions,
+    normalised,
+)
 from rawaug.registry import DATASETS
+
+LEAST_LIKENESS = 0.8
+"""Correlation of the greens below which pictures do not show the blocks of the mosaics."""
+
+
+def read_block_pictures(file: Path, blocks: tuple[int, ...], side: tuple[int, int]) -> Tensor:
+    """Pictures uint8 ``(*blocks, 3, H, W)`` of the array that is named after its file.
+
+    Raises:
+        FileNotFoundError, OSError: as :func:`rawaug.data.mat.read_array`.
+        ValueError: if they are not uint8, or of another number or size than the mosaics.
+    """
+    array = read_array(file, file.stem)
+    if array.dtype.name != "uint8" or array.shape != (*blocks, *side, 3):
+        raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the mosaics need uint8 {(*blocks, *side, 3)}")
+    return torch.from_numpy(array).movedim(-1, -3)
+
+
+def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
+    """The pictures ``(K, 3, H, W)`` of a frame's blocks, turned as their mosaics ``(K, 1, H, W)`` are.
+
+    Raises:
+        ValueError: in the name of ``what``, if they do not show the same.
+
+    Example:
+        >>> coarse = torch.rand(2, 3, 2, 2, generator=torch.Generator().manual_seed(0))
+        >>> rgb = coarse.repeat_interleave(4, dim=2).repeat_interleave(4, dim=3)
+        >>> pictures = bayer.turn((rgb * 255).to(torch.uint8), 3)
+        >>> turned = turned_like(pictures, bayer.mosaic(rgb, CFA.RGGB), CFA.RGGB, "blocks")
+        >>> torch.equal(turned, (rgb * 255).to(torch.uint8))
+        True
+    """
+    square = pictures.shape[-2] == pictures.shape[-1]
+    views = range(bayer.N_VIEWS if square else bayer.N_VIEWS // 2)
+    planes = bayer.pack(mosaics, cfa)
+    raw = (planes[:, 1] + planes[:, 2]).clamp_min(0.0).sqrt()
+    green = F.avg_pool2d(pictures[:, 1:2].float(), 2)[:, 0]
+    likeness = torch.stack([_correlation(bayer.turn_back(green, view), raw) for view in views])
+    best = int(likeness.argmax())
+    if likeness[best] < LEAST_LIKENESS:
+        raise ValueError(f"{what}: its pictures do not show its RAW blocks (correlation {likeness[best]:.2f})")
+    return bayer.turn_back(pictures, best).contiguous()
+
+
+def _correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Of two stacks of images; 1 where one of them is flat, which contradicts nothing."""
+    value = torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1]
+    return torch.where(value.isfinite(), value, torch.ones(()))
+
 
 BLOCKS = 32
 """Blocks of a frame."""
@@ -323,3 +395,81 @@ def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) ->
         noisy_srgb=None if frame.noisy_srgb is None else frame.noisy_srgb[block],
         levels_from_clean=frame.levels_from_clean,
     )
+
+
+SIDE = 256
+COUNT = len(HELD_BACK) * BLOCKS
+
+
+def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SIDE) -> None:
+    """Write denoised mosaics, in the order of :class:`rawaug.data.SiddBenchmark`, as ``.csv`` or ``.mat``.
+
+    Args:
+        path: ``SubmitRaw.csv`` or ``SubmitRaw.mat``.
+        blocks: 1,280 tensors ``(1, H, W)``, in the pattern that they came in. Values are written as they are.
+        side: of the blocks.
+
+    Raises:
+        ValueError: if the extension is another, a block has the wrong shape or a value that is not finite, or there are
+            not 1,280.
+    """
+    path = Path(path)
+    if path.suffix not in (".csv", ".mat"):
+        raise ValueError(f"{path}: a SIDD submission must be a .csv or .mat file")
+    arrays = [_checked(block, k, side) for k, block in enumerate(blocks)]
+    if len(arrays) != COUNT:
+        raise ValueError(f"{path}: a submission must have {COUNT} blocks, got {len(arrays)}")
+    if path.suffix == ".mat":
+        from scipy.io import savemat
+
+        savemat(path, {"SubmitRaw": np.stack(arrays).reshape(len(HELD_BACK), BLOCKS, side, side)})
+        return
+    with path.open("w", encoding="ascii", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["ID", "BLOCK"])
+        table.writerows((k, base64.b64encode(array.tobytes()).decode()) for k, array in enumerate(arrays))
+
+
+def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
+    """Read a submission back as ``(1280, 1, side, side)``.
+
+    Raises:
+        FileNotFoundError, OSError: if there is no such file, or it is damaged.
+        ValueError: in one line, if the benchmark would refuse it, or values leave [0, 1] (which it would not notice).
+    """
+    path = Path(path)
+    blocks = _from_mat(path, side) if path.suffix == ".mat" else _from_csv(path, side)
+    if not np.isfinite(blocks).all() or blocks.min() < 0 or blocks.max() > 1:
+        raise ValueError(f"{path}: has values from {blocks.min():.4g} to {blocks.max():.4g}; clip them to [0, 1]")
+    return torch.from_numpy(blocks)[:, None]
+
+
+def _checked(block: Tensor, index: int, side: int) -> np.ndarray:
+    if tuple(block.shape) != (1, side, side):
+        raise ValueError(f"block {index}: must have shape (1, {side}, {side}), got {tuple(block.shape)}")
+    if not block.isfinite().all():
+        raise ValueError(f"block {index}: has values that are not finite")
+    return block[0].detach().cpu().numpy().astype("<f4", order="C")
+
+
+def _from_mat(path: Path, side: int) -> np.ndarray:
+    array = read_array(path, "SubmitRaw")
+    if array.shape != (len(HELD_BACK), BLOCKS, side, side) or array.dtype != np.float32:
+        expected = (len(HELD_BACK), BLOCKS, side, side)
+        raise ValueError(f"{path}: SubmitRaw must be float32 {expected}, got {array.dtype} {array.shape}")
+    return np.ascontiguousarray(array).reshape(COUNT, side, side)
+
+
+def _from_csv(path: Path, side: int) -> np.ndarray:
+    csv.field_size_limit(sys.maxsize)
+    with path.open(encoding="ascii", newline="") as file:
+        rows = list(csv.reader(file))
+    if rows[:1] != [["ID", "BLOCK"]] or [row[0] for row in rows[1:]] != [str(k) for k in range(COUNT)]:
+        raise ValueError(f"{path}: must have the columns ID and BLOCK, with IDs 0 to {COUNT - 1} in order")
+    blocks = np.empty((COUNT, side, side), np.float32)
+    for k, row in enumerate(rows[1:]):
+        data = base64.b64decode(row[1])
+        if len(data) != 4 * side * side:
+            raise ValueError(f"{path}: block {k} has {len(data)} bytes, expected {4 * side * side} (float32)")
+        blocks[k] = np.frombuffer(data, "<f4").reshape(side, side)
+    return blocks

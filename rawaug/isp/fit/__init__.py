@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rawaug.isp.fit.fit_config import FitConfig
+from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.pipeline import fit_isp
 
 __all__ = ["FitConfig", "fit_isp"]

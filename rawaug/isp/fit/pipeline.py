@@ -1,15 +1,20 @@
-r"""The stages of a fit, in order.
+r"""Which tone a fit takes, the network or a curve: that which is better on frames that it has not seen.
+
+For every fold both are fitted without its frames and compared on these, by PSNR_r with the as-shot gains: blind, the
+guess of the gains would decide, which is the same for both.
+
+The stages of a fit, in order.
 
 1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
    and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
 2. Tone. The tone network starts as that curve and is refined together with all of stage 1; or the curve itself is
-   bent (:mod:`rawaug.isp.curve_stage`), where this is asked for or better (:mod:`rawaug.isp.fit.tone_choice`).
+   bent (:mod:`rawaug.isp.stages`), where this is asked for or better (:mod:`rawaug.isp.fit.pipeline`).
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
 4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
 
-The losses are in :mod:`rawaug.isp.fit.losses`.
+The losses are in :mod:`rawaug.isp.fit.descent`.
 
 Source: the model and losses of Conde et al., AAAI 2022; splitting the fit into a global and a per-frame part is what
 makes it hold up with a handful of frames (``docs/fit.md``).
@@ -19,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,21 +36,42 @@ from rawaug._version import __version__
 from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
-from rawaug.isp.fit.atoms import REACH_ATOMS, set_atoms, set_knee, set_priors
-from rawaug.isp.fit.colour_fit import FrameColour, Tie, fall_off, least_squares
-from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent
-from rawaug.isp.fit.encoders import train_encoders
-from rawaug.isp.fit.fit_config import FitConfig
-from rawaug.isp.fit.joint import train_jointly
-from rawaug.isp.fit.losses import cycle_error, reading_error
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent, cycle_error, decibels, reading_error
+from rawaug.isp.fit.encoders import train_encoders, train_jointly
 from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
-from rawaug.isp.fit.tone_choice import with_better_tone
+from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading
-from rawaug.isp.stage import Stage
-from rawaug.kernels.threads import one_thread
+from rawaug.isp.stages import LensShading, Stage
+from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derived_seed
+
+FOLDS = 4
+
+Refit = Callable[[Sequence[int], str, FitConfig], DictionaryISP]
+"""Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
+
+
+def with_better_tone(
+    samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, refit: Refit
+) -> tuple[FitConfig, float | None]:
+    """The settings with ``tone`` decided, and by how many dB the curve is better where it was asked for."""
+    if config.tone != "auto":
+        return config, None
+    if len(shots) < 2:
+        return replace(config, tone="learned"), None
+    gain, folds = 0.0, min(FOLDS, len(shots))
+    for fold in range(folds):
+        out = list(range(fold, len(shots), folds))
+        kept = [k for k in range(len(shots)) if k not in out]
+        part = f" without part {fold + 1} of {folds}"
+        learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
+        curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
+        better = decibels(curve, samples, shots, out, True) - decibels(learned, samples, shots, out, True)
+        gain += len(out) * better / len(shots)
+    return replace(config, tone="curve" if gain > 0 else "learned"), gain
+
 
 STANDARD_CURVES = ((2.2, 0.0), (2.4, 0.055 / 1.055), (1.0 / 0.45, 0.099 / 1.099))
 """gamma and toe a of a plain gamma camera, of sRGB (IEC 61966-2-1) and of ITU-R BT.709."""

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.extras import extra
-from rawaug.isp.encoder import thumbnail
+from rawaug.errors import extra
+from rawaug.isp.staged import thumbnail
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.seeding import keyed_generator
 
@@ -57,7 +57,7 @@ class Shot(NamedTuple):
     """What is kept of a frame besides its pixels.
 
     Args:
-        srgb, raw: thumbnails ``(1, 3, h, w)``, the longer side :data:`rawaug.isp.encoder.THUMBNAIL` at most; the RAW is
+        srgb, raw: thumbnails ``(1, 3, h, w)``, the longer side :data:`rawaug.isp.staged.THUMBNAIL` at most; the RAW is
             not white-balanced.
     """
 

@@ -15,10 +15,9 @@ import torch
 from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.commands.camera_noise import measure_camera_noise
-from rawaug.commands.fit import fit
-from rawaug.commands.frame_noise import levels_of, stored_noise
-from rawaug.data.pair import Pair
+from rawaug.commands.fit import fit, measure_camera_noise
+from rawaug.commands.frame_denoisers import levels_of, stored_noise
+from rawaug.data.pairs import Pair
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
 from rawaug.plugin.augment import noise_for
@@ -99,7 +98,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
     assert noisy_pair.noisy is not None
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
-    monkeypatch.setattr("rawaug.commands.camera_noise.estimate_noise", estimate)
+    monkeypatch.setattr("rawaug.commands.fit.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair]).law.at(None)[0] == shot_var
     else:

@@ -17,8 +17,7 @@ import denoisers
 from rawaug.bayer import CFA, mosaic
 from rawaug.cli import main
 from rawaug.commands.denoise import denoise_file, denoise_folder, run
-from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic
-from rawaug.commands.frame_noise import levels_of
+from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic, levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 

@@ -11,8 +11,7 @@ import torch
 
 import denoisers
 from rawaug.cli import main
-from rawaug.commands.export import export
-from rawaug.commands.onnx_files import errors_only, session_of
+from rawaug.commands.export import errors_only, export, session_of
 
 
 @pytest.fixture

@@ -11,12 +11,11 @@ from scipy.interpolate import RegularGridInterpolator
 
 from rawaug.bayer import pack_rgb
 from rawaug.cli import main
-from rawaug.commands.export_isp import ReversePass, export_isp
+from rawaug.commands.export import ReversePass, export_isp, session_of
 from rawaug.commands.info import as_json
-from rawaug.commands.onnx_files import session_of
 from rawaug.isp.description import typical_setting
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading
+from rawaug.isp.stages import LensShading
 
 
 @pytest.fixture(scope="module", params=["canon-powershot", "gopro-hero", "universal-small"])

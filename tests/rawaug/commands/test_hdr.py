@@ -14,7 +14,7 @@ from rawaug.cli import main
 from rawaug.commands.hdr import exposures, hdr
 from rawaug.commands.hdr import run as hdr_command
 from rawaug.io import read_picture, write_picture
-from rawaug.io.picture_exposure import read_exposure
+from rawaug.io.pictures import read_exposure
 
 
 def shot(path: Path, level: int, seconds: float = 0.0, iso: int = 100, size: tuple[int, int] = (8, 12)) -> str:

@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from rawaug.cli import main
 from rawaug.data import check
-from rawaug.data.sidd.scenes import HELD_BACK
+from rawaug.data.sidd.frames import HELD_BACK
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import time_limit
 
@@ -90,7 +90,7 @@ def _crash_on_marked(path: Path, max_pixels: int) -> torch.Tensor:
 @pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
 def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_pictures(tmp_path)
-    monkeypatch.setattr("rawaug.data.picture_folder.decode_picture", _crash_on_marked)
+    monkeypatch.setattr("rawaug.data.folders.decode_picture", _crash_on_marked)
     (part,) = check(tmp_path).parts
     assert dict(part.sizes) == {"6 x 8": 2} and part.items == part.examined == 3
     assert len(part.broken) == 1 and "1.png: crashes the decoder (killed by SIGSEGV)" in part.broken[0]

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from rawaug.data import check, fivek_pairs, open_pairs
-from rawaug.data.fivek import CAMERAS, fivek_numbers
+from rawaug.data.published import CAMERAS, fivek_numbers
 from rawaug.io import develop
-from rawaug.io.jpeg import through_jpeg
+from rawaug.io.pictures import through_jpeg
 
 SPLITS = {("canon", "train"): 650, ("canon", "test"): 127, ("nikon", "train"): 414, ("nikon", "test"): 73}
 

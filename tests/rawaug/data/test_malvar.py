@@ -5,7 +5,7 @@ import torch
 
 from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data import demo_photographs
-from rawaug.data.malvar import demosaic_malvar
+from rawaug.data.development import demosaic_malvar
 
 
 @pytest.mark.parametrize("cfa", list(CFA))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug.data import demo_pairs
-from rawaug.data.pair_pictures import PairPictures
+from rawaug.data.pairs import PairPictures
 from rawaug.experiment.plan import planned
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 

@@ -188,7 +188,7 @@ def test_the_end_of_an_epoch_is_reported(messy: tuple[Path, set[str]], caplog: p
 def test_nothing_is_opened_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for k in range(3000):
         (tmp_path / f"{k:04d}.jpg").touch()
-    monkeypatch.setattr("rawaug.data.picture_folder.decode_picture", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr("rawaug.data.folders.decode_picture", lambda *_: pytest.fail("opened"))
     start = time.perf_counter()
     assert len(PictureFolder(tmp_path)) == 3000
     assert time.perf_counter() - start < 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rawaug.data.remembered import Remembered
+from rawaug.data.folders import Remembered
 
 
 class Decoded:

@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.lazy import LazyPairs
-from rawaug.data.pair import Pair
-from rawaug.data.select import FrameLabel, one_a_phone, selected, whole_scenes
+from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, one_a_phone, selected, whole_scenes
 
 PHONES = ("GP", "IP", "S6")
 LABELS = [FrameLabel(f"{scene:03d}", phone, iso) for scene in (1, 2) for phone in PHONES for iso in (100, 400, 1600)]

@@ -8,9 +8,8 @@ import torch
 from PIL import Image
 
 from rawaug.data import Shapes, open_pictures
-from rawaug.data.picture_folder import reports
-from rawaug.data.remembered import Remembered
-from rawaug.data.shapes import KINDS
+from rawaug.data.demo.drawn import KINDS
+from rawaug.data.folders import Remembered, reports
 
 
 def test_a_picture_depends_on_seed_and_index_alone() -> None:

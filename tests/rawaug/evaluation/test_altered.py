@@ -7,8 +7,8 @@ import torch
 from skimage.color import rgb2gray
 
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.evaluation.altered import overexposed, retouched
+from rawaug.data.pairs import Pair
+from rawaug.paper.metrics import overexposed, retouched
 
 
 def grey(value: int) -> Pair:

@@ -10,8 +10,8 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.evaluation.balanced_psnr import balanced_psnr
+from rawaug.data.pairs import Pair
+from rawaug.paper.metrics import balanced_psnr
 
 BALANCE = (2.0, 1.0, 1.6)
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.page import WINDOW, Page, draw_curves, encode_png, most_detailed
 from rawaug.evaluation.tables import Row
 

@@ -17,7 +17,7 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands.evaluate import evaluate
 from rawaug.data import Pair, demo_pairs
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import (
     Score,
     classical_method,

@@ -11,7 +11,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.tables import Row, draw, mean_and_spread, print_table
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 

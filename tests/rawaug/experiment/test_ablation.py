@@ -14,12 +14,12 @@ import torch
 from skimage.color import rgb2yuv
 
 from rawaug import bayer
-from rawaug.data.pair import Pair
-from rawaug.experiment import ablation
-from rawaug.experiment.ablation import LEFT_OUT, SPACES, TITLES, Ablation, ablate, smoke_ablation, stage_psnr
+from rawaug.data.pairs import Pair
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
+from rawaug.paper import ablation
+from rawaug.paper.ablation import LEFT_OUT, SPACES, TITLES, Ablation, ablate, smoke_ablation, stage_psnr
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)

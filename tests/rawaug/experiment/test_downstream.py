@@ -14,15 +14,15 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import score_denoiser
-from rawaug.experiment import downstream
-from rawaug.experiment.downstream import DownstreamConfig, MadeCrops, psnr_d
-from rawaug.isp.baselines import UPI
-from rawaug.isp.baselines.plain_unet import UNetISP
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper import downstream
+from rawaug.paper.baselines import UPI
+from rawaug.paper.baselines.networks import UNetISP
+from rawaug.paper.downstream import DownstreamConfig, MadeCrops, psnr_d
 
 SILENT = noise_model((0.0, 0.0))
 TINY = replace(DownstreamConfig().smoke(), test=["given:"])

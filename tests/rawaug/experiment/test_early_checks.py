@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from rawaug.errors import MissingExtra
 from rawaug.experiment import denoising
 from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
-from rawaug.extras import MissingExtra
-from rawaug.training.train_config import TrainConfig
+from rawaug.training.config import TrainConfig
 
 
 @pytest.fixture

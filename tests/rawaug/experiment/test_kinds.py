@@ -13,15 +13,15 @@ import yaml
 
 from rawaug.cli import _parser
 from rawaug.commands.spelling import require_known_keys, require_known_options
-from rawaug.experiment.ablation import Ablation
 from rawaug.experiment.kinds import KINDS, kind_of, quickly
-from rawaug.experiment.methods import FAMILIES, ROWS
 from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe
-from rawaug.experiment.reconstruction import Comparison
-from rawaug.isp.baselines import BASELINES
 from rawaug.isp.fit.samples import BLOCK
-from rawaug.training.train_config import TrainConfig
+from rawaug.paper.ablation import Ablation
+from rawaug.paper.baselines import BASELINES
+from rawaug.paper.methods import FAMILIES, ROWS
+from rawaug.paper.reconstruction import Comparison
+from rawaug.training.config import TrainConfig
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from rawaug.data import PictureFolder
-from rawaug.data.pair import Pair
-from rawaug.experiment import learned_parts
-from rawaug.experiment.learned_parts import LearnedParts, score, smoke_learned, weigh_parts
+from rawaug.data.pairs import Pair
 from rawaug.io import write_picture
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP
+from rawaug.paper import component_ablation as learned_parts
+from rawaug.paper.component_ablation import LearnedParts, score, smoke_learned, weigh_parts
 
 FrameOf = Any
 TINY = FitConfig(encoders="on", joint_steps=0, steps=2, curve_steps=5, pixels=256, batch=64)

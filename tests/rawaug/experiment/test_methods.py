@@ -13,9 +13,16 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.experiment import methods, oracle
-from rawaug.experiment.methods import (
+from rawaug.data.pairs import Pair
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.fit import FitConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.metrics import PATCH
+from rawaug.paper import methods
+from rawaug.paper import methods as oracle
+from rawaug.paper.baselines import BASELINES, UPI, InvISP, TunedUPI
+from rawaug.paper.baselines.networks import UNetISP
+from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
     Fitted,
@@ -26,12 +33,6 @@ from rawaug.experiment.methods import (
     mosaic_only_psnr,
     score_rows,
 )
-from rawaug.isp.baselines import BASELINES, UPI, InvISP, TunedUPI
-from rawaug.isp.baselines.plain_unet import UNetISP
-from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import FitConfig
-from rawaug.isp.model import DictionaryISP
-from rawaug.metrics import PATCH
 
 FrameOf = Callable[..., Pair]
 DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)

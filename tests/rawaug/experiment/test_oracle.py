@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.experiment import oracle as search
-from rawaug.experiment.methods import dictionary_params
-from rawaug.experiment.oracle import oracle, squared_error
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
+from rawaug.paper import methods as search
+from rawaug.paper.methods import dictionary_params, oracle, squared_error
 from rawaug.seeding import keyed_generator
 
 

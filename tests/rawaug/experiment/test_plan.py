@@ -13,12 +13,11 @@ import torch
 
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
-from rawaug.data.identity import stamps
-from rawaug.data.lazy import names_of
+from rawaug.data.pairs import names_of, stamps
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs, with_own_pairs
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe, find_recipe, recipe_list, shipped_recipes
 from rawaug.io import write_picture
-from rawaug.training.train_config import TrainConfig
+from rawaug.training.config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
 ONE_ARM = ["--arms", '{"real": {"augmented": 0.5}}', "--denoiser.settings", '{"width": 4, "scales": 2}']

@@ -13,13 +13,13 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.experiment import methods, reconstruction
-from rawaug.experiment.downstream import DownstreamConfig
-from rawaug.experiment.reconstruction import Comparison, compare, smoke_comparison
-from rawaug.isp.baselines import BASELINES
-from rawaug.isp.baselines.base import CropTrainedISP
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig
+from rawaug.paper import methods, reconstruction
+from rawaug.paper.baselines import BASELINES
+from rawaug.paper.baselines.base import CropTrainedISP
+from rawaug.paper.downstream import DownstreamConfig
+from rawaug.paper.reconstruction import Comparison, compare, smoke_comparison
 
 FrameOf = Callable[..., Pair]
 TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64, prior_steps=20)

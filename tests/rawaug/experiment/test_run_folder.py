@@ -11,7 +11,7 @@ import pytest
 from rawaug.experiment.denoiser_sweep import DenoiserSweep, sweep
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.experiment.run_folder import STAMP, claim, require_free
-from rawaug.training.train_config import TrainConfig
+from rawaug.training.config import TrainConfig
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from rawaug.experiment.arms import chosen
 from rawaug.experiment.recipe import ArmConfig, Recipe
-from rawaug.experiment.search import chosen
 
 
 def searching(**search: list[float]) -> ArmConfig:

@@ -10,13 +10,9 @@ from typing import Any
 import pytest
 
 from rawaug.cli import main
-from rawaug.data.pair import Pair
-from rawaug.experiment import ablation, reconstruction, tables_rehearsed
-from rawaug.experiment.ablation import Ablation
+from rawaug.data.pairs import Pair
+from rawaug.experiment import tables_rehearsed
 from rawaug.experiment.denoiser_sweep import DenoiserSweep
-from rawaug.experiment.downstream import DownstreamConfig
-from rawaug.experiment.learned_parts import LearnedParts
-from rawaug.experiment.reconstruction import Comparison
 from rawaug.experiment.tables_rehearsed import (
     rehearse_ablation,
     rehearse_comparison,
@@ -24,6 +20,11 @@ from rawaug.experiment.tables_rehearsed import (
     rehearse_sweep,
 )
 from rawaug.isp.fit import FitConfig
+from rawaug.paper import ablation, reconstruction
+from rawaug.paper.ablation import Ablation
+from rawaug.paper.component_ablation import LearnedParts
+from rawaug.paper.downstream import DownstreamConfig
+from rawaug.paper.reconstruction import Comparison
 
 FrameOf = Callable[..., Pair]
 

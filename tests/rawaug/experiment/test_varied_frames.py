@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from rawaug.data import demo_photographs
-from rawaug.experiment.varied_frames import varied_frames
 from rawaug.isp.cameras import colour_matrix, published_cameras
+from rawaug.paper.synthetic_frames import varied_frames
 
 CAMERAS = ["Nikon D750", "Canon EOS 5D Mark III"]
 

@@ -19,11 +19,11 @@ import torch
 
 from rawaug.commands.explore import choices
 from rawaug.data import demo_pictures
-from rawaug.explore import look as looks
-from rawaug.explore.gradio_page import listening
+from rawaug.explore import view_state as looks
+from rawaug.explore.page import listening
 from rawaug.explore.views import pair as view
 from rawaug.io import write_picture
-from rawaug.plugin.drawing import Drawing
+from rawaug.plugin.sampling_config import Drawing
 
 pytestmark = pytest.mark.long
 WAIT = 60_000

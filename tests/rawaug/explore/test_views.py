@@ -15,10 +15,10 @@ from rawaug.cli import main
 from rawaug.data import demo_pictures
 from rawaug.explore import views
 from rawaug.explore.figures import variance_by_signal
-from rawaug.explore.look import Look, command, drawn, iso_range, noises_of, possible, python
-from rawaug.explore.markup import as_html, data_url, message
+from rawaug.explore.page import as_html, data_url, message
+from rawaug.explore.view_state import Look, command, drawn, iso_range, noises_of, possible, python
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.drawing import Drawing
+from rawaug.plugin.sampling_config import Drawing
 
 LEVELS = (1e-4, 1e-6)
 

@@ -22,7 +22,7 @@ from rawaug.io import apart as reading
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import apart, apart_each, prepare, time_limit
 from rawaug.io.helper import Helper
-from rawaug.io.picture_files import decode_picture
+from rawaug.io.pictures import decode_picture
 from rawaug.io.reading_process import FULL
 
 pytestmark = pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
@@ -203,7 +203,7 @@ def test_a_folder_names_the_file_that_crashed_in_a_worker_and_goes_on(
 ) -> None:
     for k in range(4):
         write_picture(tmp_path / f"{k}.png", torch.full((3, 8, 8), k, dtype=torch.uint8))
-    monkeypatch.setattr("rawaug.data.picture_folder.decode_picture", _crash_on_marked)
+    monkeypatch.setattr("rawaug.data.folders.decode_picture", _crash_on_marked)
     pictures = PictureFolder(tmp_path, allowed_share=0.5)
     loader = DataLoader(pictures, batch, num_workers=1, multiprocessing_context="fork")
     found = torch.cat([batch_of.reshape(-1, 3, 8, 8) for batch_of in loader])

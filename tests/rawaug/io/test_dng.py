@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
 from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
-from rawaug.io.shot import Exposure
+from rawaug.io.raw import Exposure
 
 MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
 WHITE_BALANCE = (2.1, 1.0, 1.4)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from rawaug.io.jpeg import through_jpeg
+from rawaug.io.pictures import through_jpeg
 
 
 def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width() -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms, ImageOps
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
-from rawaug.io.picture_files import read_plane
+from rawaug.io.pictures import read_plane
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
 SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)

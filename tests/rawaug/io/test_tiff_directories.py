@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rawaug.io import read_raw, write_dng
-from rawaug.io.tiff_directories import MOST_DIRECTORIES, require_no_circle
+from rawaug.io.tiff import MOST_DIRECTORIES, require_no_circle
 
 LONG = 4
 

@@ -9,7 +9,7 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 

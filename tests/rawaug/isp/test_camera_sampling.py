@@ -10,7 +10,7 @@ from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
 from rawaug.isp.dictionary import CameraDictionary, sparse_weights
 from rawaug.isp.light import D65, LightRange, sample_lights, white_point
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone_curves import STEPS
+from rawaug.isp.tone import STEPS
 from rawaug.isp.universal import of_cameras
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
+from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
 from rawaug.metrics import psnr
 
 LIGHT = (1.7, 0.9, 1.4)

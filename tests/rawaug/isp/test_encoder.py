@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from rawaug.isp.encoder import THUMBNAIL, Encoder, thumbnail
+from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 
 
 def images() -> torch.Tensor:

@@ -7,11 +7,9 @@ import torch
 
 from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
-from rawaug.isp.fast import BakedISP
+from rawaug.isp.fast import BakedISP, UnbakedISP, reverse_pass
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading, ToneMap
-from rawaug.isp.stages import place_in_frame
-from rawaug.isp.unbaked import UnbakedISP, reverse_pass
+from rawaug.isp.stages import LensShading, ToneMap, place_in_frame
 from rawaug.kernels import compiled
 from rawaug.metrics import psnr
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rawaug.isp.cameras import colour_matrix, published_cameras
-from rawaug.isp.hull import colour_coordinates, greedy_atoms, nearest_in_hull, psnr, second_moment
+from rawaug.isp.dictionary import colour_coordinates, greedy_atoms, nearest_in_hull, psnr, second_moment
 
 COLOURS = torch.rand(3, 500, generator=torch.Generator().manual_seed(0)).double() ** 2
 

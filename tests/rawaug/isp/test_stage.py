@@ -10,11 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from rawaug import bayer
-from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
+from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
-from rawaug.isp.stage import STAGES, Stage, Tables, register, stage_class
+from rawaug.isp.stages import STAGES, Stage, Tables, register, stage_class
 from rawaug.metrics import psnr
 
 

@@ -8,7 +8,7 @@ from importlib import resources
 import pytest
 import torch
 
-from rawaug.isp.tone_curves import NODES, STEPS, srgb_to_linear, to_linear, tone_names, tone_tables
+from rawaug.isp.tone import NODES, STEPS, srgb_to_linear, to_linear, tone_names, tone_tables
 
 
 def test_curves_rise_from_black_to_white() -> None:

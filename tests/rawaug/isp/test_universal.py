@@ -8,11 +8,10 @@ import torch
 from rawaug import bayer
 from rawaug.isp.cameras import published_cameras
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import CameraDictionary
+from rawaug.isp.dictionary import CameraDictionary, colour_coordinates, psnr
 from rawaug.isp.fast import BakedISP
-from rawaug.isp.hull import colour_coordinates, psnr
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone_curves import to_code, to_linear, tone_tables
+from rawaug.isp.tone import to_code, to_linear, tone_tables
 from rawaug.isp.universal import STAGES, camera_points, held, inverse_gains_in_any_light
 from rawaug.metrics import psnr as image_psnr
 

@@ -8,7 +8,7 @@ import torch
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.paper_stages import LensShading, ToneMap
+from rawaug.isp.stages import LensShading, ToneMap
 
 CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "all stages": {},

@@ -11,9 +11,10 @@ import torch
 
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import fallback, noise_numba, raw_torch
+from rawaug.kernels import noise_numba, raw_torch
 from rawaug.kernels import noise_triton as noise_kernel
 from rawaug.kernels import raw_triton as raw_kernel
+from rawaug.kernels import runtime as fallback
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.kernels import fallback
+from rawaug.kernels import runtime as fallback
 
 triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
 

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import fallback, raw_torch
+from rawaug.kernels import raw_torch
+from rawaug.kernels import runtime as fallback
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment

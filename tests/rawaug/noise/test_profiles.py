@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug.noise import noise_model
-from rawaug.noise.profiles import READ_ON_MOSAIC, SHOT_ON_MOSAIC, ProfileLevels, published_profiles
+from rawaug.noise.cameras import READ_ON_MOSAIC, SHOT_ON_MOSAIC, ProfileLevels, published_profiles
 
 
 def generator(seed: int = 0) -> torch.Generator:

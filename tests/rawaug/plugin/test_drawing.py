@@ -11,7 +11,7 @@ from rawaug.isp.cameras import published_cameras, white_balance
 from rawaug.isp.light import LAMPS, light_range, sample_lights, white_point
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.drawing import Drawing
+from rawaug.plugin.sampling_config import Drawing
 
 PICTURE = torch.randint(256, (3, 16, 24), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 

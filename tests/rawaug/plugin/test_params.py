@@ -9,9 +9,8 @@ import torch
 from safetensors.torch import save_file
 from torch.utils.data import default_collate
 
-from rawaug.isp.config import ISPConfig
+from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.setting import ISPParams
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.params import AugmentParams, load_params, save_params

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from denoisers.domains import LEAST_SHOT
-from rawaug.data.sample import Sample
+from rawaug.data.pairs import Sample
 from rawaug.training.criteria import L1, L2, Charbonnier, weighed
 
 SHOT, READ = 2e-3, 1e-5

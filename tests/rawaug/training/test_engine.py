@@ -27,7 +27,7 @@ from safetensors.torch import save_file
 from rawaug.bayer import CFA
 from rawaug.training.noisy_frames import NoisyCrops, NoisyFrame, held_out
 from rawaug.training.estimators import Noisier, Neighbor2Neighbor
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
+from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import TrainingStream
 from rawaug.training.loop import train
 from rawaug.training.validation import Watched

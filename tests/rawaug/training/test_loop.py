@@ -18,11 +18,11 @@ from rawaug.evaluation.scores import frozen_sample
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.training import loop
+from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import Supervised
-from rawaug.training.journal import Journal
+from rawaug.training.loop import Journal
 from rawaug.training.state import learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.validation import Watched, validate
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})

@@ -12,13 +12,14 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.experiment.arms import frames_of, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
 from rawaug.plugin.augment import RawAugment
+from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import (
     R2R,
     Neighbor2Neighbor,
@@ -31,7 +32,6 @@ from rawaug.training.estimators import (
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
 from rawaug.training.stream import TrainingStream
-from rawaug.training.train_config import DenoiserConfig, TrainConfig
 from rawaug.training.validation import Watched, validate
 
 LEVELS = (0.01, 1e-3)

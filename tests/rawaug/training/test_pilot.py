@@ -9,7 +9,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
 from rawaug.training.estimators import R2R, NoisyCrop
-from rawaug.training.pilot import first_estimate
+from rawaug.training.noisy_frames import first_estimate
 
 SHOT_VAR, READ_VAR = 8e-3, 3e-4
 
@@ -45,7 +45,7 @@ def test_it_is_nearer_to_the_scene_than_the_frame_and_of_its_shape() -> None:
 
 def test_noise_without_shots_needs_no_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = torch.rand(1, 8, 8)
-    monkeypatch.delattr("rawaug.training.pilot.NonLocalMeans")
+    monkeypatch.delattr("rawaug.training.noisy_frames.NonLocalMeans")
     assert first_estimate(noisy, 0.0, READ_VAR, demo_pairs("train", count=1)[0].cfa) is noisy
 
 

@@ -15,8 +15,8 @@ from rawaug.experiment.arms import in_pattern
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.training.start import first_network, start_of
-from rawaug.training.train_config import DenoiserConfig
+from rawaug.training.config import DenoiserConfig
+from rawaug.training.state import first_network, start_of
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data import demo_pairs, demo_photographs
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rawaug.training.train_config import SAME_WEIGHTS, DenoiserConfig, TrainConfig, weights_key
+from rawaug.training.config import SAME_WEIGHTS, DenoiserConfig, TrainConfig, weights_key
 
 OTHER: dict[str, Any] = {
     "schedule": "step", "loss": "l2", "weigh": "mixed", "precision": "bf16-mixed", "channels_last": False,

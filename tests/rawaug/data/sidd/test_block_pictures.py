@@ -14,7 +14,7 @@ from rawaug.bayer import turn
 from rawaug.commands.evaluate import evaluate
 from rawaug.data import SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd import blocks as sidd_blocks
-from rawaug.data.sidd.scenes import SiddScene
+from rawaug.data.sidd.frames import SiddScene
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP

@@ -27,9 +27,9 @@ from rawaug.data import (
 )
 from rawaug.data.mat import read_array
 from rawaug.data.sidd import blocks as blocks_module
-from rawaug.data.sidd.scenes import HELD_BACK, PHONES, SiddScene
+from rawaug.data.sidd.frames import HELD_BACK, PHONES, SiddScene
 from rawaug.io import write_picture
-from rawaug.io.picture_files import view_of_orientation
+from rawaug.io.pictures import view_of_orientation
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 NEUTRAL = (0.5, 1.0, 0.8)

@@ -17,8 +17,8 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import SiddBenchmark, check_submission, demo_photographs
 from rawaug.data.demo.camera import DemoCamera
-from rawaug.data.pair import Pair
-from rawaug.data.sidd.scenes import HELD_BACK, SiddScene
+from rawaug.data.pairs import Pair
+from rawaug.data.sidd.frames import HELD_BACK, SiddScene
 from rawaug.io import write_picture
 from rawaug.io.raw import XYZ_FROM_SRGB
 

@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.isp.baselines import BASELINES, BaselineISP, CycleISP, InvertibleGrey, InvISP, UNetISP
-from rawaug.isp.config import ISPConfig
+from rawaug.isp.config import ISPConfig, ReverseISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.reverse import ReverseISP
+from rawaug.paper.baselines import BASELINES, BaselineISP, CycleISP, InvertibleGrey, InvISP, UNetISP
 
 SMALL: dict[str, dict[str, Any]] = {
     "upi": {},

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers.dual_attention import DualAttentionBlock
+from denoisers.cycleisp import DualAttentionBlock
 from rawaug.bayer import mosaic, pack
-from rawaug.isp.baselines.base import Crops
-from rawaug.isp.baselines.cycleisp import CycleISP
+from rawaug.paper.baselines.base import Crops
+from rawaug.paper.baselines.cycleisp import CycleISP
 
 SMALL: dict[str, Any] = {"features": 8, "groups": 2, "blocks": 1}
 

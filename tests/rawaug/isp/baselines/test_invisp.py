@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
-from rawaug.isp.baselines.base import Crops
-from rawaug.isp.baselines.invisp import InvISP
+from rawaug.data.pairs import Pair
+from rawaug.paper.baselines.base import Crops
+from rawaug.paper.baselines.invisp import InvISP
 
 
 def shaken(blocks: int = 8, growth: int = 32) -> InvISP:

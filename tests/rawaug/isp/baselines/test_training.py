@@ -10,11 +10,10 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.isp.baselines import UPI, CycleISP, InvertibleGrey, InvISP, TunedUPI, UNetISP, fit_baseline
-from rawaug.isp.baselines.base import CropTrainedISP
-from rawaug.isp.baselines.training import _CropDrawer
+from rawaug.data.pairs import Pair
 from rawaug.metrics import psnr
+from rawaug.paper.baselines import UPI, CycleISP, InvertibleGrey, InvISP, TunedUPI, UNetISP, fit_baseline
+from rawaug.paper.baselines.base import CropTrainedISP, _CropDrawer
 
 SMALL: list[tuple[type[CropTrainedISP], dict[str, Any]]] = [
     (UNetISP, {"width": 4}),

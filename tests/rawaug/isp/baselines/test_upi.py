@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rawaug.bayer import CFA
-from rawaug.isp.baselines.upi import UPI, UPIParams, camera_matrix, inverse_smoothstep, render_pixels, smoothstep
-from rawaug.isp.baselines.upi import unprocess_pixels as unprocess
+from rawaug.paper.baselines.upi import UPI, UPIParams, camera_matrix, inverse_smoothstep, render_pixels, smoothstep
+from rawaug.paper.baselines.upi import unprocess_pixels as unprocess
 
 
 def flat(red: float, green: float, blue: float) -> torch.Tensor:

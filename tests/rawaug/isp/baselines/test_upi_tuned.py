@@ -10,10 +10,9 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.data.pair import Pair
-from rawaug.isp.baselines.upi import SmoothstepISP, UPIParams
-from rawaug.isp.baselines.upi_tuned import LOG_MSE_EPS, Criterion, Moments, TunedUPI
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
+from rawaug.paper.baselines.upi import LOG_MSE_EPS, Criterion, Moments, SmoothstepISP, TunedUPI, UPIParams
 
 MATRIX = torch.tensor([[0.7, 0.3, 0.0], [0.1, 0.8, 0.1], [0.0, 0.3, 0.7]])
 GAINS = torch.tensor([2.0, 1.2, 1.6])

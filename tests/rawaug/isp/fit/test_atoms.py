@@ -9,10 +9,10 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.atoms import best_constants, reach_atoms
+from rawaug.isp.fit.start import best_constants, reach_atoms
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 

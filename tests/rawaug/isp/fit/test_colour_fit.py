@@ -9,10 +9,10 @@ from typing import Any, cast
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.colour_fit import TIE, TIE_RANGE, FrameColour, Tie, fall_off, least_squares
 from rawaug.isp.fit.samples import sample_pixels
+from rawaug.isp.fit.start import TIE, TIE_RANGE, FrameColour, Tie, fall_off, least_squares
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 

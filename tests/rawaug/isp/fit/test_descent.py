@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, descent, fit_isp
 from rawaug.isp.fit.descent import Descent
 from rawaug.isp.model import DictionaryISP

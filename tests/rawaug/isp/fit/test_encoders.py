@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
-from rawaug.isp.fit.fit_config import EncoderTraining
+from rawaug.isp.fit.config import EncoderTraining
 from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]

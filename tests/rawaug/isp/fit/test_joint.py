@@ -8,11 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.descent import Descent
-from rawaug.isp.fit.joint import joint_steps, train_jointly
-from rawaug.isp.fit.losses import decibels
+from rawaug.isp.fit.descent import Descent, decibels
+from rawaug.isp.fit.encoders import joint_steps, train_jointly
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 

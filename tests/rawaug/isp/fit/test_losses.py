@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import FitConfig, encoders, joint
-from rawaug.isp.fit.losses import apart, cycle_error, mean_square, reading_error
+from rawaug.isp.fit import FitConfig, encoders
+from rawaug.isp.fit.descent import apart, cycle_error, mean_square, reading_error
 from rawaug.isp.fit.samples import PixelSamples, Shot, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
@@ -111,7 +111,7 @@ def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consi
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, CLEAN).item()
     assert abs(cycle - cycle_error(isp, part, ours, back, CLEAN).item()) > 1e-6
-    loss = joint._frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
+    loss = encoders._joint_frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
     expected = mean_square(isp, part, ours)[0].item() + cycle + 0.01 * APART
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     loss.backward()
@@ -135,7 +135,7 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     if stage == "encoders":
         encoders._frame_loss(isp, part, shots, 0, PIXELS, CLEAN, torch.Generator().manual_seed(0))
     else:
-        joint._frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
+        encoders._joint_frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
     shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))
     corrected = seen[0].std((3, 4)) / seen[0].mean((3, 4)).abs()
     assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain

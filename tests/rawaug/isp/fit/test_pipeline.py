@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import BLOCK, block_averages, find_shift, sample_pixels
 from rawaug.isp.stages import place_in_frame
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rawaug.data.pair import Pair
+from rawaug.data.pairs import Pair
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.losses import decibels
+from rawaug.isp.fit.descent import decibels
+from rawaug.isp.fit.pipeline import with_better_tone
 from rawaug.isp.fit.samples import PixelSamples, Shot, sample_pixels
-from rawaug.isp.fit.tone_choice import with_better_tone
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 

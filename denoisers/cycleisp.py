@@ -1,0 +1,196 @@
+r"""CycleISP's dual-attention blocks, of which its converters and its denoiser are made, and its published checkpoints.
+
+``v + merge([f s, f c])`` with ``f = conv(prelu(conv(v)))``, ``s = sigmoid(conv([max_c f, mean_c f]))`` over space and
+``c``, a weight a channel, the sigmoid of two layers on f's mean. Source: Zamir et al., "CycleISP: Real Image
+Restoration via Improved Data Synthesis", CVPR 2020.
+
+CycleISP's denoiser: ``denoised = noisy + T([noisy, variance])``, T four groups of eight dual-attention blocks.
+
+Domain: packed RAW and the noise variance, 64 features, attention reduced by 16; 2.84 M parameters. It keeps the
+resolution throughout. Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from denoisers.network import PACKED, Denoiser, require_width
+from rawaug.registry import DENOISERS
+
+RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
+"""Names of layers in the published checkpoints, and here."""
+UNUSED = ("blur.", "merge.0.")
+"""Published, after renaming, but constant or without use in the published pass."""
+
+
+class DualAttentionBlock(nn.Module):
+    """``v + merge([spatial attention, channel attention] of conv(act(conv(v))))``."""
+
+    def __init__(self, features: int, reduction: int, act: nn.PReLU) -> None:
+        super().__init__()
+        squeezed = features // reduction
+        self.body = nn.Sequential(conv(features, features), act, conv(features, features))
+        self.spatial = nn.Conv2d(2, 1, 3, padding=1, bias=False)
+        self.channel = nn.Sequential(nn.Conv2d(features, squeezed, 1), nn.ReLU(), nn.Conv2d(squeezed, features, 1))
+        self.merge = nn.Conv2d(2 * features, features, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        f = self.body(x)
+        where = self.spatial(torch.cat([f.amax(1, keepdim=True), f.mean(1, keepdim=True)], dim=1)).sigmoid()
+        which = self.channel(f.mean((2, 3), keepdim=True)).sigmoid()
+        return x + self.merge(torch.cat([f * where, f * which], dim=1))
+
+
+class ResidualGroup(nn.Module):
+    """Dual-attention blocks and a convolution, added to their input."""
+
+    def __init__(self, features: int, blocks: int, reduction: int, act: nn.PReLU) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [DualAttentionBlock(features, reduction, act) for _ in range(blocks)]
+        self.body = nn.Sequential(*layers, conv(features, features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.body(x)
+
+
+class Trunk(nn.Module):
+    """What the three networks share: a first convolution, groups, a convolution and the one PReLU used all over.
+
+    Args:
+        inputs: channels that come in.
+        features, groups, blocks, reduction: 96, 3, 5 and 8 as published.
+    """
+
+    def __init__(self, inputs: int, features: int, groups: int, blocks: int, reduction: int) -> None:
+        super().__init__()
+        act = nn.PReLU(features)
+        self.head = conv(inputs, features)
+        layers: list[nn.Module] = [ResidualGroup(features, blocks, reduction, act) for _ in range(groups)]
+        self.body = nn.Sequential(*layers, conv(features, features), act)
+
+
+def conv(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1)
+
+
+def load_published(network: nn.Module, path: str | os.PathLike[str], part: str) -> None:
+    """Take the weights of a published checkpoint; nothing in it is run as code.
+
+    Args:
+        network: whose layers they are.
+        path: a file of ``torch.save({"state_dict": ...})``, keys with or without ``module.`` before them.
+        part: what messages call the network.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not such a file, or its layers are not those of the network.
+    """
+    state, expected = _own_names(_read_state(Path(path))), network.state_dict()
+    differing = sorted(expected.keys() ^ state.keys())
+    if differing:
+        what = "unknown" if differing[0] in state else "missing"
+        raise ValueError(f"{path}: layer {differing[0]} is {what} for {part} of this size")
+    for key, value in expected.items():
+        if value.shape != state[key].shape:
+            sizes = f"{tuple(state[key].shape)}, {part} needs {tuple(value.shape)}"
+            raise ValueError(f"{path}: layer {key} is {sizes}; build the model in the published size")
+    network.load_state_dict(state)
+
+
+def _read_state(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path}: not a checkpoint of plain weights: {str(error).splitlines()[0]}") from None
+    state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise ValueError(f"{path}: holds no 'state_dict' of tensors; give a checkpoint in CycleISP's layout")
+    return state
+
+
+def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Published names of layers to those here, without the layers that are of no use."""
+    renamed = {}
+    for name, value in state.items():
+        key = name.removeprefix("module.")
+        for published, own in RENAMED:
+            key = key.replace(published, own)
+        if not key.startswith(UNUSED):
+            renamed[key] = value
+    return renamed
+
+
+@DENOISERS.register("CycleISPDenoiser")
+class CycleISPDenoiser(Denoiser):
+    """Zamir's denoiser for RAW; see the module's head. Any h, w >= 2.
+
+    Args:
+        width: features, a multiple of ``reduction``; 64 as published.
+        groups, blocks: 4 groups of 8 blocks as published.
+        reduction: of the features in channel attention.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs, as published.
+        deviation: the map is sqrt(variance); False, as published: the variance.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(1, 4, 20, 30)
+        >>> CycleISPDenoiser(width=16, groups=1, blocks=1)(noisy, torch.full_like(noisy, 1e-3)).shape
+        torch.Size([1, 4, 20, 30])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 8, "groups": 1, "blocks": 1, "reduction": 4}
+
+    def __init__(
+        self,
+        width: int = 64,
+        groups: int = 4,
+        blocks: int = 8,
+        reduction: int = 16,
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = False,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width, multiple=max(reduction, 1))
+        if min(groups, blocks, reduction) < 1:
+            raise ValueError(f"groups, blocks and reduction must be at least 1, got {groups}, {blocks}, {reduction}")
+        config = {"width": width, "groups": groups, "blocks": blocks, "reduction": reduction}
+        super().__init__(channels, variance_map, deviation, 1, config, domain)
+        with torch.random.fork_rng(devices=[]):  # every weight is drawn anew below, from the seed
+            self.trunk = Trunk(self.inputs, width, groups, blocks, reduction)
+            last = conv(width, channels)
+        self.trunk.tail = nn.Sequential(last)
+        # As in DHDN: thirty-two residual blocks one after another stay tame when each starts as the identity.
+        ends = [module.merge for module in self.modules() if isinstance(module, DualAttentionBlock)]
+        self.initialise(seed, last, *ends)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
+        trunk = self.trunk
+        correction: Tensor = trunk.tail(trunk.body(trunk.head(features)))  # type: ignore[operator]
+        return correction
+
+    @classmethod
+    def from_published(cls, path: str | os.PathLike[str]) -> CycleISPDenoiser:
+        """The network with the weights of a published checkpoint (``sidd_denoising_raw.pth``), in eval mode.
+
+        Nothing in the file is run as code. The weights are for RAW in RGGB, clipped to [0, 1].
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not such a checkpoint.
+        """
+        model = cls()
+        load_published(model.trunk, path, "the denoiser")
+        return model.eval()

@@ -1,0 +1,173 @@
+r"""The networks by name: ``build("UNet", width=16)``. Nothing else can be named in a file of weights or a recipe.
+
+Files of weights: safetensors, with what is needed to build the network again as string metadata.
+
+``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
+"info": <JSON: anything else>}``. Nothing in such a file is code; only the classes in
+:data:`rawaug.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
+
+Denoisers that ship with the package, by name; each has a model card beside its weights.
+
+``rawaug-small`` is for CPUs: PMRID's network at its published width, trained by ``recipes/pretrain.yaml`` on sRGB
+photographs alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from denoisers.network import Denoiser
+from rawaug.files import parse_object, read_tensors, write_tensors
+from rawaug.registry import DENOISERS
+
+__all__ = ["DENOISERS", "build"]
+
+MOST_WEIGHTS = 2**30
+"""Of a network: 4 GiB. Larger ones are refused before they take memory."""
+
+
+def build(name: str, **config: Any) -> Denoiser:
+    """A new network of the class ``name``, with ``config`` as its constructor's arguments.
+
+    Raises:
+        ValueError: if the name or a key is unknown, a value is of the wrong type or out of range, or the network has
+            more than :data:`MOST_WEIGHTS`.
+
+    Example:
+        >>> build("DnCNN", width=8, depth=3).config["depth"]
+        3
+    """
+    spec = {"name": name, "settings": config}
+    with torch.device("meta"):
+        network: Denoiser = DENOISERS.make(spec)
+    size = sum(weight.numel() for weight in network.parameters())
+    if size > MOST_WEIGHTS:
+        raise ValueError(f"denoiser {name}: {config} has {size:.3g} weights; choose a smaller one")
+    if torch.get_default_device().type != "meta":
+        network = DENOISERS.make(spec)
+    return network
+
+
+FORMAT, KIND = "rawaug", "denoiser"
+
+
+def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) -> None:
+    """Write a network to ``path``: whole or not at all, an older file of this name stays until then.
+
+    Args:
+        model: one of the registered networks, on any device and in any memory format.
+        path: the file, in a folder that exists; usually ``*.safetensors``.
+        info: JSON-serialisable description (data, steps, seed, ...).
+
+    Raises:
+        ValueError: if the class is not registered, or ``info`` is not JSON-serialisable.
+        FileNotFoundError: if the folder does not exist.
+    """
+    path = Path(path)
+    name = DENOISERS.name_of(type(model))
+    if name is None:
+        known = ", ".join(DENOISERS)
+        raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {known} can be loaded again")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
+    try:
+        texts = {"config": json.dumps(model.config), "info": json.dumps(info, allow_nan=False)}
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: info must be JSON-serialisable, its numbers finite: {error}") from None
+    # A PReLU that is used all over stands under several keys, which share its memory: each is written.
+    tensors = {key: value.detach().cpu().clone() for key, value in model.state_dict().items()}
+    write_tensors(tensors, {"format": FORMAT, "kind": KIND, "model": name, **texts}, path)
+
+
+def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
+    """Read what :func:`save` wrote: the network, on the CPU in eval mode, and the info.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not such a file, or its weights do not fit the network that it names.
+
+    Example:
+        >>> import tempfile
+        >>> from denoisers import DnCNN
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(DnCNN(width=8, depth=3), f"{folder}/small.safetensors", {"steps": 0})
+        ...     load(f"{folder}/small.safetensors")[1]
+        {'steps': 0}
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    metadata, tensors = read_tensors(path, "give one written by rawaug run or denoisers.save, or copy it again")
+    if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
+        raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
+    config, info = (_parse(path, metadata, key) for key in ("config", "info"))
+    try:
+        # On the meta device the network takes no memory before the file's tensors are known to fit.
+        with torch.device("meta"):
+            model = build(metadata.get("model", ""), **config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    expected = model.state_dict()
+    for key in sorted(expected.keys() | tensors.keys()):
+        if key not in tensors or key not in expected:
+            raise ValueError(f"{path}: tensor {key} is {'unknown' if key in tensors else 'missing'}")
+        shape, dtype = tensors[key].shape, tensors[key].dtype
+        if (shape, dtype) != (expected[key].shape, expected[key].dtype):
+            wanted = f"{tuple(expected[key].shape)} {expected[key].dtype}"
+            raise ValueError(f"{path}: tensor {key} is {tuple(shape)} {dtype}, the network needs {wanted}")
+    model.load_state_dict(tensors, assign=True)
+    return model.eval(), info
+
+
+def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
+    try:
+        return parse_object(metadata.get(key, ""))
+    except ValueError as error:
+        raise ValueError(f"{path}: metadata {key!r}: {error}") from None
+
+
+FOLDER = Path(__file__).parent / "weights"
+"""Of the shipped weights and their cards."""
+
+DEFAULT = "rawaug-small"
+"""What denoises where no denoiser is named."""
+
+
+def shipped() -> list[str]:
+    """The names that :func:`from_pretrained` knows."""
+    return sorted(file.stem for file in FOLDER.glob("*.safetensors"))
+
+
+def find(name: str | Path) -> Path:
+    """The file of a denoiser: a path to a ``.safetensors`` file, or the name of a shipped one.
+
+    Raises:
+        FileNotFoundError: if it is neither, naming the shipped ones.
+    """
+    path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
+    if not path.is_file():
+        known = ", ".join(shipped()) or "none in this installation"
+        raise FileNotFoundError(f"{name}: no such denoiser; give a .safetensors file or a shipped one ({known})")
+    return path
+
+
+def from_pretrained(name: str | Path = DEFAULT) -> Denoiser:
+    """A trained denoiser, on the CPU in eval mode.
+
+    Args:
+        name: of a shipped one, or a path to a file that ``rawaug run`` or :func:`denoisers.save` wrote.
+
+    Raises:
+        FileNotFoundError: if there is no such denoiser.
+        ValueError: if the file is not a denoiser's.
+
+    Example:
+        >>> denoiser = from_pretrained("rawaug-small")  # doctest: +SKIP
+        >>> clean = denoiser(noisy, variance)  # both (B, 4, h, w) packed RAW; variance of each value  # doctest: +SKIP
+    """
+    return load(find(name))[0]

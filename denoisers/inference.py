@@ -1,0 +1,204 @@
+r"""Denoising in tiles: ``f(y)[core] = f(y[core + overlap on every side])[core]``.
+
+Domain: packed RAW of any size. The equality is exact (to rounding) where the overlap is at least the network's
+receptive radius and the tiles start at multiples of its stride, so that pooling grids fall on the same pixels as in the
+whole picture: from 17 pixels for a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with
+distance: with a trained U-Net of four scales the largest difference was 0.3 of the noise's deviation at an overlap of
+32, and 2e-6 at 64; the default is 96. Only the middle of each tile is kept; nothing is blended: that would hide an
+overlap that is too small. Along each side all tiles have the same size, the smallest that does with as many of them.
+
+Self-ensemble on a mosaic: ``mean over views v of T_v^-1 f(T_v y)``, with T_v a flip or quarter turn.
+
+Domain: packed RAW whose mosaic has a known CFA. T_v turns the *mosaic*, so that neighbours stay neighbours. Where this
+moves the pattern, one line is added on either side by reflection without repeating the edge (row -1 is row 1, which has
+its colour), so that the network meets its own pattern again; the line is cropped from the result. No colour takes
+another's place: what went in as R, Gr, Gb, B comes out there, except that a quarter turn exchanges the two greens.
+Source: Timofte et al., "Seven ways to improve example-based single image super resolution", CVPR 2016; for mosaics Liu
+et al., "Learning Raw Image Denoising with Bayer Pattern Unification and Bayer Preserving Augmentation", CVPRW 2019.
+
+R2R's average: ``mean over k of f(y + alpha m_k)``, with ``m_k`` drawn with the noise's own variance at ``f(y)``.
+
+Domain: packed RAW. A network that was trained on recorrupted frames gets the input it knows, and the average removes
+most of what the added noise costs. Source: Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.domains import levels_of
+from rawaug import bayer
+
+
+def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
+    """Where the tiles begin along a side, and how long they are, at most ``tile``; the last one reaches the end."""
+    count = max(1, -(-(size - 2 * overlap) // (tile - 2 * overlap)))
+    step = -(-(size - 2 * overlap) // (count * stride)) * stride if count > 1 else tile - 2 * overlap
+    side = max(step + 2 * overlap, 2 * stride)
+    last = max(0, -(-(size - side) // stride) * stride)
+    return [*range(0, last, side - 2 * overlap), last], side
+
+
+@torch.no_grad()
+def tiled(
+    model: Callable[[Tensor, Tensor | None], Tensor],
+    noisy: Tensor,
+    variance: Tensor | None = None,
+    tile: int = 1536,
+    overlap: int = 96,
+    each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+) -> Tensor:
+    """Denoise a picture of any size piece by piece, without gradients.
+
+    Peak memory is the result plus what the model needs for one ``(B, 4, tile, tile)`` piece, whatever the picture's
+    size; at most ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles.
+        noisy: ``(B, 4, h, w)``.
+        variance: the noise variance of each value, shape of ``noisy``.
+        tile: side of a piece in packed pixels, overlap included.
+        overlap: context on each inner side, dropped from the result.
+        each: goes through the tiles, and may show how far it is, as ``tqdm`` does.
+
+    Raises:
+        ValueError: if the overlap leaves nothing of a tile, tile or overlap are no multiples of the model's stride, or
+            the tile is less than two strides.
+
+    Example:
+        >>> from denoisers import DnCNN
+        >>> tiled(DnCNN(width=8, depth=4, variance_map=False), torch.rand(1, 4, 300, 90), tile=64, overlap=8).shape
+        torch.Size([1, 4, 300, 90])
+    """
+    stride: int = getattr(model, "stride", 1)
+    if not 0 <= 2 * overlap < tile:
+        raise ValueError(f"overlap must be at least 0 and less than half the tile {tile}, got {overlap}")
+    if tile % stride or overlap % stride:
+        raise ValueError(f"tile {tile} and overlap {overlap} must be multiples of the model's stride {stride}")
+    if tile < 2 * stride:
+        raise ValueError(f"tile must be at least {2 * stride}, twice the model's stride, got {tile}")
+    denoised = torch.empty_like(noisy)
+    # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
+    (tops, height), (lefts, width) = (_pieces(side, tile, overlap, stride) for side in noisy.shape[-2:])
+    for top, left in each([(top, left) for top in tops for left in lefts]):
+        window = (..., slice(top, top + height), slice(left, left + width))
+        piece = model(noisy[window], None if variance is None else variance[window])
+        above, before = (overlap if start else 0 for start in (top, left))
+        denoised[..., top + above : top + height, left + before : left + width] = piece[..., above:, before:]
+    return denoised
+
+
+VIEWS = (4, bayer.N_VIEWS)
+
+
+def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
+    """``(B, 4, h, w)`` to the turned picture with the same CFA: a side is one cell longer where the pattern moved."""
+    rows, columns = cfa.turned(view).shift_to(cfa)
+    turned = bayer.turn(bayer.unpack(packed, cfa), view)
+    return bayer.pack(F.pad(turned, (columns, columns, rows, rows), mode="reflect"), cfa)
+
+
+def from_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
+    """The inverse of :func:`to_view`."""
+    rows, columns = cfa.turned(view).shift_to(cfa)
+    turned = bayer.unpack(packed, cfa)
+    height, width = turned.shape[-2:]
+    return bayer.pack(bayer.turn_back(turned[..., rows : height - rows, columns : width - columns], view), cfa)
+
+
+class SelfEnsemble(nn.Module):
+    """A denoiser averaged over its views of the mosaic: called as the denoiser is, ``views`` times the work.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
+        cfa: pattern of the mosaics that it will be given.
+        views: 4, the flips, or 8, the flips with and without a quarter turn (the full set).
+        each: goes through the groups of views of one shape, and may show how far it is, as ``tqdm`` does.
+
+    Views of one shape share a batch. Large pictures: ``SelfEnsemble(partial(tiled, model), cfa)`` tiles every view.
+
+    Raises:
+        ValueError: if ``views`` is neither 4 nor 8, or the CFA is unknown.
+
+    Example:
+        >>> noisy = torch.rand(1, 4, 16, 16)
+        >>> identity = lambda noisy, variance: noisy
+        >>> torch.equal(SelfEnsemble(identity, "RGGB")(noisy), noisy)
+        True
+    """
+
+    def __init__(
+        self,
+        model: Callable[[Tensor, Tensor | None], Tensor],
+        cfa: bayer.CFA | str,
+        views: int = 8,
+        each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+    ) -> None:
+        super().__init__()
+        if views not in VIEWS:
+            raise ValueError(f"views must be 4 (flips) or 8 (flips and quarter turns), got {views}")
+        self.model = model
+        self.cfa = bayer.CFA(cfa)
+        self.views = views
+        self.each = each
+        self.stride: int = getattr(model, "stride", 1)
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Denoise ``(B, 4, h, w)``, h, w >= 2; ``variance``, if any, is turned alike."""
+        alike: dict[torch.Size, list[int]] = defaultdict(list)
+        turned = {view: to_view(noisy, self.cfa, view) for view in range(self.views)}
+        for view, picture in turned.items():
+            alike[picture.shape].append(view)
+        mean = torch.zeros_like(noisy)
+        count = 0
+        for views in self.each(list(alike.values())):
+            batch = torch.cat([turned.pop(view) for view in views])
+            noise = None if variance is None else torch.cat([to_view(variance, self.cfa, view) for view in views])
+            for view, denoised in zip(views, self.model(batch, noise).chunk(len(views)), strict=True):
+                count += 1
+                # A running mean: equal views give their value back to the last bit.
+                mean = mean + (from_view(denoised, self.cfa, view) - mean) / count
+        return mean
+
+
+class Recorrupted(nn.Module):
+    """A denoiser averaged over several draws of extra noise: called as the denoiser is, ``draws + 1`` times the work.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
+        alpha: standard deviation of the extra noise over that of the noise, as in training.
+        draws: how many.
+        seed: of the extra noise, which is the same in every call.
+
+    Raises:
+        ValueError: if ``draws`` is less than 1 or ``alpha`` not positive.
+    """
+
+    def __init__(
+        self, model: Callable[[Tensor, Tensor | None], Tensor], alpha: float, draws: int, seed: int = 0
+    ) -> None:
+        super().__init__()
+        if draws < 1 or not alpha > 0:
+            raise ValueError(f"draws must be at least 1 and alpha positive, got {draws} and {alpha}")
+        self.model, self.alpha, self.draws, self.seed = model, alpha, draws, seed
+        self.stride: int = getattr(model, "stride", 1)
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
+        shot_var, read_var = levels_of(noisy, variance)
+        signal = self.model(noisy, variance)
+        deviation = self.alpha * (shot_var * signal.clamp_min(0.0) + read_var).sqrt()
+        generator = torch.Generator().manual_seed(self.seed)
+        total = torch.zeros_like(noisy)
+        for _ in range(self.draws):
+            drawn = torch.randn(noisy.shape, generator=generator).to(noisy)
+            noisier = (noisy + deviation * drawn).clamp(max=1.0)
+            noise_map = (1.0 + self.alpha**2) * (shot_var * noisier.clamp_min(0.0) + read_var)
+            total += self.model(noisier, noise_map)
+        return total / self.draws

@@ -1,0 +1,356 @@
+r"""The U-Net of UPI: ``denoised = noisy + U([noisy, variance])``.
+
+Domain: packed RAW (R, Gr, Gb, B) and its noise variance map. Five scales of three 3 x 3 convolutions with leaky ReLU
+0.2; features double at each scale, 32 to 512; max-pooling down, bilinear interpolation up, skips by concatenation, a
+last convolution to four channels. Source: Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019.
+
+DHDN, the densely connected hierarchical network: ``denoised = noisy + D([noisy, variance])``.
+
+Domain: packed RAW (the published network: sRGB, three channels). A U-Net of four levels, features C, 2C, 4C, 8C, with
+two densely connected residual (DCR) blocks a level on the way down and on the way up. Down: max-pooling and a 1 x 1
+convolution; up: a 1 x 1 convolution and pixel shuffle; skips by concatenation at every level, the lowest included.
+With C = 128 and three channels it has 168.2 M parameters and takes 1,020 GMAC for 256 x 256 pixels.
+Source: Park, Yu and Jeong, "Densely Connected Hierarchical Network for Image Denoising", CVPR Workshops 2019.
+
+DnCNN: ``denoised = noisy + R([noisy, variance])``, a plain chain of 3 x 3 convolutions that predicts the noise.
+
+Domain: packed RAW. First layer convolution + ReLU, then ``depth - 2`` times convolution + batch normalisation + ReLU,
+then a convolution. Here the chain predicts what is to be added, the paper's noise with its sign turned.
+Source: Zhang et al., "Beyond a Gaussian Denoiser: Residual Learning of Deep CNN for Image Denoising", TIP 2017.
+
+NAFNet: a U-Net without activation functions; ``denoised = noisy + N(features)``.
+
+Domain: packed RAW. A block is two residuals: layer norm, pointwise c to 2c, depthwise 3 x 3, simple gate
+:math:`a \odot b`, simplified channel attention, pointwise; and layer norm, pointwise c to 2c, simple gate, pointwise;
+each enters with a learned factor that starts at 0. Convolutions 2 x 2 of stride 2 go down, pixel shuffles go up, skips
+are added. Source: Chen et al., "Simple Baselines for Image Restoration", ECCV 2022.
+
+The channel attention averages over the whole input: a tile and the whole picture differ a little.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
+from rawaug.registry import DENOISERS, require_between
+
+PUBLISHED_WIDTH = 32
+"""Features of the first scale in the paper."""
+
+
+def _block(inputs: int, features: int) -> nn.Sequential:
+    """Three convolutions, each with its leaky ReLU."""
+    layers: list[nn.Module] = []
+    for size in (inputs, features, features):
+        layers += [conv(size, features), nn.LeakyReLU(LEAK, inplace=True)]
+    return nn.Sequential(*layers)
+
+
+@DENOISERS.register("UNet")
+class UNet(Denoiser):
+    """UPI's U-Net; see the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
+
+    Args:
+        width: features of the first scale; the last has ``width * 2**(scales - 1)``.
+        scales: of the pyramid; sides are padded to multiples of ``2**(scales - 1)``.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs.
+        deviation: the map is sqrt(variance), of the size of the errors to remove; False: the variance, as published.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> UNet(width=8)(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
+
+    def __init__(
+        self,
+        width: int = PUBLISHED_WIDTH,
+        scales: int = 5,
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = True,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width)
+        require_between("scales", scales, 1, MOST_SCALES)
+        require_bounded(seed)
+        config = {"width": width, "scales": scales}
+        super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), config, domain)
+        sizes = [width * 2**k for k in range(scales)]
+        self.encoder = nn.ModuleList(_block(a, b) for a, b in zip([self.inputs, *sizes], sizes, strict=False))
+        self.decoder = nn.ModuleList(_block(3 * size, size) for size in reversed(sizes[:-1]))
+        self.last = conv(width, channels)
+        self.initialise(seed, self.last)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+        skips = []
+        for k, block in enumerate(self.encoder):
+            features = block(F.max_pool2d(features, 2) if k else features)
+            skips.append(features)
+        for block, skip in zip(self.decoder, reversed(skips[:-1]), strict=True):
+            finer = F.interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
+            features = block(torch.cat([finer, skip], dim=1))
+        return self.last(features)
+
+
+LEVELS = 4
+
+
+class DCRBlock(nn.Module):
+    """Three densely connected convolutions, C to C/2, 3C/2 to C/2 and 2C to C, each with its PReLU, and a residual."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        half = features // 2
+        self.first = nn.Sequential(conv(features, half), nn.PReLU())
+        self.second = nn.Sequential(conv(features + half, half), nn.PReLU())
+        self.third = conv(2 * features, features)
+        self.activation = nn.PReLU()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, C, h, w)`` to the same shape."""
+        dense = torch.cat([features, self.first(features)], dim=1)
+        dense = torch.cat([dense, self.second(dense)], dim=1)
+        return features + self.activation(self.third(dense))
+
+
+def _level(features: int) -> nn.Sequential:
+    return nn.Sequential(DCRBlock(features), DCRBlock(features))
+
+
+def _pointwise(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(conv(inputs, outputs, size=1), nn.PReLU())
+
+
+@DENOISERS.register("DHDN")
+class DHDN(Denoiser):
+    """Park's DHDN; see the module's head. Any h, w >= 2: padded by reflection to multiples of 8 inside.
+
+    Args:
+        width: features of the first level, even. 16 (2.6 M parameters) suits a CPU; 128 is the published width.
+        channels: 4 for packed RAW, 3 in the paper.
+        variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
+        deviation: the map is sqrt(variance); False: the variance.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(1, 4, 20, 30)
+        >>> DHDN(width=4, variance_map=False)(noisy).shape
+        torch.Size([1, 4, 20, 30])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4}
+
+    def __init__(
+        self,
+        width: int = 16,
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = True,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width, multiple=2)
+        require_bounded(seed)
+        super().__init__(channels, variance_map, deviation, 2 ** (LEVELS - 1), {"width": width}, domain)
+        sizes = [width * 2**k for k in range(LEVELS)]
+        self.first = _pointwise(self.inputs, width)
+        self.encoder = nn.ModuleList(_level(size) for size in sizes)
+        self.down = nn.ModuleList(_pointwise(size, 2 * size) for size in sizes[:-1])
+        # What comes up and what was kept have a level's features each, so its decoder works on twice as many.
+        self.up = nn.ModuleList(_pointwise(2 * size, 2 * size) for size in reversed(sizes[1:]))
+        self.decoder = nn.ModuleList(_level(2 * size) for size in reversed(sizes[:-1]))
+        self.last = conv(2 * width, channels, size=1)
+        # Fourteen residual blocks one after another stay tame when each starts as the identity (Goyal et al. 2017).
+        ends = [module.third for module in self.modules() if isinstance(module, DCRBlock)]
+        self.initialise(seed, self.last, *ends)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+        features = self.first(features)
+        skips = []
+        for level, down in zip(self.encoder, self.down, strict=False):
+            features = level(features)
+            skips.append(features)
+            features = down(F.max_pool2d(features, 2))
+        features = torch.cat([self.encoder[-1](features), features], dim=1)
+        for up, level, skip in zip(self.up, self.decoder, reversed(skips), strict=True):
+            features = level(torch.cat([F.pixel_shuffle(up(features), 2), skip], dim=1))
+        return self.last(features)
+
+
+def _layer(width: int, batch_norm: bool) -> list[nn.Module]:
+    norm = [nn.BatchNorm2d(width)] if batch_norm else []
+    return [conv(width, width, bias=not batch_norm), *norm, nn.ReLU(inplace=True)]
+
+
+@DENOISERS.register("DnCNN")
+class DnCNN(Denoiser):
+    """Zhang's DnCNN; see the module's head. Any h, w >= 2; nothing is padded but the convolutions' zeros.
+
+    Args:
+        width: features.
+        depth: convolutions; 17 in the paper for one noise level, 20 for a range of them.
+        batch_norm: as published. Denoise in eval mode: in train mode a picture's result depends on its batch.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
+        deviation: the map is sqrt(variance); False: the variance.
+        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
+        seed: of the initial weights.
+
+    Example:
+        >>> import torch
+        >>> noisy = torch.rand(1, 4, 20, 30)
+        >>> DnCNN(width=8, depth=5, variance_map=False)(noisy).shape
+        torch.Size([1, 4, 20, 30])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 8, "depth": 3}
+
+    def __init__(
+        self,
+        width: int = 64,
+        depth: int = 17,
+        batch_norm: bool = True,
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = True,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width)
+        if depth < 2:
+            raise ValueError(f"depth must be at least 2, got {depth}")
+        require_bounded(seed, depth=depth)
+        config = {"width": width, "depth": depth, "batch_norm": batch_norm}
+        super().__init__(channels, variance_map, deviation, 1, config, domain)
+        middle = [layer for _ in range(depth - 2) for layer in _layer(width, batch_norm)]
+        last = conv(width, channels)
+        self.layers = nn.Sequential(conv(self.inputs, width), nn.ReLU(inplace=True), *middle, last)
+        self.initialise(seed, last)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
+        return self.layers(features)
+
+
+class ChannelNorm(nn.Module):
+    """Layer norm over the channels of every pixel."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Of any shape ``(B, width, h, w)``."""
+        normed = F.layer_norm(x.permute(0, 2, 3, 1), self.weight.shape, self.weight, self.bias, 1e-6)
+        return normed.permute(0, 3, 1, 2)
+
+
+def gate(x: Tensor) -> Tensor:
+    """The first half of the channels times the second."""
+    first, second = x.chunk(2, dim=1)
+    return first * second
+
+
+class Block(nn.Module):
+    """NAFNet's block; see the module's head."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = ChannelNorm(width), ChannelNorm(width)
+        self.conv1, self.conv2 = conv(width, 2 * width, 1), conv(2 * width, 2 * width, 3, groups=2 * width)
+        self.attention, self.conv3 = conv(width, width, 1), conv(width, width, 1)
+        self.conv4, self.conv5 = conv(width, 2 * width, 1), conv(width, width, 1)
+        self.beta = nn.Parameter(torch.zeros(1, width, 1, 1))
+        self.gamma = nn.Parameter(torch.zeros(1, width, 1, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Of any shape ``(B, width, h, w)``."""
+        y = gate(self.conv2(self.conv1(self.norm1(x))))
+        x = x + self.beta * self.conv3(y * self.attention(y.mean((2, 3), keepdim=True)))
+        return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
+
+
+@DENOISERS.register("NAFNet")
+class NAFNet(Denoiser):
+    """See the module's head. Any h, w >= 2: padded by reflection inside.
+
+    Args:
+        width: features of the first scale, doubled at each further one; 32 and 64 are published.
+        encoder: blocks of each scale going down; their number is that of the scales above the middle.
+        middle: blocks of the middle.
+        decoder: blocks of each scale going up, as many as ``encoder``.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs.
+        deviation: the map is sqrt(variance).
+        domain: linear, ksigma or anscombe.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1))(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "encoder": (1, 1), "middle": 1, "decoder": (1, 1)}
+
+    def __init__(
+        self,
+        width: int = 32,
+        encoder: tuple[int, ...] = (2, 2, 4, 8),
+        middle: int = 12,
+        decoder: tuple[int, ...] = (2, 2, 2, 2),
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = True,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width)
+        if len(encoder) != len(decoder) or min((*encoder, *decoder, middle), default=0) < 0 or not encoder:
+            raise ValueError(f"encoder and decoder must have the same number of scales, got {encoder} and {decoder}")
+        require_between("scales", len(encoder), 1, MOST_SCALES)
+        require_bounded(seed, middle=middle, encoder=max(encoder), decoder=max(decoder))
+        config = {"width": width, "encoder": list(encoder), "middle": middle, "decoder": list(decoder)}
+        super().__init__(channels, variance_map, deviation, 2 ** len(encoder), config, domain)
+        sizes = [width * 2**k for k in range(len(encoder) + 1)]
+        self.intro = conv(self.inputs, width)
+        self.encoder = nn.ModuleList(_blocks(c, n) for c, n in zip(sizes, encoder, strict=False))
+        self.downs = nn.ModuleList(conv(c, 2 * c, 2, stride=2, padding=0) for c in sizes[:-1])
+        self.middle = _blocks(sizes[-1], middle)
+        self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
+        self.decoder = nn.ModuleList(_blocks(c, n) for c, n in zip(reversed(sizes[:-1]), decoder, strict=True))
+        self.ending = conv(width, channels)
+        self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+        x, skips = self.intro(features), []
+        for blocks, down in zip(self.encoder, self.downs, strict=True):
+            x = blocks(x)
+            skips.append(x)
+            x = down(x)
+        x = self.middle(x)
+        for up, blocks, skip in zip(self.ups, self.decoder, reversed(skips), strict=True):
+            x = blocks(F.pixel_shuffle(up(x), 2) + skip)
+        correction: Tensor = self.ending(x)
+        return correction
+
+
+def _blocks(width: int, number: int) -> nn.Sequential:
+    return nn.Sequential(*(Block(width) for _ in range(number)))

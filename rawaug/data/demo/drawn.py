@@ -1,0 +1,312 @@
+r"""Dead-leaves pictures: opaque disks that fall on each other, with the statistics of natural images.
+
+    p(r) = C r^-3   for r_min <= r <= r_max,    centres uniform
+
+With this law the pictures look alike at every scale, and have occlusion edges and a 1/f^2 power spectrum as photographs
+do. Source: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images: a statistical study of a
+scale-invariant dead leaves model", IJCV 41, 2001; as training data for restoration: R. Achddou, Y. Gousseau, S. Ladjal,
+"Synthetic images as a regularity prior for image restoration neural networks", SSVM 2021.
+
+Here a disk is a window of a photograph, or flat in one of its colours. Seen from below, the first leaf is on top: disks
+are laid front to back on what is still bare, until nothing is, which draws exactly from the stationary model.
+
+Pictures of boxes, ellipses, polygons, stripes and lettering: the edges, corners and text that man-made things have.
+
+    p(R) = C R^-3   for R_min <= R <= R_max,    centres uniform
+
+is the law of dead leaves (:mod:`rawaug.data.demo.drawn`), whose pictures have occlusion edges and a 1/f^2 power
+spectrum as photographs do; here the leaves are not disks. Photographs of landscapes have few long straight edges and no
+text, and a denoiser trained on them alone is weakest there.
+
+Sources: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images: a statistical study of a scale-invariant
+dead leaves model", IJCV 41, 2001; as training data for restoration: R. Achddou, Y. Gousseau, S. Ladjal, "Synthetic
+images as a regularity prior for image restoration neural networks", SSVM 2021.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import math
+import string
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from rawaug.errors import extra
+from rawaug.registry import PICTURES
+from rawaug.seeding import derived_seed
+
+_OVERSAMPLING = 2
+_FLAT_SHARE = 0.25
+_BATCH = 4096
+
+
+def dead_leaves(
+    height: int, width: int, sources: Sequence[Tensor], generator: torch.Generator, smallest_radius: float = 4.0
+) -> Tensor:
+    """One dead-leaves picture, uint8 ``(3, height, width)``, anti-aliased (each pixel the mean of 2 x 2).
+
+    Args:
+        height, width: in pixels, at least 8.
+        sources: photographs for colours and textures, uint8 ``(3, h, w)``, sides at least 32; textures are drawn at
+            half the photograph's scale.
+        generator: the only source of randomness, on the CPU.
+        smallest_radius: r_min in pixels, above 0.5; r_max is what fits into every source, a third of the picture's
+            longer side at most.
+
+    Raises:
+        ValueError: if there is no source, or one of another shape or dtype or too small for r_min.
+
+    Example:
+        >>> source = torch.randint(0, 256, (3, 64, 64), dtype=torch.uint8)
+        >>> dead_leaves(48, 64, [source], torch.Generator().manual_seed(0)).shape
+        torch.Size([3, 48, 64])
+    """
+    for source in sources:
+        if source.ndim != 3 or source.shape[0] != 3 or source.dtype != torch.uint8 or min(source.shape[1:]) < 32:
+            raise ValueError(
+                f"a source must be uint8 (3, h, w) with sides of at least 32, got {source.dtype} {tuple(source.shape)}"
+            )
+    if not sources or smallest_radius <= 0.5 or min(height, width) < 8:
+        raise ValueError(f"dead leaves need sources ({len(sources)}), r_min > 0.5 and sides >= 8 ({height} x {width})")
+    photographs = [source.permute(1, 2, 0).contiguous().numpy() for source in sources]
+    fits = min(min(photograph.shape[:2]) for photograph in photographs) / 2 - 1
+    radii = (_OVERSAMPLING * smallest_radius, min(fits, _OVERSAMPLING * max(height, width) / 3))
+    if radii[0] >= radii[1]:
+        raise ValueError(
+            f"smallest_radius {smallest_radius} is too large: the sources allow at most {fits / _OVERSAMPLING}"
+        )
+    fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
+    n = _OVERSAMPLING
+    total = sum(fine[i::n, j::n].astype(np.uint16) for i in range(n) for j in range(n))
+    return torch.from_numpy(np.rint(total / n**2).astype(np.uint8)).permute(2, 0, 1).contiguous()
+
+
+def _fine_picture(
+    height: int, width: int, photographs: list[np.ndarray], radii: tuple[float, float], generator: torch.Generator
+) -> np.ndarray:
+    """Disks front to back until every pixel is covered, uint8 ``(height, width, 3)``."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    bare = np.ones((height, width), bool)
+    smallest, largest = radii
+    while bare.any():
+        u = torch.rand(7, _BATCH, generator=generator, dtype=torch.float64).numpy()
+        # inverse of the distribution function of r^-3 between the two radii
+        radius = (smallest**-2 - u[0] * (smallest**-2 - largest**-2)) ** -0.5
+        # centres as far outside as the largest disk reaches, so that the border is like the middle
+        y = u[1] * (height + 2 * largest) - largest
+        x = u[2] * (width + 2 * largest) - largest
+        edges = _edges(y, x, radius, bare.shape)
+        for k in np.flatnonzero(_bare_pixels(bare, edges)):
+            disk, photograph = (y[k], x[k], radius[k]), photographs[int(u[3, k] * len(photographs))]
+            _lay(picture, bare, disk, edges[:, k].tolist(), photograph, u[4:, k])
+    return picture
+
+
+def _edges(y: np.ndarray, x: np.ndarray, radius: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Top, bottom, left and right of each disk within the picture, ``(4, N)``; bottom and right are exclusive."""
+    ends = [
+        end.clip(0, side)
+        for centre, side in ((y, shape[0]), (x, shape[1]))
+        for end in (np.ceil(centre - radius), np.floor(centre + radius) + 1)
+    ]
+    return np.stack(ends).astype(np.int64)
+
+
+def _bare_pixels(bare: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """How many pixels between the edges are bare, by summed areas; what is covered never becomes bare again."""
+    areas = np.pad(bare.cumsum(0, dtype=np.int32).cumsum(1, dtype=np.int32), ((1, 0), (1, 0)))
+    top, bottom, left, right = edges
+    return np.asarray(areas[bottom, right] - areas[top, right] - areas[bottom, left] + areas[top, left])
+
+
+def _lay(
+    picture: np.ndarray,
+    bare: np.ndarray,
+    disk: tuple[float, float, float],
+    edges: Sequence[int],
+    photograph: np.ndarray,
+    u: np.ndarray,
+) -> None:
+    """Put one disk (row, column, radius) where ``bare``; ``u`` are uniform: window (2), flat or textured."""
+    (y, x, radius), (top, bottom, left, right) = disk, edges
+    free = bare[top:bottom, left:right]
+    if not free.any():
+        return
+    rows, columns = np.arange(top, bottom) - y, np.arange(left, right) - x
+    leaf = free & (rows[:, None] ** 2 + columns**2 <= radius**2)
+    i = int(u[0] * (photograph.shape[0] - (bottom - top)))
+    j = int(u[1] * (photograph.shape[1] - (right - left)))
+    window = photograph[i, j] if u[2] < _FLAT_SHARE else photograph[i : i + bottom - top, j : j + right - left]
+    np.copyto(picture[top:bottom, left:right], window, where=leaf[..., None])
+    free &= ~leaf
+
+
+SIDE = 640
+
+_SMALLEST = (4.0, 8.0, 16.0)
+_LARGEST = (80.0, 160.0, 300.0)
+_COVER = (1.5, 3.0, 6.0)
+"""Area of all shapes relative to the picture's; few of the first are hidden."""
+_BLUR = (0.0, 0.0, 0.5, 0.8, 1.2)
+"""Deviation in pixels: lenses differ."""
+_FONT = (16.0, 160.0)
+"""Least and greatest size of letters, in pixels of the oversampled picture."""
+_LETTERS = string.ascii_letters + string.digits + "   .,-"
+
+Colour = tuple[int, int, int]
+Rng = np.random.Generator
+
+
+class Shapes(Dataset[Tensor]):
+    """``count`` different pictures, uint8 ``(3, side, side)``, each drawn when it is asked for, in half a second.
+
+    Args:
+        count: how many.
+        side: in pixels.
+        seed: of all draws; picture i depends on (seed, i) alone.
+
+    Raises:
+        ValueError: if the count is below 1, or the side below 32.
+
+    Example:
+        >>> Shapes(2, side=64)[1].shape
+        torch.Size([3, 64, 64])
+    """
+
+    def __init__(self, count: int, side: int = SIDE, seed: int = 0) -> None:
+        if count < 1 or side < 32:
+            raise ValueError(f"shapes: needs a count of at least 1 and a side of at least 32, got {count} and {side}")
+        self.count, self.side, self.seed = count, side, seed
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Tensor:
+        number = range(self.count)[index]
+        return drawn(self.side, np.random.default_rng(derived_seed(self.seed, "shapes", number)))
+
+
+@PICTURES.register("shapes")
+def open_shapes(path: str = "", min_side: int = 2) -> Shapes:
+    """``shapes:100``, a hundred pictures of :data:`SIDE`, larger where crops are.
+
+    Raises:
+        ValueError: if no number follows.
+    """
+    if not path.isdecimal():
+        raise ValueError(f"shapes:{path}: write the number of pictures, such as shapes:100")
+    return Shapes(int(path), max(SIDE, min_side))
+
+
+def drawn(side: int, rng: Rng) -> Tensor:
+    """One picture, uint8 ``(3, side, side)``: anti-aliased shapes of two to six kinds, shaded, some out of focus."""
+    with extra("train"):
+        from PIL import Image, ImageFilter
+
+    fine = side * _OVERSAMPLING
+    picture = Image.new("RGB", (fine, fine), _colour(rng))
+    smallest, largest = (_OVERSAMPLING * rng.choice(radii) for radii in (_SMALLEST, _LARGEST))
+    kinds = rng.permutation(list(KINDS))[: rng.integers(2, len(KINDS) + 1)]
+    left = rng.choice(_COVER) * fine**2
+    while left > 0:
+        u = rng.random()
+        radius = ((1 - u) * smallest**-2 + u * largest**-2) ** -0.5  # inverse of the distribution function of R^-3
+        centre = rng.random(2) * fine
+        KINDS[str(rng.choice(kinds))](picture, centre, radius, rng)
+        left -= 3 * radius**2
+    picture = picture.resize((side, side), Image.Resampling.BOX)
+    if blur := float(rng.choice(_BLUR)):
+        picture = picture.filter(ImageFilter.GaussianBlur(blur))
+    return _shaded(np.asarray(picture, np.float32), rng)
+
+
+def _shaded(picture: np.ndarray, rng: Rng) -> Tensor:
+    """Lit from one side, ``(side, side, 3)`` to uint8 ``(3, side, side)``."""
+    place = np.linspace(-0.5, 0.5, len(picture), dtype=np.float32)
+    down, right = rng.normal(0.0, 0.35, 2).astype(np.float32)
+    lit = picture * np.exp(down * place[:, None] + right * place)[..., None]
+    return torch.from_numpy(lit.clip(0, 255).round().astype(np.uint8)).permute(2, 0, 1).contiguous()
+
+
+def _colour(rng: Rng) -> Colour:
+    """Any hue, mostly pale, dark and light ones most often."""
+    hue, saturation, value = rng.random(), min(1.0, abs(rng.normal(0.0, 0.35))), rng.beta(1.2, 1.2)
+    red, green, blue = (int(255 * channel) for channel in colorsys.hsv_to_rgb(hue, saturation, value))
+    return red, green, blue
+
+
+def _ellipse(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    half = radius * np.exp(rng.normal(0.0, 0.3, 2))
+    _brush(picture).ellipse([*(centre - half), *(centre + half)], fill=_colour(rng))
+
+
+def _box(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    _boxes(picture, centre, radius, rng, rng.random() * math.pi)
+
+
+def _upright(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    _boxes(picture, centre, radius, rng, rng.normal(0.0, 0.03))
+
+
+def _stripes(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    _boxes(picture, centre, radius, rng, rng.random() * math.pi, stripes=int(rng.integers(2, 20)))
+
+
+def _boxes(picture: Any, centre: np.ndarray, radius: float, rng: Rng, angle: float, stripes: int = 0) -> None:
+    """A box, and as many stripes of another colour across it."""
+    half_width, half_height = radius * np.exp(rng.normal(0.0, 0.6, 2))
+    cosine, sine = math.cos(angle), math.sin(angle)
+
+    def lay(left: float, right: float, colour: Colour) -> None:
+        corners = [(left, -half_height), (right, -half_height), (right, half_height), (left, half_height)]
+        turned = [(cosine * x - sine * y, sine * x + cosine * y) for x, y in corners]
+        _brush(picture).polygon([(centre[0] + x, centre[1] + y) for x, y in turned], fill=colour)
+
+    lay(-half_width, half_width, _colour(rng))
+    if stripes:
+        other, width = _colour(rng), max(2.0 * _OVERSAMPLING, half_width / stripes)
+        for left in np.arange(-half_width, half_width, 2 * width):
+            lay(left, min(half_width, left + width), other)
+
+
+def _polygon(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    angles = np.sort(rng.random(rng.integers(3, 8))) * 2 * math.pi
+    radii = radius * rng.uniform(0.5, 1.2, len(angles))
+    corners = zip(centre[0] + radii * np.cos(angles), centre[1] + radii * np.sin(angles), strict=True)
+    _brush(picture).polygon(list(corners), fill=_colour(rng))
+
+
+def _lettering(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
+    from PIL import Image, ImageFont
+
+    font = ImageFont.load_default(min(max(radius / 2, _FONT[0]), _FONT[1]))
+    text = "".join(rng.choice(list(_LETTERS), rng.integers(3, 24)))
+    _, _, right, bottom = _brush(picture).textbbox((0, 0), text, font=font)
+    label = Image.new("L", (int(right) + 4, int(bottom) + 4), 0)
+    _brush(label).text((2, 2), text, fill=255, font=font)
+    angle = float(rng.choice([0.0, 0.0, 90.0, 270.0, rng.random() * 360.0]))
+    label = label.rotate(angle, expand=True, resample=Image.Resampling.BICUBIC)
+    corner = (int(centre[0]) - label.width // 2, int(centre[1]) - label.height // 2)
+    picture.paste(_colour(rng), corner, label)
+
+
+def _brush(picture: Any) -> Any:
+    from PIL import ImageDraw
+
+    return ImageDraw.Draw(picture)
+
+
+KINDS: dict[str, Callable[[Any, np.ndarray, float, Rng], None]] = {
+    "ellipse": _ellipse,
+    "box": _box,
+    "upright box": _upright,
+    "polygon": _polygon,
+    "stripes": _stripes,
+    "lettering": _lettering,
+}
+"""How each kind of shape is drawn: ``(PIL picture, centre, radius, rng)``, in pixels of the oversampled picture."""

@@ -1,0 +1,467 @@
+"""Pictures kept in memory once decoded, for training on a few hundred photographs.
+
+The pairs of a dataset that can be read; those that cannot are named.
+
+A folder of sRGB pictures as a map-style dataset, for real folders: large, with some damaged files.
+
+Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
+cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
+whatever order, with any number of workers. Damaged files are marked in memory shared by all workers, so that
+the main process can report them and no worker opens one twice.
+
+RAW files as pairs: the mosaic, and LibRaw's rendering or the camera's own JPEG of the same shot.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, Dataset, get_worker_info
+
+from rawaug.bayer import turn_back
+from rawaug.data.pairs import LazyPairs, Pair, SomePairs
+from rawaug.errors import printable
+from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
+from rawaug.io.apart import apart, apart_each, prepare
+from rawaug.io.pictures import MAX_PIXELS, decode_picture, through_jpeg
+
+
+class Remembered(Dataset[Tensor]):
+    """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read again each time.
+
+    Each worker process has its own cache.
+
+    Example:
+        >>> import torch
+        >>> pictures = Remembered([torch.zeros(3, 8, 8, dtype=torch.uint8)], megabytes=1)
+        >>> pictures[0] is pictures[0]
+        True
+    """
+
+    def __init__(self, pictures: Sequence[Tensor] | Any, megabytes: int) -> None:
+        self.pictures, self._left = pictures, megabytes * 2**20
+        self._kept: dict[int, Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, index: int) -> Tensor:
+        if index not in self._kept:
+            picture: Tensor = self.pictures[index]
+            if picture.nbytes > self._left:
+                return picture
+            self._left -= picture.nbytes
+            self._kept[index] = picture
+        return self._kept[index]
+
+
+T = TypeVar("T")
+
+
+class Readable(Sequence[Pair]):
+    """Goes over pairs one by one; one whose files are damaged is left out, its reason kept.
+
+    To go over pairs of which none can be read ends in a ValueError with the first reason.
+
+    Attributes:
+        broken: by index, why a pair could not be read; a pair is tried once.
+
+    Example:
+        >>> class Damaged(list):
+        ...     def __getitem__(self, index):
+        ...         if index == 1:
+        ...             raise OSError(f"{index}.dng: truncated")
+        ...         return super().__getitem__(index)
+        >>> pairs = Readable(Damaged(["first", "second"]))
+        >>> list(pairs), pairs.broken
+        (['first'], {1: '1.dng: truncated'})
+    """
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = pairs
+        self.broken: dict[int, str] = {}
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.pairs[index]
+
+    def __iter__(self) -> Iterator[Pair]:
+        for index in range(len(self.pairs)):
+            if (pair := self.attempt(index, self.pairs.__getitem__)) is not None:
+                yield pair
+        if self.broken and len(self.broken) == len(self.pairs):
+            raise ValueError(f"none of the {len(self.pairs)} frames can be read; {self.reasons()[0]}")
+
+    def attempt(self, index: int, read: Callable[[int], T]) -> T | None:
+        """``read(index)``; None where this pair, now or before, could not be read."""
+        if index in self.broken:
+            return None
+        try:
+            return read(index)
+        except (OSError, ValueError) as error:
+            self.broken[index] = " ".join(str(error).split())
+            return None
+
+    def reasons(self) -> list[str]:
+        """Why pairs were left out so far, in their order."""
+        return [self.broken[index] for index in sorted(self.broken)]
+
+    def kept(self) -> Sequence[Pair]:
+        """Those that were not found to be broken so far; all of them as they were given if none was."""
+        if not self.broken:
+            return self.pairs
+        kept = [k for k in range(len(self.pairs)) if k not in self.broken]
+        if isinstance(self.pairs, SomePairs):  # of the same pairs
+            return SomePairs(self.pairs.pairs, [self.pairs.indices[k] for k in kept])
+        return SomePairs(self.pairs, kept)
+
+
+def left_out(pairs: Readable, of: str) -> list[str]:
+    """What was left out of a dataset, as lines to print: how many, then the reason of each; none if nothing was."""
+    reasons = pairs.reasons()
+    if not reasons:
+        return []
+    return [f"left out of {printable(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(printable, reasons)]
+
+
+def each_readable(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
+    """The pairs that can be read, one by one; at the end the others are printed.
+
+    Args:
+        pairs: a dataset, or one that is :class:`Readable` already, which then keeps what was found.
+        of: what a user calls it.
+        seconds: after which no further pair is read, from the first one on, which also waits for the libraries.
+        least: that many are read all the same.
+
+    Raises:
+        ValueError: if there are pairs, and none can be read.
+    """
+    readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
+    start = math.inf
+    for count, pair in enumerate(readable, start=1):
+        start = min(start, time.perf_counter())
+        yield pair
+        if count >= least and time.perf_counter() - start > seconds:
+            break
+    if lines := left_out(readable, of):
+        print("\n".join(lines))
+
+
+EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+_COUNTERS = 64
+_NAMED = 20
+_log = logging.getLogger(__name__)
+
+
+class PictureFolder(Dataset[Tensor]):
+    """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
+
+    Files are decoded apart (:mod:`rawaug.io.apart`): one that crashes its decoder, or hangs, is skipped like any other
+    damaged one. After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far
+    are logged as a warning; :attr:`skipped` and :meth:`report` list them at any time.
+
+    Args:
+        path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
+        min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
+        max_pixels: larger pictures are skipped.
+        allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds no file with such an extension, or, on access, if too many of them had to be skipped.
+
+    Example:
+        >>> pictures = PictureFolder("photographs", min_side=256)  # doctest: +SKIP
+        >>> pictures[0].shape  # doctest: +SKIP
+        torch.Size([3, 375, 500])
+        >>> print(pictures.report())  # doctest: +SKIP
+        photographs: none of 25000 pictures skipped so far
+    """
+
+    def __init__(
+        self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
+    ) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise FileNotFoundError(f"{path}: no such folder of pictures")
+        self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
+        self.names = _Names(sorted(_listed(self.path)))
+        if not len(self.names):
+            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
+        self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
+        self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
+        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._reasons: dict[int, str] = {}
+        prepare()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Tensor:
+        return self._picture(range(len(self))[index])
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Tensor]:
+        """Those of a batch, as a DataLoader asks for them."""
+        return list(self.read_ahead(indices))
+
+    def read_ahead(self, indices: Sequence[int]) -> Iterator[Tensor]:
+        """The pictures in this order, the next ones decoded while the caller works on one."""
+        wanted = [range(len(self))[index] for index in indices]
+        usable = [not self._bad[index] for index in wanted]
+        files = [self.path / self.names[index] for index, use in zip(wanted, usable, strict=True) if use]
+        found = apart_each(decode_picture, files, self.max_pixels)
+        for index, use in zip(wanted, usable, strict=True):
+            yield self._picture(index, next(found) if use else None)
+
+    def _picture(self, first: int, known: Tensor | Exception | None = None) -> Tensor:
+        """The picture of a file, or of the next that can be used; ``known`` is what came of reading the first."""
+        for candidate in chain(range(first, len(self)), range(first)):
+            if self._bad[candidate]:
+                continue
+            picture = self._judged(candidate, known if candidate == first else None)
+            if picture is not None:
+                self._count()
+                return picture
+        raise AssertionError("the share of skipped files is checked before the last one is")
+
+    def read(self, index: int) -> Tensor:
+        """The picture of one file, not replaced by another.
+
+        Raises:
+            FileNotFoundError, OSError, ValueError: if it cannot be used.
+        """
+        return self._required(index, apart(decode_picture, self.path / self.names[index], self.max_pixels))
+
+    def _required(self, index: int, picture: Tensor) -> Tensor:
+        file = self.path / self.names[index]
+        if min(picture.shape[1:]) < self.min_side:
+            size = f"{picture.shape[1]} x {picture.shape[2]}"
+            raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
+        return picture.contiguous()
+
+    @property
+    def skipped(self) -> dict[Path, str]:
+        """The files that could not be used, with the reason, as far as any worker has met them."""
+        bad = self._bad.nonzero()[:, 0].tolist()
+        for index in bad:
+            if index not in self._reasons:  # met by a worker: ask the file again
+                self._reasons[index] = (
+                    self._fault(index) or f"{self.path / self.names[index]}: was damaged, but is readable now"
+                )
+        return {self.path / self.names[index]: self._reasons[index] for index in bad}
+
+    def report(self) -> str:
+        """What was skipped so far, one line a file."""
+        skipped = self.skipped
+        folder = printable(self.path)
+        if not skipped:
+            return f"{folder}: none of {len(self)} pictures skipped so far"
+        lines = map(printable, skipped.values())
+        return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
+
+    def _judged(self, index: int, known: Tensor | Exception | None) -> Tensor | None:
+        """The picture, or None and a mark where it is damaged; ``known`` is what came of reading it, None if unread."""
+        try:
+            if isinstance(known, Exception):
+                raise known
+            return self.read(index) if known is None else self._required(index, known)
+        except (OSError, ValueError) as error:
+            self._reasons[index] = str(error)
+        self._bad[index] = 1
+        count = int(self._bad.sum())
+        if count > self.allowed_share * len(self):
+            names = [f"{self.path / self.names[i]}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
+            more = f" and {count - _NAMED} more" if count > _NAMED else ""
+            raise ValueError(
+                f"{self.path}: {count} of {len(self)} pictures are unusable, more than allowed_share "
+                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
+            )
+        return None
+
+    def _fault(self, index: int) -> str | None:
+        try:
+            self.read(index)
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None
+
+    def _count(self) -> None:
+        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
+        worker = get_worker_info()
+        self._read[(0 if worker is None else 1 + worker.id) % _COUNTERS] += 1
+        epoch = int(self._read.sum()) // len(self)
+        if epoch > self._epochs_logged[0]:
+            self._epochs_logged[0] = epoch
+            if self._bad.any():
+                _log.warning("%s", self.report())
+
+
+def reports(pictures: Any) -> list[str]:
+    """What each folder in ``pictures`` skipped so far, a text a folder; those behind a cache or in a list too."""
+    if isinstance(pictures, PictureFolder):
+        return [pictures.report()] if pictures.skipped else []
+    inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
+    return [report for each in inside if each is not None for report in reports(each)]
+
+
+class _Names(Sequence[str]):
+    """Many strings in two arrays: a list's reference counts would be copied into every forked worker, page by page."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        encoded = [os.fsencode(name) for name in names]
+        self._ends = np.cumsum([len(name) for name in encoded], dtype=np.int64)
+        self._bytes = np.frombuffer(b"".join(encoded), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    def __getitem__(self, index: int) -> str:  # type: ignore[override]
+        index = range(len(self))[index]
+        start = self._ends[index - 1] if index else 0
+        return os.fsdecode(self._bytes[start : self._ends[index]].tobytes())
+
+
+def _listed(folder: Path) -> Iterator[str]:
+    """Paths below ``folder`` that have a picture's extension, unordered; folders with such a name are skipped."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for parent, _, files in os.walk(folder, onerror=refuse):
+        inside = Path(parent).relative_to(folder)
+        for file in files:
+            if file.lower().endswith(EXTENSIONS):
+                yield str(inside / file)
+
+
+RAW_FOLDER_EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+)
+_MARGIN = 0.03
+"""Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
+_JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
+
+
+class RawFolder(LazyPairs):
+    """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
+
+    A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
+    is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
+    ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`, also on forked workers), with
+    a warning if there is a JPEG of another size. Its name is the file's stem; where two would have the same, the path.
+    Files are read when asked for; the last one stays.
+
+    Args:
+        path: where the RAW files are.
+        camera_jpeg: False always uses LibRaw's rendering.
+        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
+        jpeg_quality: LibRaw's rendering as a JPEG of this quality gives it back; None leaves it as it is.
+        max_pixels: of a JPEG; a larger one is an error of its pair.
+
+    Raises:
+        FileNotFoundError: if a file or the folder does not exist.
+        ValueError: if the folder holds no RAW file.
+
+    Example:
+        >>> pair = RawFolder("shots")[0]  # doctest: +SKIP
+        >>> pair.raw.shape, pair.srgb.shape  # doctest: +SKIP
+        (torch.Size([1, 3000, 4000]), torch.Size([3, 3000, 4000]))
+    """
+
+    def __init__(
+        self,
+        path: str | Path | Iterable[str | Path],
+        *,
+        camera_jpeg: bool = True,
+        adjust_maximum_thr: float = 0.0,
+        jpeg_quality: int | None = None,
+        max_pixels: int = MAX_PIXELS,
+    ) -> None:
+        self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
+        missing = [file for file in self.files if not file.is_file()]
+        if missing:
+            raise FileNotFoundError(f"{missing[0]}: no such RAW file")
+        if not self.files:
+            raise ValueError(
+                f"{path}: contains no RAW file; supported extensions are {', '.join(RAW_FOLDER_EXTENSIONS)}; "
+                "noisy/clean pairs of other formats are read as pairs:PATH"
+            )
+        self.camera_jpeg = camera_jpeg
+        self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
+        super().__init__(_names(self.files))
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        return (self.files[index],)
+
+    def read(self, index: int) -> Pair:
+        """The frame of ``files[index]``, developed, or with its camera's JPEG."""
+        file = self.files[index]
+        jpeg = _jpeg_beside(file) if self.camera_jpeg else None
+        if jpeg is not None:
+            frame = apart(read_raw, file)
+            srgb = turn_back(apart(read_picture, jpeg, self.max_pixels), frame.upright_view)
+            size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
+            sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
+            if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
+                frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
+                return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
+            sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
+            warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
+        frame, srgb = apart(read_raw_and_develop, file, self.adjust_maximum_thr)
+        srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
+        return _pair(self.names[index], frame, srgb, registered=True)
+
+
+def _centre(image: Tensor, height: int, width: int) -> Tensor:
+    """The middle of ``(C, H, W)``, from an even row and column on."""
+    top, left = (image.shape[-2] - height) // 4 * 2, (image.shape[-1] - width) // 4 * 2
+    return image[:, top : top + height, left : left + width].contiguous()
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """File stems, or paths where two stems are equal."""
+    names = [file.stem for file in files]
+    if len(set(names)) < len(names):
+        above = os.path.commonpath([file.resolve().parent for file in files])
+        names = [file.resolve().relative_to(above).as_posix() for file in files]
+    return names
+
+
+def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
+    return Pair(
+        name=name,
+        srgb=srgb,
+        raw=frame.mosaic,
+        cfa=frame.cfa,
+        white_balance=frame.white_balance,
+        color_matrix=frame.color_matrix,
+        camera=frame.camera,
+        registered=registered,
+        iso=frame.iso,
+    )
+
+
+def _raw_files(path: str | Path) -> list[Path]:
+    path = Path(path)
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.suffix.lower() in RAW_FOLDER_EXTENSIONS)
+    return [path]
+
+
+def _jpeg_beside(file: Path) -> Path | None:
+    return next((jpeg for suffix in _JPEG_SUFFIXES if (jpeg := file.with_suffix(suffix)).is_file()), None)

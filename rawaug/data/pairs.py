@@ -1,0 +1,388 @@
+"""A RAW frame and the sRGB picture of the same shot: what an ISP is fitted on and measured against.
+
+What a denoiser is trained and scored on: packed noisy RAW, its clean version and the variance of its noise.
+
+Which frames a sequence of pairs holds, without reading them: what is trained on must not be scored.
+
+A frame is identified by the resolved paths of its files where it has some, else by its name.
+
+Pairs that are read when they are asked for.
+
+The sRGB pictures of RAW-sRGB pairs, as pictures to augment with: what few pairs alone can give.
+
+Which of many pairs a recipe uses: the first ones, whole scenes, one phone after another, or by name.
+
+A dataset that knows more of its frames than their names has ``labels``, one :class:`FrameLabel` a frame.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, groupby
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, overload, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.data.captured_noise import measured_levels
+from rawaug.files import digest
+from rawaug.io.apart import prepare
+from rawaug.io.pictures import MAX_PIXELS
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One shot, RAW and sRGB.
+
+    Attributes:
+        name: of the shot, for reports.
+        srgb: uint8 ``(3, H, W)``, in the sensor's orientation.
+        raw: the clean mosaic, float32 ``(1, H, W)``, black 0, white 1, sides even.
+        cfa: the pattern of ``raw`` and ``noisy``.
+        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 where they are not known.
+        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
+        noisy: a noisy mosaic of the same scene, like ``raw``, where one was captured.
+        shot_var, read_var: the levels of ``noisy``: its variance is shot_var * raw + read_var.
+        camera: make and model.
+        iso: None if unknown.
+        registered: whether ``srgb`` and ``raw`` agree pixel for pixel. A camera's own JPEG is corrected for its lens:
+            compare it at a much lower resolution only.
+        rendered: whether ``srgb`` is a rendering in the camera's colours. False: gains and matrix are unknown, and
+            ``srgb`` merely displays the RAW, so that no ISP can be fitted to it or scored on it.
+        noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, where there is one.
+        levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``, which a denoiser that is
+            tested must not know.
+        color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
+
+    Raises:
+        ValueError: if shapes or dtypes disagree, a side is odd, or levels come without the other or without ``noisy``.
+    """
+
+    name: str
+    srgb: Tensor
+    raw: Tensor
+    cfa: CFA
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
+    noisy: Tensor | None = None
+    shot_var: float | None = None
+    read_var: float | None = None
+    camera: str = "unknown"
+    registered: bool = True
+    rendered: bool = True
+    noisy_srgb: Tensor | None = None
+    levels_from_clean: bool = False
+    color_known: bool = True
+    iso: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name
+        self._require_shape("srgb", self.srgb, 3, torch.uint8)
+        self._require_shape("raw", self.raw, 1, torch.float32)
+        if self.noisy is not None:
+            self._require_shape("noisy", self.noisy, 1, torch.float32)
+        if self.noisy_srgb is not None:
+            self._require_shape("noisy_srgb", self.noisy_srgb, 3, torch.uint8)
+        if any(side % 2 or side == 0 for side in self.raw.shape[-2:]):
+            raise ValueError(f"pair {self.name}: the mosaic must have even sides, got {tuple(self.raw.shape)}")
+        if self.color_matrix.shape != (3, 3):
+            raise ValueError(f"pair {self.name}: color_matrix must be (3, 3), got {tuple(self.color_matrix.shape)}")
+        if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
+            raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
+
+    @property
+    def balance_known(self) -> bool:
+        """Whether ``white_balance`` is the camera's."""
+        return self.white_balance != (1.0, 1.0, 1.0)
+
+    def with_levels(self) -> Pair:
+        """This pair; the levels of a noisy capture that came without are measured against ``raw``."""
+        if self.noisy is None or self.shot_var is not None:
+            return self
+        shot_var, read_var = measured_levels(self.raw, self.noisy)
+        return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
+
+    def require_rendered(self) -> None:
+        """Refuse a pair whose colours are unknown.
+
+        Raises:
+            ValueError: if ``srgb`` is no rendering in the camera's colours.
+        """
+        if not self.rendered:
+            raise ValueError(
+                f"{self.name}: has no sRGB picture, and its white balance and colour matrix are unknown; "
+                "put the dataset's sRGB files or METADATA beside its RAW (docs/datasets.md)"
+            )
+
+    def in_pattern(self, cfa: CFA | str) -> Pair:
+        """The frame without the first row or column, where that gives it the pattern ``cfa``; sides stay even."""
+        top, left = self.cfa.shift_to(CFA(cfa))
+        if not (top or left):
+            return self
+        height, width = ((size - first) // 2 * 2 for size, first in zip(self.raw.shape[-2:], (top, left), strict=True))
+        return self._window(slice(top, top + height), slice(left, left + width), CFA(cfa))
+
+    def middle(self, side: int) -> Pair:
+        """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
+        top, left = ((size - side) // 4 * 2 if size > side else 0 for size in self.raw.shape[-2:])
+        rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
+        return self._window(rows, columns, self.cfa)
+
+    def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:
+        images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
+        cut = {key: image[:, rows, columns].contiguous() for key, image in images.items() if image is not None}
+        return replace(self, **cut, cfa=cfa)
+
+    def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
+        expected = (channels, *self.raw.shape[-2:])
+        if tuple(image.shape) != expected or image.dtype != dtype:
+            raise ValueError(
+                f"pair {self.name}: {field} must be {dtype} {expected}, got {image.dtype} {tuple(image.shape)}"
+            )
+
+
+class Sample(NamedTuple):
+    """What a denoiser is trained on, packed ``(4, h, w)`` (in a batch ``(B, 4, h, w)``)."""
+
+    noisy: Tensor
+    clean: Tensor
+    variance: Tensor
+
+
+def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
+    """A frame that both hold, by its path or name; None if they share none.
+
+    Example:
+        >>> from rawaug.data import demo_pairs
+        >>> shared_frame(demo_pairs("train"), demo_pairs("train", count=1))
+        'train_00_astronaut'
+    """
+    return min(_identities(first) & _identities(second), default=None)
+
+
+def stamps(pairs: Sequence[Pair]) -> list[str]:
+    """What a stage depends on, by frame, without reading files again.
+
+    Path, size and modification time of files; names of a dataset's frames; samples of the content of frames in memory.
+    """
+    if isinstance(pairs, SomePairs) and not isinstance(pairs.pairs, LazyPairs):
+        return [_sampled(pair) for pair in pairs]
+    if isinstance(pairs, LazyPairs):
+        return [pairs.stamp(index) for index in range(len(pairs))]
+    return [_sampled(pair) for pair in pairs]
+
+
+def _identities(pairs: Sequence[Pair]) -> set[str]:
+    if not isinstance(pairs, LazyPairs):
+        return {pair.name for pair in pairs}
+    found = set()
+    for index, name in enumerate(pairs.names):
+        files = pairs.files_of(index)
+        found |= {str(file.resolve()) for file in files} if files else {name}
+    return found
+
+
+def _sampled(pair: Pair) -> str:
+    known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
+    images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
+    return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]
+
+
+class LazyPairs(Sequence[Pair], ABC):
+    """A sequence of pairs that reads one at a time; the last one stays in memory.
+
+    Args:
+        names: of the pairs, known without reading any.
+
+    Attributes:
+        max_pixels: sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded.
+    """
+
+    max_pixels: int = MAX_PIXELS
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = list(names)
+        self._last: tuple[int, Pair] | None = None
+        prepare()
+
+    @abstractmethod
+    def read(self, index: int) -> Pair:
+        """The pair at ``index`` in [0, len)."""
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        """The files that identify a pair; none where its name does."""
+        return ()
+
+    def stamp(self, index: int) -> str:
+        """What a pair depends on, without reading it: path, size and modification time of its files, or its name."""
+        files = [f"{f.resolve()} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
+        return " ".join(files) or self.names[index]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @overload
+    def __getitem__(self, index: int) -> Pair: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Pair]: ...
+
+    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        if self._last is None or self._last[0] != index:
+            self._last = index, self.read(index)
+        return self._last[1]
+
+
+class SomePairs(LazyPairs):
+    """Some pairs of a sequence, by index.
+
+    Example:
+        >>> from rawaug.data import demo_pairs
+        >>> SomePairs(demo_pairs("train", count=3), [2, 0]).names
+        ['train_02_astronaut', 'train_00_astronaut']
+    """
+
+    def __init__(self, pairs: Sequence[Pair], indices: Sequence[int]) -> None:
+        self.pairs, self.indices = pairs, list(indices)
+        known = names_of(pairs)
+        super().__init__([known[index] for index in self.indices])
+
+    def read(self, index: int) -> Pair:
+        return self.pairs[self.indices[index]]
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        return self.pairs.files_of(self.indices[index]) if isinstance(self.pairs, LazyPairs) else ()
+
+    def stamp(self, index: int) -> str:
+        return self.pairs.stamp(self.indices[index]) if isinstance(self.pairs, LazyPairs) else super().stamp(index)
+
+
+def names_of(pairs: Sequence[Pair]) -> list[str]:
+    """The names, without reading lazy pairs."""
+    return list(pairs.names) if isinstance(pairs, LazyPairs) else [pair.name for pair in pairs]
+
+
+OWN_PICTURES = "pairs"
+"""``data.pictures`` of a recipe that augments the pictures of its own pairs."""
+
+
+class PairPictures(Sequence[Tensor]):
+    """The pictures uint8 ``(3, H, W)`` of pairs; a pair is read when its picture is asked for.
+
+    Args:
+        pairs: the pairs; keep them in memory if they are asked for often.
+    """
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = pairs
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        return self.pairs[index].srgb
+
+
+SELECTIONS = ("first", "scenes", "phones")
+
+
+class FrameLabel(NamedTuple):
+    """The scene that a frame shows, the phone that took it, and its ISO."""
+
+    scene: str
+    phone: str
+    iso: int
+
+
+@runtime_checkable
+class Labelled(Protocol):
+    """A dataset whose frames have labels, known without reading any."""
+
+    @property
+    def labels(self) -> Sequence[FrameLabel]: ...
+
+
+def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
+    """Indices of ``count`` of the first ``kept`` pairs, of all of these if None; none is read.
+
+    Args:
+        pairs: the dataset.
+        kept: number of pairs to choose from; the others are held out.
+        count: how many.
+        select: ``first``; ``scenes``, whole scenes until there are ``count`` pairs; ``phones``, as many of each phone,
+            the middle ones by ISO; or names of frames, or of their folders (scene instances).
+
+    Raises:
+        ValueError: if a name is unknown, the dataset has no labels, or ``count`` is not that of whole scenes.
+
+    Example:
+        >>> labels = [FrameLabel("001", phone, iso) for phone in ("GP", "S6") for iso in (100, 400, 800)]
+        >>> one_a_phone(labels, 2)
+        [1, 4]
+    """
+    if not isinstance(select, str):
+        return _named(names_of(pairs)[:kept], select)[:count]
+    if select not in SELECTIONS:
+        raise ValueError(f"data.select {select!r} is unknown; use {', '.join(SELECTIONS)} or a list of names")
+    if select == "first":
+        return list(range(kept)[:count])
+    if not isinstance(pairs, Labelled):
+        raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
+    if count is None:
+        return list(range(kept))
+    choose = whole_scenes if select == "scenes" else one_a_phone
+    return choose(pairs.labels[:kept], count)
+
+
+def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
+    """Indices of the first scenes, in order of their names, whose frames are ``count`` in all.
+
+    Raises:
+        ValueError: if no number of scenes has ``count`` frames; the numbers on either side are named.
+    """
+    order = sorted(range(len(labels)), key=lambda k: labels[k].scene)
+    totals = list(accumulate(len(list(group)) for _, group in groupby(order, key=lambda k: labels[k].scene)))
+    if count not in totals:
+        near = sorted(totals, key=lambda total: abs(total - count))[:2]
+        raise ValueError(
+            f"data.count: {count} pairs are not whole scenes; use {' or '.join(map(str, sorted(near)))}, "
+            "or select: first"
+        )
+    return order[:count]
+
+
+def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
+    """Indices of ``count`` frames, one phone after another; of each phone evenly spread in ISO.
+
+    Raises:
+        ValueError: if a phone has too few frames.
+    """
+    phones = sorted({label.phone for label in labels})
+    chosen: list[list[int]] = []
+    for place, phone in enumerate(phones):
+        share = count // len(phones) + (place < count % len(phones))
+        frames = sorted((k for k, label in enumerate(labels) if label.phone == phone), key=lambda k: labels[k].iso)
+        if share > len(frames):
+            raise ValueError(f"data.count: {count} pairs are {share} of {phone}, which has {len(frames)}")
+        chosen.append([frames[(2 * i + 1) * len(frames) // (2 * share)] for i in range(share)])
+    longest = max(len(frames) for frames in chosen)
+    return [frames[i] for i in range(longest) for frames in chosen if i < len(frames)]
+
+
+def _named(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    indices: list[int] = []
+    for name in wanted:
+        found = [k for k, known in enumerate(names) if known == name or known.rpartition("_")[0] == name]
+        if not found:
+            raise ValueError(f"data.select: {name} is none of the {len(names)} frames, such as {', '.join(names[:3])}")
+        indices += [k for k in found if k not in indices]
+    return indices

@@ -1,0 +1,383 @@
+r"""MIT-Adobe FiveK: DNGs of the Canon EOS 5D and the Nikon D700, split as for InvISP.
+
+Each DNG is developed by LibRaw with the camera's white balance and without automatic brightness (see
+:func:`rawaug.io.read_raw_and_develop`), as the sRGB of the pair. ``fivek.json`` beside this file lists the numbers of
+the splits: 650 and 127 frames of the Canon, 414 and 73 of the Nikon. InvISP's pictures (``invisp_canon:``,
+``invisp_nikon:``) differ: LibRaw scales each frame by its own maximum (``adjust_maximum_thr`` 0.75, its default), and
+they are stored as JPEGs of quality 90.
+
+Source: V. Bychkovsky, S. Paris, E. Chan, F. Durand, "Learning photographic global tonal adjustment with a database of
+input/output image pairs", CVPR 2011; Y. Xing, Z. Qian, Q. Chen, "Invertible image signal processing", CVPR 2021.
+
+RAWIR and AIM 2022 Reversed ISP: crops of phone RAW, packed in ``.npy`` files, with the phone's picture beside them.
+
+A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
+be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
+Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). An ``.npz`` holds the same array as
+``raw`` and its white level as ``max_val``. There is no white balance or colour matrix in a form that is safe to open
+(RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+
+The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
+"Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
+
+RGB2RAW, the set of NTIRE 2025's RAW reconstruction from sRGB: crops of three phones, as RAWIR's.
+
+Files are ``PHONE/RAWID_CROP.npy``, uint16 ``(512, 512, 4)`` in RGGB with white at 2^12 - 1, and the phone's PNG
+of 1024 x 1024 beside each. Only the training pairs are public, so the splits are this package's own: of each folder's
+RAW files in the order of their names every tenth is for the test and the one after it for validation, with all
+of its crops. Source: the dataset's page, <https://huggingface.co/datasets/marcosv/rgb2raw>.
+
+Zurich RAW to RGB: crops of a Huawei P20's RAW, and of the same scenes by a Canon 5D Mark IV.
+
+    y = min((d - 63) / (1020 - 63), 1)
+
+for the numbers d of ``SPLIT/huawei_raw/0.png``, a PNG of 16 bits with 10 of them used, RGGB, 448 x 448; the picture is
+``SPLIT/canon/0.jpg``. It was taken by another camera from another place: the pairs are not registered, and no camera's
+ISP leads from one to the other. The files have no white balance: gains are 1, the colour matrix is the identity.
+
+Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing mobile camera ISP with a single deep learning model", CVPR
+workshops 2020, whose loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning
+RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Sequence
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA, unpack
+from rawaug.data.folders import RawFolder
+from rawaug.data.mat import MAX_BYTES
+from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.io import read_picture
+from rawaug.io.apart import apart
+from rawaug.io.pictures import read_plane
+from rawaug.registry import DATASETS
+
+CAMERAS = ("canon", "nikon")
+_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
+
+
+@DATASETS.register("fivek")
+def fivek_pairs(
+    path: str | Path,
+    split: str,
+    cameras: Sequence[str] = CAMERAS,
+    adjust_maximum_thr: float = 0.0,
+    jpeg_quality: int | None = None,
+) -> RawFolder:
+    """The pairs of a split, Canon before Nikon, each sorted by number.
+
+    Args:
+        path: contains the DNGs under their published names, ``a0016-jmac_MG_0795.dng``, at any depth.
+        split: ``"train"`` or ``"test"``.
+        cameras: some of :data:`CAMERAS`.
+        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum.
+        jpeg_quality: the pictures as JPEGs of this quality give them back; None leaves them as they are.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or one of the split's DNGs is missing.
+        ValueError: if there is no such split or camera.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder of FiveK")
+    wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
+    files = {
+        found[1]: Path(parent, file)
+        for parent, _, names in os.walk(path)
+        for file in names
+        if (found := _DNG.fullmatch(file))
+    }
+    missing = [number for number in wanted if number not in files]
+    if missing:
+        raise FileNotFoundError(
+            f"{path}: {len(missing)} of the {len(wanted)} DNGs of fivek {'+'.join(cameras)}, {split}, are missing, "
+            f"first a{missing[0]}-*.dng"
+        )
+    chosen = [files[number] for number in wanted]
+    return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
+
+
+_as_invisp = partial(fivek_pairs, adjust_maximum_thr=0.75, jpeg_quality=90)
+"""As its published script makes the pictures."""
+
+for _camera in CAMERAS:
+    DATASETS.register(f"fivek_{_camera}")(partial(fivek_pairs, cameras=[_camera]))
+    DATASETS.register(f"invisp_{_camera}")(partial(_as_invisp, cameras=[_camera]))
+
+
+def fivek_numbers(camera: str, split: str) -> list[str]:
+    """The numbers, four digits, of the DNGs of a split.
+
+    Raises:
+        ValueError: if there is no such camera or split.
+
+    Example:
+        >>> fivek_numbers("nikon", "test")[:3]
+        ['0002', '0088', '0208']
+    """
+    splits = _splits()
+    if camera not in CAMERAS:
+        raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")
+    if split not in splits[camera]:
+        raise ValueError(f"fivek: no split {split}; use one of InvISP's: {', '.join(splits[camera])}")
+    return splits[camera][split].split()
+
+
+@cache
+def _splits() -> dict[str, dict[str, str]]:
+    content: dict[str, dict[str, str]] = json.loads(
+        resources.files("rawaug.data").joinpath("fivek.json").read_text(encoding="utf-8")
+    )
+    return content
+
+
+WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
+"""White level by the picture's extension."""
+
+_DAMAGE = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
+    tokenize.TokenError,
+)
+"""What NumPy raises for headers that say anything."""
+_ARRAYS = (".npy", ".npz")
+_MAGIC = b"\x93NUMPY"
+
+_SPLITS = {"train": "train", "validation": "val", "test": "test"}
+
+
+@DATASETS.register("rawir")
+class Rawir(LazyPairs):
+    """The pairs below a folder, in RGGB.
+
+    Args:
+        path: contains ``.npy`` or ``.npz`` files with a picture beside each, at any depth. Where it has subfolders
+            ``train``, ``val`` or ``test``, only the one of the split is taken.
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        white: in digital numbers; by default as :data:`WHITE` says.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or an array has no picture beside it.
+        ValueError: if there is no such split, or it holds no pair.
+
+    Example:
+        >>> Rawir("data-s7", "train")[0].raw.shape  # doctest: +SKIP
+        torch.Size([1, 504, 504])
+    """
+
+    def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
+        folder, self.white = Path(path), white
+        if split not in _SPLITS:
+            raise ValueError(f"rawir: no split {split}; use one of {', '.join(_SPLITS)}")
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{path}: no such folder of RAWIR")
+        if any((folder / name).is_dir() for name in _SPLITS.values()):
+            folder = folder / _SPLITS[split]
+        self.files = sorted(
+            Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(_ARRAYS)
+        )
+        if not self.files:
+            raise ValueError(f"{folder}: contains no .npy or .npz file of RAWIR")
+        self.pictures = [picture_beside(file) for file in self.files]
+        super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
+
+    def camera_of(self, file: Path) -> str:
+        """The camera of a file, which the names do not say."""
+        return "unknown"
+
+    def read(self, index: int) -> Pair:
+        file, picture = self.files[index], self.pictures[index]
+        return Pair(
+            name=self.names[index],
+            srgb=apart(read_picture, picture, self.max_pixels),
+            raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
+            cfa=CFA.RGGB,
+            camera=self.camera_of(file),
+            white_balance=(1.0, 1.0, 1.0),
+            color_matrix=torch.eye(3),
+            registered=not _is_p20(file),
+        )
+
+
+def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
+    """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level.
+
+    Raises:
+        OSError: if the file is damaged.
+        ValueError: if its array is of another kind, or exceeds white.
+    """
+    numbers, stated = apart(_archive, file) if file.suffix == ".npz" else (_array(file), None)
+    if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
+        raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
+    white = white or stated or WHITE[picture.suffix.lower()]
+    if numbers.max() > white:
+        raise ValueError(f"{file}: has value {numbers.max()}, above the white level {white:g}; pass white=")
+    return torch.from_numpy(numbers.astype(np.float32)).permute(2, 0, 1) / white
+
+
+def _array(file: Path) -> np.ndarray:
+    """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory.
+
+    Raises:
+        OSError: if it is damaged.
+    """
+    try:
+        with file.open("rb") as opened:
+            if opened.read(len(_MAGIC)) != _MAGIC:  # NumPy would open an archive of arrays, or a pickle
+                raise ValueError("does not begin as one")
+        return np.load(file, mmap_mode="r", allow_pickle=False)
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{file}: cannot be read as an array ({reason}); copy it again") from error
+
+
+def _archive(file: Path) -> tuple[np.ndarray, float]:
+    """``raw`` and ``max_val`` of an ``.npz`` file.
+
+    Raises:
+        OSError: if it is damaged, or lacks one.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            size = sum(arrays.zip.getinfo(f"{name}.npy").file_size for name in ("raw", "max_val"))
+            if size > MAX_BYTES:
+                raise ValueError(f"declares {size} bytes, above the limit of {MAX_BYTES}")
+            return arrays["raw"], float(arrays["max_val"])
+    except (*_DAMAGE, zipfile.BadZipFile, zlib.error) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"{file}: cannot be read as raw and max_val ({reason}); copy it again") from error
+
+
+def picture_beside(file: Path) -> Path:
+    """The picture of the same stem.
+
+    Raises:
+        FileNotFoundError: if there is no such picture.
+    """
+    for suffix in WHITE:
+        if file.with_suffix(suffix).is_file():
+            return file.with_suffix(suffix)
+    raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; download it too")
+
+
+def _is_p20(file: Path) -> bool:
+    return any("p20" in part.lower() for part in file.parts)
+
+
+TENTH = 10
+_TURN = {"test": (0,), "validation": (1,), "train": tuple(range(2, TENTH))}
+
+
+@DATASETS.register("rgb2raw")
+class Rgb2Raw(Rawir):
+    """The pairs of a split; a pair's camera is the name of its folder.
+
+    Args:
+        path: contains the arrays, ``.npy`` or ``.npz``, with a picture beside each, at any depth.
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or an array has no picture beside it.
+        ValueError: if there is no such split, or it holds no pair.
+
+    Example:
+        >>> Rgb2Raw("train_rgb2raw", "test")[0].raw.shape  # doctest: +SKIP
+        torch.Size([1, 1024, 1024])
+    """
+
+    def __init__(self, path: str | Path, split: str = "train") -> None:
+        super().__init__(path, split)
+        by_folder: dict[Path, list[str]] = {}
+        for file in self.files:
+            shots = by_folder.setdefault(file.parent, [])
+            shots += [] if _raw_id(file) in shots else [_raw_id(file)]
+        turn = {(folder, shot): k % TENTH for folder, shots in by_folder.items() for k, shot in enumerate(shots)}
+        kept = [k for k, file in enumerate(self.files) if turn[file.parent, _raw_id(file)] in _TURN[split]]
+        if not kept:
+            raise ValueError(f"{path}: has no pair of RGB2RAW for {split}; it needs files of {TENTH} RAWs")
+        for key in ("files", "pictures", "names"):
+            setattr(self, key, [getattr(self, key)[k] for k in kept])
+
+    def camera_of(self, file: Path) -> str:
+        return file.parent.name
+
+
+def _raw_id(file: Path) -> str:
+    """``12_3`` is crop 3 of RAW 12."""
+    return file.stem.rpartition("_")[0] or file.stem
+
+
+BLACK, ZURICH_WHITE = 63, 1020
+_BITS = 10
+
+
+@DATASETS.register("zurich")
+class Zurich(LazyPairs):
+    """The pairs of a split, sorted by number.
+
+    Args:
+        path: contains ``train`` and ``test`` with ``huawei_raw`` and ``canon`` in each.
+        split: ``"train"`` or ``"test"``.
+        black, white: in digital numbers of 10 bits. PNGs of 8 bits hold a quarter of them.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or a RAW has no picture.
+        ValueError: if there is no such split, or it holds no RAW.
+
+    Example:
+        >>> Zurich("Zurich-RAW-to-DSLR", "test")[0].registered  # doctest: +SKIP
+        False
+    """
+
+    def __init__(
+        self, path: str | Path, split: str = "train", black: float = BLACK, white: float = ZURICH_WHITE
+    ) -> None:
+        if split not in ("train", "test"):
+            raise ValueError(f"zurich: no split {split}; use train or test")
+        folder = Path(path) / split
+        if not (folder / "huawei_raw").is_dir():
+            raise FileNotFoundError(f"{folder / 'huawei_raw'}: no such folder of Zurich RAW to RGB")
+        self.files = sorted((folder / "huawei_raw").glob("*.png"), key=lambda file: (len(file.stem), file.stem))
+        if not self.files:
+            raise ValueError(f"{folder / 'huawei_raw'}: contains no PNG")
+        existing = {file.name for file in (folder / "canon").glob("*.jpg")}
+        missing = [file for file in self.files if f"{file.stem}.jpg" not in existing]
+        if missing:
+            raise FileNotFoundError(
+                f"{folder / 'canon' / missing[0].stem}.jpg: is missing, and {len(missing) - 1} others"
+            )
+        self.folder, self.black, self.white = folder, black, white
+        super().__init__([f"{split}_{file.stem}" for file in self.files])
+
+    def read(self, index: int) -> Pair:
+        file = self.files[index]
+        numbers = apart(read_plane, file, self.max_pixels)
+        scale = 1.0 if numbers.dtype == np.uint16 else 0.25
+        if numbers.max() >= scale * 2**_BITS:
+            raise ValueError(
+                f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is not a RAW of this dataset"
+            )
+        light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
+        return Pair(
+            name=self.names[index],
+            srgb=apart(read_picture, self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
+            raw=torch.from_numpy(np.minimum(light, 1))[None],
+            cfa=CFA.RGGB,
+            white_balance=(1.0, 1.0, 1.0),
+            color_matrix=torch.eye(3),
+            camera="Huawei P20 (picture: Canon 5D Mark IV)",
+            registered=False,
+        )

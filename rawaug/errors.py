@@ -1,0 +1,92 @@
+"""Names of files as text for terminals, logs and tables: a name may hold any byte but ``/`` and NUL.
+
+Libraries of the extras, as ``[raw]`` and ``[train]``: what is not installed is named with its extra.
+
+What PyTorch reports when the machine lacks something, as one line with a way out.
+
+PyTorch raises a RuntimeError of several lines where a worker was killed, or shared memory, file descriptors or memory
+have run out: no fault of a program, so no traceback either.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+def printable(text: object) -> str:
+    r"""The text with what is not printed as its escape: line breaks, terminal codes, marks that turn the direction of
+    writing, and bytes of a name that are not UTF-8.
+
+    Example:
+        >>> printable("a\nb\x1b[2Jc ü 写真")
+        'a\\nb\\x1b[2Jc ü 写真'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
+
+
+class MissingExtra(ImportError):
+    """A library of an extra is not installed."""
+
+
+@contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Import libraries of the extra ``name`` in this block.
+
+    Raises:
+        MissingExtra: with the command that installs what is missing.
+
+    Example:
+        >>> with extra("raw"):
+        ...     import rawpy_of_the_future
+        Traceback (most recent call last):
+        ...
+        rawaug.errors.MissingExtra: rawpy_of_the_future is not installed; run: pip install 'rawaug[raw]'
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"{str(error.name).split('.')[0]} is not installed; run: pip install 'rawaug[{name}]'"
+        ) from None
+
+
+_MEMORY = "out of memory; use a smaller batch, crop or tile"
+_WAYS_OUT = (
+    (r"too many open files|ancdata", "too many open files; raise the limit (ulimit -n) or use fewer workers"),
+    (
+        r"out of shared memory|shared memory\(shm\)|bus error|/torch_",
+        "shared memory is full; enlarge /dev/shm or use fewer workers",
+    ),
+    (r"out of memory|can't allocate memory", _MEMORY),
+    (r"dataloader worker.*(killed|exited)", "a worker process was killed, perhaps for its memory; use fewer workers"),
+    (r"no space left on device|pytorchstreamwriter", "the disk is full; free some space"),
+)
+"""By what the error says, in lower case, first match."""
+
+
+def shortage(error: BaseException) -> str | None:
+    """What is short and what to do about it, in one line; None for any other error.
+
+    Example:
+        >>> shortage(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
+        'a worker process was killed, perhaps for its memory; use fewer workers, then run the same command again'
+    """
+    if isinstance(error, MemoryError):
+        return f"{_MEMORY}, then run the same command again"
+    text = str(error).lower()
+    found = next((way for pattern, way in _WAYS_OUT if re.search(pattern, text, re.DOTALL)), None)
+    return None if found is None else f"{found}, then run the same command again"
+
+
+def without_traceback(text: str) -> str:
+    """The last line of an error that a DataLoader's worker raised, in place of its traceback.
+
+    Example:
+        >>> without_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")
+        'a'
+    """
+    if "Original Traceback" not in text:
+        return text
+    return text.strip().splitlines()[-1].partition(": ")[2]

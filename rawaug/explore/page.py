@@ -1,0 +1,276 @@
+"""Panels as HTML: pictures inside of it as data, so that the page loads nothing else.
+
+The page: controls on one side, a tab for each view on the other; every change redraws the open tab alone.
+
+Nothing is loaded from elsewhere and nothing is sent: system fonts, no analytics, no sharing.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+import re
+import socket
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rawaug.errors import MissingExtra, extra, printable
+from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
+from rawaug.explore.views import VIEWS, Panel, denoised
+from rawaug.files import shipped_isps
+from rawaug.isp.cameras import published_cameras
+from rawaug.isp.light import LAMPS
+from rawaug.patterns import PATTERNS
+from rawaug.plugin.sampling_config import Drawing
+
+STYLE = """
+.panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); gap: 12px}
+.panels figure {margin: 0; min-width: 0}
+.panels img {width: 100%; height: auto; display: block; border-radius: 4px}
+.panels figcaption {font-size: 13px; line-height: 1.4; padding: 4px 0; overflow-wrap: anywhere}
+.panels .number {white-space: nowrap}
+#message:not(:has(.message)) {display: none}
+.message {border: 1px solid #c0392b; border-radius: 4px; padding: 8px 12px; overflow-wrap: anywhere}
+#controls {max-width: 420px}
+#views {min-width: 0 !important}
+@media (max-width: 768px) {
+  #layout {flex-direction: column-reverse; align-items: stretch}
+  #controls, #views {max-width: none; width: 100%; flex: none}
+}
+"""
+
+
+def as_html(panels: Sequence[Panel]) -> str:
+    """A grid of pictures with their titles."""
+    figures = "".join(
+        f'<figure><img src="{data_url(panel.image)}" alt="{html.escape(panel.title)}">'
+        f"<figcaption>{_caption(panel.title)}</figcaption></figure>"
+        for panel in panels
+    )
+    return f'<div class="panels">{figures}</div>'
+
+
+def _caption(title: str) -> str:
+    """The title; numbers such as 2.9e-03 stay on one line."""
+    return re.sub(r"\S+e-\d+", r'<span class="number">\g<0></span>', html.escape(title))
+
+
+def message(text: str) -> str:
+    """What went wrong, or nothing."""
+    return f'<div class="message" role="alert">{html.escape(text)}</div>' if text else ""
+
+
+def data_url(image: np.ndarray) -> str:
+    """uint8 ``(H, W, 3)`` as a JPEG of full colour resolution: noise stays noise."""
+    with extra("explore"):
+        from PIL import Image
+
+    content = io.BytesIO()
+    Image.fromarray(image).save(content, "JPEG", quality=92, subsampling=0)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+ANY, OWN = "any", "the ISP's"
+KELVINS = (2000, 2500, 2856, 3200, 4000, 5000, 5500, 6500, 7500, 10000)
+DENOISE = "Denoise"
+
+
+def look_of(values: Mapping[str, Any]) -> Look:
+    """The look that the controls' values mean.
+
+    Raises:
+        ValueError: if no picture is chosen.
+    """
+    picture = values["picture"]
+    if not picture:
+        raise ValueError("choose a picture")
+    light = values["light"]
+    drawing = Drawing(
+        isp=values["isp"],
+        camera=_given(values["camera"]),
+        light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
+        tone=_given(values["tone"]),
+        exposure=None if values["draw_exposure"] else _number(values["exposure"]),
+        noise=values["noise"],
+        iso=_number(values["iso"]) if values["iso"] else None,
+        cfa=None if values["cfa"] == OWN else values["cfa"],
+    )
+    return Look(str(picture), possible(drawing), int(values["seed"] or 0))
+
+
+def _number(value: float) -> float:
+    """Whole ones as int, which are written without a point."""
+    return int(value) if value == int(value) else float(value)
+
+
+def _given(choice: str) -> str | None:
+    return None if choice == ANY else choice
+
+
+def shown(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What changes on the page: ``message``, ``python``, ``command``, and the content of the open tab by its name."""
+    try:
+        look = look_of(values)
+        if tab == DENOISE:
+            before, after = denoised(look)
+            images = (before.image, after.image)
+            return {"message": "", tab: images, "compared": f"{before.title} | {after.title}", **_code(look)}
+        return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
+    except (ValueError, OSError, MissingExtra) as error:
+        empty: dict[str, Any] = {tab: None, "compared": ""} if tab == DENOISE else {tab: ""}
+        return {"message": message(printable(str(error))), **empty, "python": "", "command": ""}
+
+
+def _code(look: Look) -> dict[str, str]:
+    return {"python": python(look), "command": command(look)}
+
+
+def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
+    """The page as Gradio's Blocks.
+
+    Args:
+        pictures: that can be chosen besides uploaded ones.
+        names: of these; their files' by default.
+    """
+    os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
+    with extra("explore"):
+        import gradio as gr
+
+    choices = [(name, str(file)) for name, file in zip(names or [p.name for p in pictures], pictures, strict=True)]
+    private = {"analytics_enabled": False, "delete_cache": (3600, 86400)}  # uploads go when the page stops
+    with gr.Blocks(title="rawaug explore", fill_width=True, **private) as page:
+        gr.HTML("<h1>Your pictures as RAW</h1>")
+        outputs: dict[str, Any] = {"message": gr.HTML(elem_id="message")}
+        with gr.Row(elem_id="layout"):
+            with gr.Column(scale=1, min_width=300, elem_id="controls"):
+                controls = _controls(gr, choices)
+            with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs():
+                tabs = {name: _tab(gr, name, outputs) for name in (*VIEWS, DENOISE)}
+                with gr.Tab("Code"):
+                    form = {"interactive": False, "wrap_lines": True, "show_line_numbers": False, "buttons": ["copy"]}
+                    outputs["python"] = gr.Code(label="Python", language="python", elem_id="python", **form)
+                    outputs["command"] = gr.Code(label="Command", language="shell", elem_id="command", **form)
+        _connect(gr, page, controls, outputs, tabs)
+    return page
+
+
+def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    isps, usual = shipped_isps(), Drawing()
+    cameras = sorted(set(published_cameras().names), key=str.casefold)
+    with gr.Group():
+        picture = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", elem_id="picture")
+        upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
+    with gr.Group():
+        isp = gr.Dropdown(isps, value=usual.isp, label="ISP", elem_id="isp")
+        camera = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", elem_id="camera")
+        light = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", elem_id="light")
+        tone = gr.Dropdown([ANY, *tones_of(usual.isp)], value=ANY, label="Tone curve", elem_id="tone")
+        draw_exposure = gr.Checkbox(True, label="Draw the exposure at random", elem_id="draw_exposure")
+        exposure = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False, elem_id="exposure")
+    with gr.Group():
+        noise = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", elem_id="noise")
+        iso = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False, elem_id="iso")
+        cfa = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA", elem_id="cfa")
+        seed = gr.Number(0, label="Seed", precision=0, minimum=0, elem_id="seed")
+    made = locals()
+    names = ("picture", "isp", "camera", "light", "tone", "draw_exposure", "exposure", "noise", "iso", "cfa", "seed")
+    upload.upload(partial(_added, gr, choices), upload, picture, show_progress="hidden", api_visibility="private")
+    return {name: made[name] for name in names}
+
+
+def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
+    """The uploaded picture in the list, and chosen."""
+    return gr.update(choices=[*choices, (Path(uploaded).name, uploaded)], value=uploaded)
+
+
+def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
+    with gr.Tab(name) as tab:
+        if name == DENOISE:
+            outputs["compared"] = gr.HTML(elem_id="compared")
+            outputs[name] = gr.ImageSlider(show_label=False, format="png", elem_id="slider", max_height=560)
+        else:
+            outputs[name] = gr.HTML(elem_id=f"view-{name.lower().replace(' ', '-')}")
+    return tab
+
+
+def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, Any], tabs: dict[str, Any]) -> None:
+    opened = gr.State(next(iter(VIEWS)))
+
+    def redraw(tab: str, *values: Any) -> list[Any]:
+        changes = shown(tab, dict(zip(controls, values, strict=True)))
+        return [changes.get(name, gr.skip()) for name in outputs]
+
+    def select(tab: str, *values: Any) -> list[Any]:
+        return [tab, *redraw(tab, *values)]
+
+    quiet = {"show_progress": "hidden", "api_visibility": "private"}
+    inputs, results = list(controls.values()), list(outputs.values())
+    moved = [page.load, *(control.change for control in inputs)]
+    gr.on(moved, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
+    for name, tab in tabs.items():
+        tab.select(partial(select, name), inputs, [opened, *results], **quiet)
+    tone, light, camera, iso = (controls[name] for name in ("tone", "light", "camera", "iso"))
+    controls["isp"].change(
+        partial(_fitting, gr),
+        [controls["isp"], tone, controls["noise"]],
+        [camera, light, tone, controls["noise"]],
+        **quiet,
+    )
+    controls["noise"].change(
+        lambda noise: gr.update(interactive=iso_range(noise) is not None, info=_about_iso(noise)),
+        controls["noise"],
+        iso,
+        **quiet,
+    )
+    drawn = controls["draw_exposure"]
+    drawn.change(lambda on: gr.update(interactive=not on), drawn, controls["exposure"], **quiet)
+
+
+def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
+    """Cameras, lights and tones are those of published cameras; the noise of the ISP's own goes with it."""
+    published, tones, noises = bool(loaded(isp).config.cameras), [ANY, *tones_of(isp)], noises_of(isp)
+    toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
+    usual = Drawing().noise
+    noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
+    return [gr.update(interactive=published), gr.update(interactive=published), toned, noised]
+
+
+def _about_iso(noise: str) -> str:
+    measured = iso_range(noise)
+    return f"0: drawn from {measured[0]:g} to {measured[1]:g}" if measured else "this noise model has no ISO"
+
+
+def server_of(page: Any) -> Any:
+    """A server of uvicorn for the page; ``server.run(sockets=[...])`` runs it until it is interrupted."""
+    with extra("explore"):
+        import fastapi
+        import gradio as gr
+        import uvicorn
+
+    theme = gr.themes.Base(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"])
+    app = gr.mount_gradio_app(fastapi.FastAPI(), page, "/", footer_links=[], ssr_mode=False, theme=theme, css=STYLE)
+    return uvicorn.Server(uvicorn.Config(app, log_level="error"))
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket for :func:`server_of`; port 0 takes any that is free.
+
+    Raises:
+        OSError: if the address or the port cannot be used.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise OSError(f"port {port} of {host} cannot be used ({error.strerror}); choose another --port") from None
+
+
+def address(open_: socket.socket) -> str:
+    """What a browser opens."""
+    host, port = open_.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,0 +1,341 @@
+r"""sRGB pictures: files of any format that OpenImageIO knows, to and from uint8 ``(3, H, W)``.
+
+The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and display value v, both in [0, 1]:
+
+    v = 12.92 l                      for l <= 0.0031308
+    v = 1.055 l^(1/2.4) - 0.055      otherwise
+
+OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space is
+applied (see :mod:`rawaug.io.pictures`); without one, a picture is taken to be sRGB whatever else its tags say.
+
+Exposure of a picture as its EXIF states it: ``EV = log2(t S / (100 N^2))``, with seconds t, ISO S and f-number N.
+
+One stop more is twice the RAW value. Unlike the exposure value of ISO 2720 it grows with exposure.
+
+Embedded ICC profiles: pictures of other colour spaces (Display P3, Adobe RGB, grey of another gamma) to sRGB.
+
+The conversion is LittleCMS's, relative colorimetric with black point compensation, in 8 bits. Source of the format:
+ICC.1:2022, "Image technology colour management".
+
+A picture as a JPEG file gives it back: 8 x 8 cosine transform, colour at half the width (4:2:2), one quality.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import turn
+from rawaug.errors import extra
+
+MAX_PIXELS = 2**26
+"""Larger pictures (8192 x 8192) are refused by default, since a few header bytes can claim any size."""
+
+MAX_CHANNELS = 4
+
+_VIEW_OF_EXIF_ORIENTATION = (0, 1, 3, 2, 4, 5, 7, 6)
+"""Views of :func:`rawaug.bayer.turn` that bring EXIF orientations 1 to 8 upright."""
+
+_FORMAT = "rawaug:format"
+_LINEAR_FORMATS = ("openexr", "hdr")
+_HALF_LEVEL = 0.5 / 255
+
+
+def encode_srgb(linear: Tensor) -> Tensor:
+    """Linear light in [0, 1] to display values in [0, 1], any shape."""
+    curve = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+
+
+def decode_srgb(display: Tensor) -> Tensor:
+    """Display values in [0, 1] to linear light in [0, 1], any shape; the inverse of :func:`encode_srgb`."""
+    curve = ((display.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(display <= 0.04045, display / 12.92, curve)
+
+
+def view_of_orientation(orientation: int) -> int:
+    """The view of :func:`rawaug.bayer.turn` that shows a picture of this EXIF orientation upright; 0 if unknown."""
+    return _VIEW_OF_EXIF_ORIENTATION[orientation - 1] if 1 <= orientation <= 8 else 0
+
+
+def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
+    """The first picture of a file as sRGB, uint8 ``(3, H, W)``, upright as its EXIF orientation says.
+
+    Grey becomes three equal channels. Transparency is composited over black. 16 bits become 8 by rounding to the
+    nearest level; floating point too, and must lie in [0, 1] (half an 8-bit level aside).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        OSError: if the file is not a picture, or is truncated.
+        ValueError: if its header declares more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
+            CIELAB, more than four channels, a damaged profile), or leave [0, 1].
+
+    Example:
+        >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
+        torch.Size([3, 480, 640])
+    """
+    return decode_picture(path, max_pixels).contiguous()
+
+
+def decode_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
+    """:func:`read_picture` in the strides of the decoder, for :mod:`rawaug.io.apart`, which copies it anyway."""
+    with _text_damage_as_os_error(Path(path)):
+        pixels, orientation = _read(Path(path), max_pixels)
+    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation))
+
+
+def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG.
+
+    Raises:
+        FileNotFoundError, OSError: as :func:`read_picture`.
+        ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
+    """
+    with _text_damage_as_os_error(Path(path)):
+        pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
+    if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
+        names = ", ".join(spec.channelnames)
+        raise ValueError(f"{path}: has {pixels.dtype} channels {names}; a mosaic must have one channel of 8 or 16 bits")
+    return pixels[..., 0]
+
+
+def write_picture(path: str | Path, srgb: Tensor) -> None:
+    """Write sRGB ``(3, H, W)``, uint8 or floating point in [0, 1], as 8 bits in the format of the path's extension.
+
+    Raises:
+        ValueError: if the shape is wrong, a value leaves [0, 1], or the extension is unknown.
+        OSError: if the file cannot be written.
+    """
+    with extra("raw"):
+        import OpenImageIO as oiio
+
+    if srgb.ndim != 3 or srgb.shape[0] != 3:
+        raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
+    pixels = srgb.detach().cpu().permute(1, 2, 0).numpy()
+    if pixels.dtype != np.uint8:
+        pixels = _round_to_8_bits(pixels, Path(path))
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
+    written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
+    if not (output.close() and written):
+        raise OSError(f"{path}: cannot be written (OpenImageIO: {_first_line(output.geterror())})")
+
+
+@contextmanager
+def _text_damage_as_os_error(path: Path) -> Iterator[None]:
+    """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
+
+
+def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
+    """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
+
+    def kind(spec: Any) -> str:
+        _require_srgb(spec, path)
+        return "float" if spec.format.basetype in _floating() else "uint8"
+
+    pixels, spec = _decoded(path, max_pixels, kind)
+    pixels = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    if pixels.dtype != np.uint8:
+        pixels = _round_to_8_bits(pixels, path, linear=spec.get_string_attribute(_FORMAT) in _LINEAR_FORMATS)
+    profile = spec.getattribute("ICCProfile")
+    if profile is not None:
+        pixels = to_srgb(np.ascontiguousarray(pixels), bytes(profile), path)
+    return pixels, spec.get_int_attribute("Orientation", 1)
+
+
+def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
+    """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
+    with extra("raw"):
+        import OpenImageIO as oiio
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such picture file")
+    require_utf8(path)
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
+    spec = source.spec()
+    spec.attribute(_FORMAT, source.format_name())
+    _require_size(spec, path, max_pixels)
+    pixels = source.read_image(kind(spec))
+    error = source.geterror()  # also set where a decoder padded a truncated file
+    # a GIF is marked as animated only if its frames have a duration
+    moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
+    source.close()
+    if moves:
+        raise ValueError(f"{path}: is an animation; save a single frame")
+    if pixels is None or error:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(error)})")
+    return pixels, spec
+
+
+def require_utf8(path: Path) -> None:
+    """Refuse a name that the libraries cannot be given.
+
+    Raises:
+        OSError: if it is not UTF-8.
+    """
+    if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
+        raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
+
+
+def _floating() -> tuple[Any, ...]:
+    with extra("raw"):
+        import OpenImageIO as oiio
+
+    return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
+
+
+def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
+    """Refuse what would fill the memory before anything is decoded."""
+    pixels = spec.width * spec.height * spec.depth
+    if pixels > max_pixels or pixels * spec.nchannels > MAX_CHANNELS * max_pixels:
+        size = f"{spec.height} x {spec.width} pixels"
+        size += f" of {spec.nchannels} channels" if pixels <= max_pixels else ""
+        raise ValueError(f"{path}: declares {size}, above the limit of {max_pixels}; split it, or raise max_pixels")
+
+
+def _require_srgb(spec: Any, path: Path) -> None:
+    """Refuse what would need a profile, or a choice of channels, to become sRGB."""
+    stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
+    if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
+        raise ValueError(f"{path}: is {stored}; convert it to sRGB first")
+    names = tuple(spec.channelnames)
+    extra = names[1:] if len(names) < 3 else names[3:]
+    if extra not in ((), ("A",)):
+        raise ValueError(f"{path}: has channels {', '.join(names)}; expected grey or R, G, B, with optional alpha")
+
+
+def _round_to_8_bits(pixels: np.ndarray, path: Path, linear: bool = False) -> np.ndarray:
+    """Floating point in [0, 1] to the nearest 8-bit level, through the sRGB transfer where the values are linear."""
+    low, high = float(pixels.min()), float(pixels.max())
+    if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
+        raise ValueError(
+            f"{path}: has values from {low:.4g} to {high:.4g}, expected [0, 1]; scale or tone-map it first"
+        )
+    values = np.clip(pixels, 0, 1)
+    if linear:
+        values = encode_srgb(torch.from_numpy(values)).numpy()
+    return np.rint(values * 255).astype(np.uint8)
+
+
+def _first_line(message: str) -> str:
+    return message.strip().splitlines()[0] if message.strip() else "no reason given"
+
+
+_ISO = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")
+
+
+def read_exposure(path: str | Path) -> float:
+    """The exposure in stops, up to a constant of the scene.
+
+    Raises:
+        FileNotFoundError, OSError: if there is no such file, or it is not a picture.
+        ValueError: if its EXIF lacks exposure time, f-number or ISO.
+    """
+    with extra("raw"):
+        import OpenImageIO as oiio
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such picture file")
+    require_utf8(Path(path))
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {oiio.geterror().strip()})")
+    spec = source.spec()
+    source.close()
+    iso = next((value for name in _ISO if (value := spec.get_int_attribute(name, 0))), 0)
+    stated = {
+        "exposure time": spec.get_float_attribute("ExposureTime", 0.0),
+        "f-number": spec.get_float_attribute("FNumber", 0.0),
+        "ISO": float(iso),
+    }
+    if missing := [name for name, value in stated.items() if not 0 < value < math.inf]:
+        raise ValueError(f"{path}: its EXIF has no {' or '.join(missing)}; give the exposures with --ev")
+    seconds, f_number, speed = stated.values()
+    return math.log2(seconds * speed / (100.0 * f_number**2))
+
+
+_MODES = {"RGB": "RGB", "GRAY": "L"}
+
+
+def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
+    """Pixels uint8 ``(H, W, 3)`` in the space of ``profile`` as sRGB; the same pixels where that is sRGB by name.
+
+    A grey profile takes the first channel.
+
+    Raises:
+        ValueError: if the profile is damaged, or is neither of RGB nor of grey.
+    """
+    with extra("raw"):
+        from PIL import Image, ImageCms
+
+    try:
+        mode, transform = _transform(profile)
+    except (ImageCms.PyCMSError, OSError, KeyError) as error:
+        raise ValueError(f"{path}: its ICC profile cannot be used ({error}); convert the picture to sRGB") from error
+    if transform is None:
+        return pixels
+    stored = Image.fromarray(pixels if mode == "RGB" else np.ascontiguousarray(pixels[..., 0]), mode)
+    return np.array(ImageCms.applyTransform(stored, transform))
+
+
+@lru_cache(maxsize=8)
+def _transform(profile: bytes) -> tuple[str, Any]:
+    """The mode of the stored pixels, and the conversion; None for sRGB."""
+    from io import BytesIO
+
+    with extra("raw"):
+        from PIL import ImageCms
+
+    source = ImageCms.ImageCmsProfile(BytesIO(profile))
+    mode = _MODES[source.profile.xcolor_space.strip()]
+    if (source.profile.profile_description or "").startswith("sRGB"):
+        return mode, None
+    target = ImageCms.createProfile("sRGB")
+    intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
+    return mode, ImageCms.buildTransform(source, target, mode, "RGB", intent, flags)
+
+
+_HALF_WIDTH = 1
+"""Pillow's number of 4:2:2."""
+
+
+def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
+    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again.
+
+    Raises:
+        ValueError: if the picture is of another kind, or the quality out of range.
+
+    Example:
+        >>> picture = torch.full((3, 16, 16), 128, dtype=torch.uint8)
+        >>> bool((through_jpeg(picture, 90) == picture).all())
+        True
+    """
+    with extra("raw"):
+        from PIL import Image
+
+    if srgb.ndim != 3 or srgb.shape[0] != 3 or srgb.dtype != torch.uint8:
+        raise ValueError(f"a picture must be uint8 (3, H, W), got {srgb.dtype} {tuple(srgb.shape)}")
+    if not 1 <= quality <= 100:
+        raise ValueError(f"quality must be 1 to 100, got {quality}")
+    stored = BytesIO()
+    picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
+    picture.save(stored, "JPEG", quality=quality, subsampling=_HALF_WIDTH)
+    return torch.from_numpy(np.array(Image.open(stored))).permute(2, 0, 1).contiguous()

@@ -1,0 +1,147 @@
+"""How an ISP is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal
+
+from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
+from rawaug.isp.stages import stage_class
+from rawaug.registry import require_between
+
+MOST = 2**31
+"""Of steps and pixels."""
+
+_SWITCH = ("auto", "on", "off")
+
+
+@dataclass(frozen=True)
+class EncoderTraining:
+    """How encoders are trained, and whether they help is found out.
+
+    Args:
+        steps: of Adam.
+        frames: of a step.
+        pixels: of each of them.
+        learning_rate: initial, with cosine decay to 0.
+        fewest_frames: from which on "auto" trains encoders.
+        folds: parts of the frames that are left out in turn, to compare encoders with constants on them.
+    """
+
+    steps: int = 200
+    frames: int = 4
+    pixels: int = 1024
+    learning_rate: float = 1e-3
+    fewest_frames: int = 12
+    folds: int = 4
+
+    def __post_init__(self) -> None:
+        for key, least in {"steps": 0, "frames": 1, "pixels": 1, "fewest_frames": 2, "folds": 2}.items():
+            require_between(f"encoder_training.{key}", getattr(self, key), least, MOST)
+        require_between("encoder_training.learning_rate", self.learning_rate, 0.0, float(MOST))
+
+
+_LATER = {
+    "curve_steps": None,
+    "tone": "learned",
+    "intermediate": 0.1,
+    "consistency": 1.0,
+    "prior_steps": 400,
+    "mse_floor": 1e-5,
+    "encoder_training": asdict(EncoderTraining()),
+}
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How an ISP is fitted.
+
+    Args:
+        size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
+            of 0.52 M, without them about 5,000 in either case.
+        atoms: largest number of atoms in each dictionary; more frames than that are clustered.
+        reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
+            digital gain its fourth root) to either side of the frames' mean, so that the hull holds other light as
+            well; 1 adds none.
+        steps: refinement steps of each direction.
+        pixels: random pixels kept of each frame.
+        batch: pixels of each frame in a step.
+        learning_rate: initial learning rate of Adam, with cosine decay to 0.
+        shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
+            at least half of the squared error.
+        tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
+            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
+            as-shot gains; with one frame, "learned".
+        attention: fit the attention mask as well.
+        encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
+            and keeps them if they beat the constants on held-out frames.
+        encoder_training: how that is done, as an :class:`EncoderTraining` or its settings by name.
+        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
+            else 0. Kept only if held-out frames improve.
+        curve_steps: steps of the first stage, which fits the tone curve; None is 150.
+        prior_steps: steps of the descent on the constant weights.
+        mse_floor: added to a frame's mean squared error under the logarithm: frames beyond 50 dB count no more.
+        intermediate: weight of the loss on the images between the stages, beside 1 of that on sRGB; 0 leaves it out.
+        consistency: factor of the losses between the weights that reverse and forward encoders choose; 0 leaves them
+            out.
+        noisy: fit on the captured noisy RAW of the pairs.
+        seed: random seed of the drawn pixels and initial networks.
+        isp: further keys of :class:`rawaug.isp.config.ISPConfig`, such as ``encoder_widths``.
+    """
+
+    size: Literal["default", "small"] = "default"
+    atoms: int = 16
+    reach: float = 1.6
+    steps: int = 200
+    pixels: int = 32768
+    batch: int = 4096
+    learning_rate: float = 2e-3
+    shading: Literal["auto", "on", "off"] = "auto"
+    tone: Literal["auto", "learned", "curve"] = "learned"
+    attention: bool = False
+    encoders: Literal["auto", "on", "off"] = "auto"
+    encoder_training: EncoderTraining = field(default_factory=EncoderTraining)
+    joint_steps: int | None = None
+    curve_steps: int | None = None
+    prior_steps: int = 400
+    mse_floor: float = 1e-5
+    intermediate: float = 0.1
+    consistency: float = 1.0
+    noisy: bool = False
+    seed: int = 0
+    isp: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def most_atoms(self) -> int:
+        """``atoms``, as far as the size allows."""
+        return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
+
+    def key(self) -> dict[str, Any]:
+        """What a fit depends on; keys that came later are left out at their default: older fits stay what they are."""
+        return {key: value for key, value in asdict(self).items() if key not in _LATER or value != _LATER[key]}
+
+    def smoke(self) -> FitConfig:
+        """The same configuration, reduced to a fit of a second."""
+        few = replace(self.encoder_training, steps=4)
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.encoder_training, Mapping):
+            object.__setattr__(self, "encoder_training", EncoderTraining(**self.encoder_training))
+        for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():
+            if getattr(self, key) is not None:
+                require_between(key, getattr(self, key), least, MOST)
+        require_between("seed", self.seed, -(2**63), 2**63 - 1)
+        require_between("reach", self.reach, 1.0, float(MOST))
+        for key in ("learning_rate", "mse_floor", "intermediate", "consistency"):
+            require_between(key, getattr(self, key), 0.0, float(MOST))
+        for key, values in {"size": ("default", "small"), **dict.fromkeys(("shading", "encoders"), _SWITCH)}.items():
+            if getattr(self, key) not in values:
+                raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
+        if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
+            raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
+        if self.curve_steps is not None and self.curve_steps < 0:
+            raise ValueError(f"curve_steps must be at least 0, got {self.curve_steps}")
+        if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
+            raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")

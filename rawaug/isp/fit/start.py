@@ -1,0 +1,237 @@
+r"""Every frame's own colour: ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised.
+
+What a camera's frames have in common shows once the as-shot white balance is taken out: ``M_f`` divided by its row
+sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the metadata are exact. Frames of one camera are drawn
+together by ``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure) on both: a deviation far beyond tau, such as
+metadata that lie, costs a constant.
+
+From the frames' colours to the dictionaries and their constant weights.
+
+The constants minimise ``sum_f log(E_f(w) + eps)``, because the score averages decibels. ``E_f`` is the squared error
+beyond that of the frame's best gains, which is noise where the frames are noisy. It is quadratic in the inverse gains
+``u``: with second moments ``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from rawaug.isp import stages
+from rawaug.isp.config import ISPParams
+from rawaug.isp.dictionary import l1_normalised, log_light
+from rawaug.isp.fit.config import FitConfig
+from rawaug.isp.fit.samples import PixelSamples, Shot
+from rawaug.isp.model import DictionaryISP
+from rawaug.seeding import derived_seed
+
+TIE = 1e-1
+"""Weight of the deviations; the squared errors of a good fit are near 1e-6."""
+TIE_RANGE = 0.05
+"""tau: deviations of frames that belong together are a few hundredths at most."""
+FEWEST_PIXELS = 32
+
+
+@dataclass
+class FrameColour:
+    """Per-frame colour, refined together with the global parameters."""
+
+    log_scale: Tensor  # (F, 3), log of 1 / gains
+    matrix: Tensor  # (F, 3, 3), rows l1-normalised on use
+
+    @classmethod
+    def from_product(cls, product: Tensor) -> FrameColour:
+        """Split ``M`` ``(F, 3, 3)``."""
+        return cls(product.abs().sum(2).log(), l1_normalised(product))
+
+    def product(self) -> Tensor:
+        """``M`` ``(F, 3, 3)``."""
+        return self.log_scale.exp()[:, :, None] * l1_normalised(self.matrix)
+
+    def params(self) -> ISPParams:
+        """As the ISP takes them (without weights)."""
+        none = self.log_scale.new_empty(len(self.log_scale), 0)
+        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale), none)
+
+    def pick(self, frames: Tensor | slice) -> FrameColour:
+        """The colours of some frames."""
+        return FrameColour(self.log_scale[frames], self.matrix[frames])
+
+    def neutral(self, balance: Tensor) -> tuple[Tensor, Tensor]:
+        """White-keeping matrices ``(F, 3, 3)`` and ``log k`` ``(F, 3)``, given the as-shot balance ``(F, 3)``."""
+        product = self.product()
+        rows = product.sum(2)
+        return product / rows[:, :, None], rows.clamp_min(1e-3).log() + balance.log()
+
+
+class Tie:
+    """What draws the frames of one camera together.
+
+    Args:
+        shots: the frames, in order.
+    """
+
+    def __init__(self, shots: Sequence[Shot]) -> None:
+        cameras = [shot.camera for shot in shots]
+        self.groups = [torch.tensor([c == camera for c in cameras]) for camera in dict.fromkeys(cameras)]
+        self.balance = torch.tensor([shot.white_balance for shot in shots])
+
+    def __call__(self, colour: FrameColour) -> Tensor:
+        matrix, neutral = colour.neutral(self.balance)
+        values = torch.cat([matrix.flatten(1), neutral], dim=1)
+        centre = torch.empty_like(values)
+        for group in self.groups:
+            centre[group] = values.detach()[group].quantile(0.5, dim=0)
+        square = (values - centre) ** 2
+        bounded: Tensor = TIE_RANGE**2 * square / (TIE_RANGE**2 + square)
+        return TIE * bounded.sum(1).mean()
+
+
+@torch.no_grad()
+def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
+    """``M_f`` ``(F, 3, 3)`` that takes ``linear`` ``(F, 3, 1, P)`` to the readings, from the normal equations.
+
+    Raises:
+        ValueError: if a frame has too few unclipped pixels.
+    """
+    x = linear[:, :, 0].double()
+    y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
+    if (known.sum(2) < FEWEST_PIXELS).any():
+        frame = int((known.sum(2) < FEWEST_PIXELS).any(1).nonzero()[0])
+        raise ValueError(f"frame {frame}: too few unclipped pixels to fit; use a better exposed frame or more pixels")
+    moments = torch.einsum("fip,fjp,fcp->fcij", x, x, known)
+    cross = torch.einsum("fip,fcp,fcp->fci", x, y, known)
+    ridge = 1e-9 * moments.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).double()
+    return torch.linalg.solve(moments + ridge, cross).float()
+
+
+@torch.no_grad()
+def fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean ``(2,)`` and precision ``(2, 2)`` of the Gaussian that best explains log(reading / prediction).
+
+    A quadratic in the place, with one offset a frame and channel that takes up what the mask does to the matrices.
+    """
+    predicted = stages.correct_colour(linear, product)
+    bright = (samples.known * (samples.target > 0.02) * (predicted > 0.02))[:, :, 0].double()
+    ratio = (samples.target.clamp_min(1e-3) / predicted.clamp_min(1e-3)).log()[:, :, 0].double()
+    y, x = samples.place[:, :, 0].double().unbind(1)
+    terms = torch.stack([y, x, y * y, y * x, x * x], dim=1)  # (F, 5, P)
+    count = bright.sum(2, keepdim=True).clamp_min(1.0)
+    ratio = ratio - (ratio * bright).sum(2, keepdim=True) / count
+    means = torch.einsum("fkp,fcp->fkc", terms, bright) / count.transpose(1, 2)
+    centred = (terms[:, :, None] - means[..., None]) * bright[:, None]  # (F, 5, 3, P)
+    normal = torch.einsum("fkcp,flcp->kl", centred, centred) + 1e-6 * torch.eye(5).double()
+    c = torch.linalg.solve(normal, torch.einsum("fkcp,fcp->k", centred, ratio))
+    precision = -torch.stack([2 * c[2], c[3], c[3], 2 * c[4]]).reshape(2, 2)
+    mean = torch.linalg.lstsq(precision, c[:2, None]).solution[:, 0]  # double to the end: sums vary in their last bit
+    return mean.clamp(-0.5, 0.5).float(), precision.float()
+
+
+SPREADS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, torch.inf)
+SPREAD_EPS = 1e-6
+"""Under the logarithm, as for the MSE: a frame that nothing predicts must not decide alone."""
+KNEES = (0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+REACH_ATOMS = 8
+
+
+@torch.no_grad()
+def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[Shot], config: FitConfig) -> None:
+    """The frames' matrices and gains become the atoms; clusters of them where there are more frames than atoms."""
+    balance = torch.tensor([shot.white_balance for shot in shots])
+    params = colour.params()
+    light, neutral = log_light(balance), -colour.neutral(balance)[1]
+    count = isp.config.colour_atoms
+    groups = _groups(torch.cat([params.matrix.flatten(1), params.gains.log()], dim=1), count, config.seed)
+    isp.colour.matrices.copy_((groups @ params.matrix.flatten(1)).unflatten(1, (3, 3)))
+    isp.colour.light.copy_(groups @ light)
+    isp.colour.neutral.copy_(groups @ neutral)
+    isp.colour.spread.fill_(_spread(colour, balance))
+    red, green, blue = (groups @ params.gains.log()).unbind(1)
+    frames = torch.stack([green, red - green, blue - green], dim=1)
+    more = reach_atoms(isp.config.gain_atoms - count, config.reach)
+    isp.gain.log_gains.copy_(torch.cat([frames, frames.mean(0) + more]))
+
+
+def reach_atoms(count: int, reach: float) -> Tensor:
+    """``(count, 3)`` log offsets (digital, red, blue) from the frames' mean: corners of a box, tetrahedron first."""
+    corners = sorted(product((-1.0, 1.0), repeat=3), key=lambda corner: corner[0] * corner[1] * corner[2])
+    size = torch.tensor([0.25, 1.0, 1.0]) * torch.tensor(reach).log()
+    return torch.tensor(corners[:count]).reshape(-1, 3) * size
+
+
+def _groups(points: Tensor, count: int, seed: int) -> Tensor:
+    """``(count, F)`` averaging matrix: of the points themselves if there are as many, else of k-means clusters.
+
+    An empty cluster is the mean of all points.
+    """
+    if len(points) == count:
+        return torch.eye(count)
+    from scipy.cluster.vq import kmeans2
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an empty cluster, which frames that are all alike leave
+        _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derived_seed(seed, "atoms") % 2**32)
+    member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
+    used = member.sum(1, keepdim=True)
+    return torch.where(used > 0, member / used.clamp_min(1.0), torch.full_like(member, 1.0 / len(points)))
+
+
+def _spread(colour: FrameColour, balance: Tensor) -> float:
+    """The kernel width that best predicts each frame's colour from the others' in similar light."""
+    if len(balance) < 3:
+        return torch.inf
+    matrix, neutral = colour.neutral(balance)
+    values = torch.cat([matrix.flatten(1), neutral], dim=1)
+    distance = torch.cdist(log_light(balance), log_light(balance)) ** 2
+    distance.fill_diagonal_(torch.inf)
+    errors: dict[float, float] = {}
+    for width in SPREADS:
+        logits = -distance / (2.0 * width**2) if width < torch.inf else torch.where(distance.isinf(), -torch.inf, 0.0)
+        square = ((values - logits.softmax(1) @ values) ** 2).sum(1)
+        errors[width] = float((square + SPREAD_EPS).log().sum())
+    return min(errors, key=lambda width: errors[width])
+
+
+@torch.no_grad()
+def set_knee(isp: DictionaryISP, colour: FrameColour, samples: PixelSamples) -> None:
+    """Where highlights begin to be spared: the knee under which all pixels, clipped ones too, come out best."""
+    errors: dict[float, float] = {}
+    for knee in KNEES:
+        isp.configure(knee=knee)
+        predicted = isp.reverse_pixels(samples.srgb, colour.params(), samples.place).clamp(0.0, 1.0)
+        square = (predicted - samples.target) ** 2 * samples.site
+        errors[knee] = float((square.sum((1, 2, 3)) / samples.site.sum((1, 2, 3)) + 1e-6).log().sum())
+    isp.configure(knee=min(errors, key=lambda knee: errors[knee]))
+
+
+def set_priors(isp: DictionaryISP, samples: PixelSamples, config: FitConfig) -> None:
+    """The constant weights: all colour atoms alike, and the gains that serve the frames best."""
+    colour_weights = torch.full((isp.config.colour_atoms,), 1.0 / isp.config.colour_atoms)
+    with torch.no_grad():
+        plain = isp.params_from_weights(colour_weights[None], torch.ones(1, isp.config.gain_atoms))
+        plain = plain._replace(gains=torch.ones(1, 3))
+        x = isp.reverse_pixels(samples.srgb, plain, samples.place)
+        a, b = ((samples.known * m).mean((2, 3)) for m in (x * x, x * samples.target))
+    inverse = 1.0 / isp.gain.channel_gains().detach()
+    weights = best_constants(a, b, inverse, config.prior_steps, config.mse_floor)
+    for encoders in (isp.reverse_encoders, isp.forward_encoders):
+        encoders.colour.set_prior(colour_weights)
+        encoders.gain.set_prior(weights)
+
+
+def best_constants(a: Tensor, b: Tensor, inverse_atoms: Tensor, steps: int = 400, mse_floor: float = 1e-5) -> Tensor:
+    """Weights ``(M,)`` of atoms of inverse gains ``(M, 3)`` for frames with moments ``a, b`` ``(F, 3)``."""
+    logits = torch.zeros(len(inverse_atoms), requires_grad=True)
+    optimiser = torch.optim.Adam([logits], lr=0.05)
+    for _ in range(steps):
+        u = logits.softmax(0) @ inverse_atoms
+        loss = (((u * a - b) ** 2 / a.clamp_min(1e-9)).sum(1) + mse_floor).log().sum()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    return logits.detach().softmax(0)

@@ -1,0 +1,496 @@
+r"""Noise of a camera by name: darktable's profiles, 374 models by ISO.
+
+.. math:: \operatorname{var}(y) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
+
+of black-subtracted RAW, white 1. The ISO is drawn log-uniformly between the ends of a camera's profile, and both
+variances are interpolated in their logarithms against that of the ISO. Two things about the profiles:
+
+- The red and blue figures differ from the green ones as if they contained a white balance (a gain w multiplies a by w
+  and b by w squared), so the green ones are taken for all channels: photons and electronics are the same behind every
+  filter.
+- darktable measures after demosaicking and on fine details, where noise has been averaged. For four cameras that ELD
+  (Wei et al., CVPR 2020) measured on the mosaic the profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to
+  16 in read variance; all are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`.
+  The median of shot_var at ISO 100 is then 2.8e-5, a full well of 36,000 electrons.
+
+Rows whose green variance is not positive are left out, and counted in :attr:`Profiles.rows_left_out`.
+
+The noise law of a camera over ISO, measured on its own files.
+
+.. math:: \log \mathrm{shot\_var},\ \log \mathrm{read\_var} \text{ are linear in } \log \mathrm{ISO}
+
+between the ISO values that were measured, as in SIDD's tables (:mod:`rawaug.noise.levels`): a sensor's gain grows
+with the
+ISO, in steps where it switches its amplifier, so that a table follows it better than one line. Outside the measured
+range an ISO is refused. Files without an ISO give one level, which holds for every picture.
+
+Noise by name: the published presets and the measured cameras.
+
+===================================================================  ===========================  ============
+names                                                                what                         ``iso=``
+===================================================================  ===========================  ============
+``upi`` ``cycleisp_dnd`` ``cycleisp_sidd`` ``rawir``                 published training presets   no
+``iPhone 7`` ``Google Pixel`` ``Samsung Galaxy S6 Edge``
+``Motorola Nexus 6`` ``LG G4``                                       SIDD's phones                as tabulated
+``pmrid``                                                            OPPO Reno 10x                100 to 6400
+``CanonEOS5D4`` ``CanonEOS700D`` ``CanonEOS70D`` ``NikonD850``
+``SonyA7S2``                                                         ELD's cameras                100 to 6400
+``Nikon D750`` ``Sony ILCE-7M3`` and 367 more                        darktable's profiles         as measured
+``any camera``                                                       all profiles, each alike     as measured
+===================================================================  ===========================  ============
+
+Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": ..., "settings": {...}}`` gives settings:
+``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
+no name: ``{"pair_psnr": 41.18}``.
+
+Noise levels scaled so that noisy/clean pairs have a stated mean PSNR.
+
+A picture of mean signal m has noise of mean square ``shot_var m + read_var``, before the clip at white. A factor s on
+both variances shifts every pair's PSNR by ``-10 log10(s)``, so that the factor follows without a search:
+
+    s = 10^((P_0 - P) / 10),        P_0 = mean(-10 log10(shot_var m + read_var))
+
+over draws of the law and the pictures' m. Conde et al., AAAI 2022, state P = 41.18 dB for their training pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from importlib import resources
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug.noise.levels import (
+    EldLevels,
+    FixedLevels,
+    Iso,
+    MixedLevels,
+    NoiseLevels,
+    PmridLevels,
+    Preset,
+    SiddLevels,
+    interpolated,
+    iso_limits,
+    log_uniform,
+    published,
+)
+from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
+from rawaug.registry import NOISE, Spec, checked_settings, name_and_settings, nearest, spelled
+from rawaug.seeding import keyed_generator
+
+ANY_CAMERA = "any camera"
+SHOT_ON_MOSAIC = 8.6
+READ_ON_MOSAIC = 6.2
+
+
+class Profiles(NamedTuple):
+    """The usable rows of all cameras.
+
+    Args:
+        names: maker and model, ``N`` of them.
+        table: ``(3, N, R)`` float64, logarithms of ISO, shot_var and read_var, ISO increasing; behind a camera's
+            last row the ISO is infinite and the logarithms of the variances are 0.
+        rows: ``(N,)`` number of each camera's rows.
+        rows_left_out: rows of the profiles with a variance that is not positive.
+        cameras_left_out: cameras with no other row.
+    """
+
+    names: tuple[str, ...]
+    table: Tensor
+    rows: Tensor
+    rows_left_out: int
+    cameras_left_out: tuple[str, ...]
+
+    def limits(self) -> Tensor:
+        """Logarithms of the lowest and highest ISO of each camera, ``(N, 2)``."""
+        iso = self.table[0]
+        return torch.stack([iso[:, 0], iso.gather(1, self.rows[:, None] - 1)[:, 0]], dim=1)
+
+
+@cache
+def published_profiles() -> Profiles:
+    """The package's ``profiles.tsv``. Where a camera has an ISO twice the geometric mean is taken."""
+    cameras: dict[str, dict[float, list[tuple[float, float]]]] = {}
+    left_out = 0
+    text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
+    for line in text.splitlines()[2:]:
+        maker, model, iso, *variances = line.split("\t")
+        rows = cameras.setdefault(f"{maker} {model}", defaultdict(list))
+        shot_var, read_var = float(variances[1]) * SHOT_ON_MOSAIC, float(variances[4]) * READ_ON_MOSAIC
+        if shot_var > 0 and read_var > 0:
+            rows[math.log(float(iso))].append((math.log(shot_var), math.log(read_var)))
+        else:
+            left_out += 1
+    names = tuple(name for name, rows in cameras.items() if rows)
+    length = torch.tensor([len(cameras[name]) for name in names])
+    table = torch.zeros(3, len(names), int(length.max()), dtype=torch.float64)
+    table[0] = math.inf
+    for camera, name in enumerate(names):
+        for row, (log_iso, levels) in enumerate(sorted(cameras[name].items())):
+            means = torch.tensor(levels, dtype=torch.float64).mean(dim=0)
+            table[:, camera, row] = torch.tensor([log_iso, *means.tolist()], dtype=torch.float64)
+    return Profiles(names, table, length, left_out, tuple(name for name, rows in cameras.items() if not rows))
+
+
+def profile_names() -> list[str]:
+    """The cameras that have a profile."""
+    return list(published_profiles().names)
+
+
+class ProfileLevels:
+    """Levels of one camera, or of any, each weighted alike.
+
+    Args:
+        camera: maker and model, whatever the case of the letters, or ``"any camera"``.
+        iso: one ISO, limits, or None for the whole profile. Of ``"any camera"``, whose profiles end at different ISOs,
+            every camera keeps its share of the limits; one without a share is not drawn.
+
+    Attributes:
+        cameras: indices into :func:`published_profiles` of those that are drawn, ``(M,)``.
+        limits: logarithms of their lowest and highest ISO, ``(M, 2)``.
+
+    Raises:
+        ValueError: if the camera is unknown, or the ISO outside what was measured.
+
+    Example:
+        >>> shot_var, read_var = ProfileLevels("Sony ILCE-7M3", iso=800).sample(1, torch.Generator())
+        >>> round(shot_var.item(), 7)
+        6.72e-05
+    """
+
+    def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
+        profiles = published_profiles()
+        limits = profiles.limits()
+        if camera.casefold() == ANY_CAMERA:
+            measured = (round(math.exp(limits.min())), round(math.exp(limits.max())))
+            wanted = torch.tensor(iso_limits(ANY_CAMERA, iso, measured), dtype=torch.float64).log()
+            limits = torch.stack([limits[:, 0].clamp_min(wanted[0]), limits[:, 1].clamp_max(wanted[1])], dim=1)
+            self.cameras = (limits[:, 0] <= limits[:, 1] + _ROUNDING).nonzero()[:, 0]
+        else:
+            index = profiles.names.index(spelled(camera, profiles.names))
+            low, high = (round(value) for value in limits[index].exp().tolist())
+            limits[index] = torch.tensor(iso_limits(profiles.names[index], iso, (low, high)), dtype=torch.float64).log()
+            self.cameras = torch.tensor([index])
+        if not len(self.cameras):
+            raise ValueError(f"no camera has a profile within ISO {iso}; widen the range")
+        self.limits = limits[self.cameras]
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        device = generator.device
+        drawn = torch.randint(len(self.cameras), (batch,), generator=generator, device=device)
+        low, high = self.limits.to(device)[drawn].unbind(1)
+        at = low + (high - low) * torch.rand(batch, generator=generator, device=device, dtype=torch.float64)
+        iso, shot, read = published_profiles().table.to(device)[:, self.cameras.to(device)[drawn]]
+        right = torch.searchsorted(iso, at[:, None]).clamp(1, iso.shape[1] - 1)
+        (x0, x1), (s0, s1), (r0, r1) = ((y.gather(1, right - 1), y.gather(1, right)) for y in (iso, shot, read))
+        t = ((at[:, None] - x0) / (x1 - x0)).clamp(0.0, 1.0)
+        return torch.exp(torch.lerp(s0, s1, t))[:, 0].float(), torch.exp(torch.lerp(r0, r1, t))[:, 0].float()
+
+
+_ROUNDING = 1e-9
+"""Of logarithms that are the same ISO."""
+
+
+_LEAST = 1e-12
+"""Stands for a variance of 0, which is below what can be measured, in the logarithms."""
+
+
+class IsoLevel(NamedTuple):
+    """What was measured at one ISO.
+
+    Args:
+        iso: None if the files have none.
+        shot_var, read_var: variances, white = 1.
+        r2: of the line through the measured points; None if unknown.
+        frames: how many were measured; None if unknown.
+    """
+
+    iso: float | None
+    shot_var: float
+    read_var: float
+    r2: float | None = None
+    frames: int | None = None
+
+
+class MeasuredLevels:
+    """The levels of one camera, at the measured ISO values and between them.
+
+    Args:
+        levels: one for each ISO, or a single one without.
+        camera: make and model, for messages.
+
+    Raises:
+        ValueError: if there is no level, two have the same ISO, or one of several has none.
+
+    Example:
+        >>> law = MeasuredLevels([IsoLevel(100, 1e-4, 1e-7), IsoLevel(400, 4e-4, 1.6e-6)], "Maker Model")
+        >>> [f"{level:.2g}" for level in law.at(200)]
+        ['0.0002', '4e-07']
+    """
+
+    def __init__(self, levels: Sequence[IsoLevel], camera: str = "unknown") -> None:
+        values = [level.iso for level in levels]
+        if not values or len(set(values)) < len(values) or (None in values and len(values) > 1):
+            raise ValueError(f"a noise law takes levels of different ISO values, or one without; got {values}")
+        self.levels = sorted(levels, key=lambda level: level.iso or 0.0)
+        self.camera = camera
+        rows = [(iso or 1.0, max(shot, _LEAST), max(read, _LEAST)) for iso, shot, read, *_ in self.levels]
+        self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Lowest and highest ISO that was measured; None where the files have no ISO."""
+        low, high = self.levels[0].iso, self.levels[-1].iso
+        return None if low is None or high is None else (low, high)
+
+    def at(self, iso: float | None) -> tuple[float, float]:
+        """(shot_var, read_var) at an ISO; any ISO, or none, where only one level without was measured.
+
+        Raises:
+            ValueError: if the ISO is unknown or outside the measured range.
+        """
+        if self.limits is None or (iso is None and len(self.levels) == 1):
+            return self.levels[0].shot_var, self.levels[0].read_var
+        if iso is None:
+            raise ValueError(f"the noise of {self.camera} depends on the ISO, which the file does not say")
+        low, _ = iso_limits(self.camera, iso, self.limits)
+        known = next((level for level in self.levels if level.iso == iso), None)
+        if known is not None:
+            return known.shot_var, known.read_var
+        shot_var, read_var = interpolated(self.table, torch.tensor([low]))
+        return float(shot_var), float(read_var)
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Levels at ISO values that are log-uniform over the measured range."""
+        device = generator.device
+        if self.limits is None or len(self.levels) == 1:
+            shot_var, read_var = self.at(None)
+            return torch.full((batch,), shot_var, device=device), torch.full((batch,), read_var, device=device)
+        return interpolated(self.table.to(device), log_uniform(self.limits, batch, generator))
+
+    def spec(self) -> dict[str, Any]:
+        """The noise by name: what files of weights hold, and :func:`rawaug.noise.noise_model` reads."""
+        rows = [{key: value for key, value in level._asdict().items() if value is not None} for level in self.levels]
+        return {"name": "MeasuredNoise", "settings": {"camera": self.camera, "levels": rows}}
+
+
+def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
+    """The law that the entry ``noise`` of an ISP's file holds.
+
+    Raises:
+        ValueError: if it is not such an entry.
+    """
+    if "shot_var" in stored:  # of version 0.1: one level, without its ISO
+        return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
+    if stored.get("name") != "MeasuredNoise":
+        raise ValueError(f"expected the noise law of a camera, got {dict(stored)}; fit the ISP again")
+    return MeasuredNoise(**stored["settings"]).law
+
+
+@NOISE.register("MeasuredNoise")
+class MeasuredNoise(ShotReadNoise):
+    """Shot and read noise of a camera measured at several ISO values; each picture draws an ISO.
+
+    Args:
+        levels: for each ISO ``{iso, shot_var, read_var}``, besides ``r2`` and ``frames`` if known.
+        camera: make and model.
+
+    Raises:
+        ValueError: see :class:`MeasuredLevels`; or if a level has an unknown key.
+    """
+
+    def __init__(self, levels: Sequence[Mapping[str, Any]], camera: str = "unknown") -> None:
+        for row in levels:
+            if not {"shot_var", "read_var"} <= row.keys() <= set(IsoLevel._fields):
+                raise ValueError(f"MeasuredNoise: a level is {{iso, shot_var, read_var}}, got {dict(row)}")
+        self.law = MeasuredLevels([IsoLevel(**{"iso": None, **row}) for row in levels], camera)
+        super().__init__(self.law)
+
+
+NoiseSpec = Spec | Sequence[float] | Sequence[str]
+"""A name with or without settings, (shot_var, read_var), or several names of which each picture draws one."""
+
+
+@cache
+def _by_iso() -> dict[str, Callable[[Iso], NoiseLevels]]:
+    """The cameras that were measured one by one."""
+    data = published()
+    sidd = {name: partial(SiddLevels, name) for name in data["sidd_noise_level_function"]["cameras"]}
+    return {**sidd, "pmrid": PmridLevels, **{name: partial(EldLevels, name) for name in data["eld"]["cameras"]}}
+
+
+def camera_names() -> list[str]:
+    """The cameras that were measured one by one: names that take ``iso=``, as those of the profiles do."""
+    return list(_by_iso())
+
+
+def noise_names() -> list[str]:
+    """Every name that :func:`noise_model` knows."""
+    return [*NOISE, *published()["presets"], *camera_names(), ANY_CAMERA, *profile_names()]
+
+
+def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
+    """The levels of a name, of a mixture of names, or the fixed levels (shot_var, read_var).
+
+    Raises:
+        ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
+    """
+    if isinstance(spec, str):
+        return _of_name(spec, iso)
+    if spec and all(isinstance(name, str) for name in spec):
+        return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
+    _require_no_iso(spec, iso)
+    if not isinstance(spec, Sequence) or len(spec) != 2:
+        raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
+    return FixedLevels(*(float(value) for value in spec))
+
+
+def _of_name(name: str, iso: Iso) -> NoiseLevels:
+    if name in _by_iso():
+        return _by_iso()[name](iso)
+    if name in published()["presets"]:
+        _require_no_iso(name, iso)
+        return Preset(name)
+    return _of_profile(name, iso)
+
+
+def _require_no_iso(spec: str | Sequence[float] | Sequence[str], iso: Iso) -> None:
+    if iso is not None:
+        raise ValueError(
+            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
+        )
+
+
+def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
+    if spec.casefold() != ANY_CAMERA:
+        try:
+            spelled(spec, profile_names())
+        except ValueError as unknown:
+            short = [*published()["presets"], *camera_names(), *NOISE]
+            listed = ", ".join(short)
+            raise ValueError(
+                f"noise {spec!r} is unknown: {unknown}; use one of {listed}, {ANY_CAMERA!r}, maker and model of a "
+                f"camera, or (shot_var, read_var){nearest(spec, short)}"
+            ) from None
+    return ProfileLevels(spec, iso)
+
+
+def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool = False) -> NoiseModel:
+    """The noise model of a name or of (shot_var, read_var); a model is returned as it is.
+
+    Args:
+        spec: one of :func:`noise_names`, with settings as ``{"name": ..., "settings": {...}}``, a list of names (each
+            picture draws one), a pair of variances on the scale white = 1, or a :class:`NoiseModel`.
+        iso: of a camera: one ISO, limits, or None for its whole measured range.
+        poisson: exact photon statistics instead of the Gaussian.
+
+    Raises:
+        ValueError: if a name or setting is unknown, ``iso`` does not fit it, or options are given beside a model.
+
+    Example:
+        >>> import torch
+        >>> params = noise_model("Google Pixel", iso=800).sample(1, torch.Generator().manual_seed(0))
+        >>> round(params["shot_var"].item(), 6)
+        0.001764
+        >>> len(noise_model({"name": "SensorNoise", "settings": {"levels": "upi", "row_var": 1e-6}}).models)
+        2
+    """
+    if isinstance(spec, Mapping) and "pair_psnr" in spec:
+        spec = {"name": "CalibratedNoise", "settings": dict(spec)}
+    if isinstance(spec, (str, Mapping)):
+        name, settings = name_and_settings(spec)
+        if name not in NOISE:
+            noise_levels(name)  # an unknown name is reported before its settings
+            options = checked_settings(f"noise {name!r}", partial(_shot_read, name), settings)
+            return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
+        model: NoiseModel = NOISE.make(spec)
+    elif isinstance(spec, NoiseModel):
+        model = spec
+    else:
+        return _shot_read(spec, iso, poisson)
+    if iso is not None or poisson:
+        raise ValueError("iso and poisson apply to noise given by name, not to a noise model")
+    return model
+
+
+def _shot_read(
+    spec: str | Sequence[float] | Sequence[str], iso: Iso = None, poisson: bool = False
+) -> PoissonGaussianNoise | ShotReadNoise:
+    levels = noise_levels(spec, iso=iso)
+    return PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)
+
+
+_DRAWS = 2**14
+
+TYPICAL_SIGNAL = 0.06
+"""Geometric mean of the mean signals of photographs that the ISP ``universal`` made RAW."""
+
+
+class ScaledLevels:
+    """The levels of a law, both variances times a factor.
+
+    Example:
+        >>> from rawaug.noise import FixedLevels
+        >>> shot_var, read_var = ScaledLevels(FixedLevels(1e-3, 1e-5), 0.5).sample(1, torch.Generator())
+        >>> round(shot_var.item(), 6)
+        0.0005
+    """
+
+    def __init__(self, law: NoiseLevels, factor: float) -> None:
+        self.law, self.factor = law, factor
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        shot_var, read_var = self.law.sample(batch, generator)
+        return shot_var * self.factor, read_var * self.factor
+
+
+def expected_pair_psnr(law: NoiseLevels, signal: Sequence[float]) -> float:
+    """P_0: mean PSNR in dB of pairs whose clean pictures have these mean signals; the same at every call."""
+    shot_var, read_var = law.sample(_DRAWS, keyed_generator(0, "pair_psnr"))
+    square = torch.outer(torch.tensor(signal, dtype=torch.float64), shot_var.double()) + read_var.double()
+    return -10.0 * float(square.log10().mean())
+
+
+@NOISE.register("CalibratedNoise")
+class CalibratedNoise(ShotReadNoise):
+    """Shot and read noise at a stated mean PSNR of the pairs; the ratio of read to shot noise is that of the law.
+
+    In recipes ``noise: {pair_psnr: 41.18}``.
+
+    Args:
+        pair_psnr: in dB, over all pairs; a single one scatters as the law and the pictures do.
+        signal: mean signal of the clean RAW, a number or one for each of some pictures; by default that of photographs
+            made RAW by ``universal``.
+        levels: the law that is scaled, as :func:`rawaug.noise.noise_levels` knows it.
+
+    Raises:
+        ValueError: if the PSNR is not finite, a signal is not in (0, 1], or the law has no noise.
+
+    Example:
+        >>> round(CalibratedNoise(41.18, 0.1, (1e-3, 0.0)).levels.factor, 4)
+        0.7621
+    """
+
+    levels: ScaledLevels
+
+    def __init__(
+        self,
+        pair_psnr: float,
+        signal: float | Sequence[float] = TYPICAL_SIGNAL,
+        levels: str | Sequence[float] | Sequence[str] = "cycleisp_sidd",
+    ) -> None:
+        signals = list(signal) if isinstance(signal, Sequence) else [signal]
+        if not math.isfinite(pair_psnr):
+            raise ValueError(f"pair_psnr must be finite, got {pair_psnr}")
+        if not signals or not all(0.0 < mean <= 1.0 for mean in signals):
+            raise ValueError(f"signal: mean signals must be above 0 and at most 1, got {signal}")
+        law = noise_levels(levels)
+        uncalibrated = expected_pair_psnr(law, signals)
+        if not math.isfinite(uncalibrated):
+            raise ValueError(f"levels {levels!r} have no noise, which no factor brings to {pair_psnr:g} dB")
+        super().__init__(ScaledLevels(law, 10.0 ** ((uncalibrated - pair_psnr) / 10.0)))

@@ -1,0 +1,273 @@
+r"""UPI as published: ``y = mosaic(clip(h(C s^-1(x)^2.2; g)))``.
+
+``s^-1(x) = 1/2 - sin(asin(1 - 2x) / 3)`` undoes the tone curve ``s(x) = 3x^2 - 2x^3``. ``C`` is a random convex
+combination of four cameras' XYZ-to-camera matrices, times sRGB-to-XYZ, rows divided by their sum. The gains ``g`` are a
+digital one, 1 / N(0.8, 0.1), times a red one, U(1.9, 2.4), and a blue one, U(1.5, 1.9); ``h`` divides by them and
+spares highlights. Nothing is learned. Domain: display-referred sRGB in [0, 1] to linear camera colour in [0, 1].
+
+Source: Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019.
+
+UPI tuned: its fixed tone curve and gamma, with one matrix and one set of gains fitted to pairs.
+
+``y = M s^-1(x)^2.2`` below the highlights, with ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All of a frame's
+mean squared error is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``, so a fit is a few 3 x 3
+systems: the whole is exact and takes well under a second.
+
+The frames differ in gains that cannot be guessed. ``mse`` minimises the sum of their errors and follows the brightest;
+``mean`` takes the mean of the frames' own gains and matrices; ``log`` minimises ``sum_f log(MSE_f + eps)``, since the
+score averages decibels, by weighted least squares with weights ``1 / (MSE_f + eps)``: each round minimises the tangent
+of the concave logarithm, which lies above it, so the loss never rises.
+
+Source: Brooks et al., CVPR 2019, for the stages; the paper of the dictionary ISP compares with UPI "tuned" to its data.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor, nn
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.isp import stages
+from rawaug.isp.config import HIGHLIGHT_KNEE
+from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
+from rawaug.paper.baselines.base import BaselineISP, checked_raw, checked_srgb
+from rawaug.registry import BASELINES
+
+GAMMA = 2.2
+XYZ_TO_CAMERA = (
+    ((1.0234, -0.2969, -0.2266), (-0.5625, 1.6328, -0.0469), (-0.0703, 0.2188, 0.6406)),
+    ((0.4913, -0.0541, -0.0202), (-0.6130, 1.3513, 0.2906), (-0.1564, 0.2151, 0.7183)),
+    ((0.8380, -0.2630, -0.0639), (-0.2887, 1.0725, 0.2496), (-0.0627, 0.1427, 0.5438)),
+    ((0.6596, -0.2079, -0.0562), (-0.4782, 1.3016, 0.1933), (-0.0970, 0.1581, 0.5181)),
+)
+"""Of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
+SRGB_TO_XYZ = (
+    (0.4124564, 0.3575761, 0.1804375),
+    (0.2126729, 0.7151522, 0.0721750),
+    (0.0193339, 0.1191920, 0.9503041),
+)
+"""Linear sRGB (D65) to XYZ, IEC 61966-2-1."""
+INVERSE_DIGITAL = (0.8, 0.1)
+"""Mean and standard deviation of 1 / digital gain."""
+RED, BLUE = (1.9, 2.4), (1.5, 1.9)
+
+
+class UPIParams(NamedTuple):
+    """One camera setting a picture; replays a pass.
+
+    Args:
+        matrix: ``(B, 3, 3)`` linear sRGB to camera, rows of sum 1.
+        gains: ``(B, 3)`` digital gain times white balance, forward direction.
+    """
+
+    matrix: Tensor
+    gains: Tensor
+
+
+def smoothstep(x: Tensor) -> Tensor:
+    """The tone curve ``3x^2 - 2x^3`` on [0, 1]; values beyond are clipped, where it would turn back."""
+    x = x.clamp(0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def inverse_smoothstep(x: Tensor) -> Tensor:
+    """``1/2 - sin(asin(1 - 2x) / 3)`` on [0, 1]."""
+    return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
+
+
+def camera_matrix(weights: Tensor) -> Tensor:
+    """Weights ``(B, 4)`` of the cameras, of any positive sum, to linear sRGB-to-camera ``(B, 3, 3)``, rows of sum 1."""
+    cameras = torch.tensor(XYZ_TO_CAMERA).to(weights) @ torch.tensor(SRGB_TO_XYZ).to(weights)
+    matrix = torch.einsum("bn,nij->bij", weights, cameras)
+    return matrix / matrix.sum(dim=2, keepdim=True)
+
+
+class SmoothstepISP(BaselineISP):
+    """UPI's stages with a matrix and gains from wherever; both passes are pure functions of picture and parameters."""
+
+    @abstractmethod
+    def default_params(self, batch: int) -> UPIParams:
+        """The defaults of a pass."""
+
+    def apply(self, srgb: Any, params: UPIParams | None = None) -> Any:
+        """sRGB ``(B, 3, H, W)``, uint8 or float, to the mosaic ``(B, 1, H, W)`` with the given parameters.
+
+        With a function alone it is ``nn.Module.apply``, which a surrounding module may call.
+        """
+        if params is None:
+            return super().apply(srgb)
+        return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), params))
+
+    def balanced(self, white_balance: tuple[float, float, float]) -> UPIParams:
+        """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
+        params = self.default_params(1)
+        balance = torch.tensor(white_balance) / white_balance[1]
+        return params._replace(gains=params.gains[:, 1:2].cpu() * balance)
+
+    def make(self, srgb: Tensor, setting: UPIParams | None = None, place: Tensor | None = None) -> Tensor:
+        return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), setting or self.default_params(len(srgb))))
+
+    def unprocess(self, srgb: Tensor) -> Tensor:
+        return unprocess_pixels(srgb, self.default_params(len(srgb)))
+
+    def render(self, raw: Tensor) -> Tensor:
+        return self.render_with(raw, self.default_params(len(raw)))
+
+    def render_with(self, raw: Tensor, params: UPIParams) -> Tensor:
+        """The mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1] with the given parameters."""
+        return render_pixels(bayer.demosaic(checked_raw(raw), self.cfa), params)
+
+
+def unprocess_pixels(x: Tensor, params: UPIParams) -> Tensor:
+    """sRGB to linear camera colour, both ``(B, 3, H, W)``; not clipped yet."""
+    linear = stages.gamma_expand(inverse_smoothstep(x), GAMMA)
+    return stages.inverse_gains(stages.correct_colour(linear, params.matrix.to(x)), params.gains.to(x))
+
+
+def render_pixels(x: Tensor, params: UPIParams) -> Tensor:
+    """Linear camera colour to sRGB, both ``(B, 3, H, W)``: the inverse of :func:`unprocess_pixels` below highlights."""
+    balanced = stages.apply_gains(x, params.gains.to(x)).clamp(0.0, 1.0)
+    linear = stages.correct_colour(balanced, torch.linalg.inv(params.matrix).to(x))
+    return smoothstep(stages.gamma_compress(linear, GAMMA))
+
+
+@BASELINES.register("upi")
+class UPI(SmoothstepISP):
+    """UPI as published: a random camera a picture, or the mean one.
+
+    Example:
+        >>> upi, srgb = UPI("GRBG"), torch.rand(2, 3, 8, 10)
+        >>> params = upi.sample(2, torch.Generator().manual_seed(0))
+        >>> torch.equal(upi.apply(srgb, params), upi.apply(srgb, params))
+        True
+        >>> upi.reverse(srgb).shape
+        torch.Size([2, 1, 8, 10])
+    """
+
+    name = "upi"
+    trainable = False
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        mosaic: Tensor = self.apply(srgb, self.sample(len(srgb), generator))
+        return mosaic
+
+    def default_params(self, batch: int) -> UPIParams:
+        """The published distributions' means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""
+        digital = 1.0 / INVERSE_DIGITAL[0]
+        gains = torch.tensor([digital * sum(RED) / 2, digital, digital * sum(BLUE) / 2])
+        return UPIParams(camera_matrix(torch.ones(1, 4)).expand(batch, 3, 3), gains.expand(batch, 3))
+
+    def sample(self, batch: int, generator: torch.Generator) -> UPIParams:
+        """Draw ``batch`` cameras from the published distributions."""
+        weights = torch.rand(batch, 4, generator=generator, device=generator.device)
+        normal = torch.randn(batch, generator=generator, device=generator.device)
+        digital = 1.0 / (INVERSE_DIGITAL[0] + INVERSE_DIGITAL[1] * normal)
+        uniform = torch.rand(2, batch, generator=generator, device=generator.device)
+        red, blue = (low + (high - low) * u for (low, high), u in zip((RED, BLUE), uniform, strict=True))
+        return UPIParams(camera_matrix(weights), torch.stack([digital * red, digital, digital * blue], dim=1))
+
+
+Criterion = Literal["log", "mse", "mean"]
+
+LOG_MSE_EPS = 1e-5
+"""Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
+ROUNDS = 100
+PIXELS = 32768
+"""Drawn of each frame."""
+
+
+@BASELINES.register("upi-tuned")
+class TunedUPI(SmoothstepISP):
+    """UPI's stages with a fitted camera's matrix and gains; identity until tuned.
+
+    Args:
+        cfa: pattern of the RAW.
+        criterion: "log", "mse" or "mean", see the module's head.
+    """
+
+    name = "upi-tuned"
+    trainable = True
+
+    def __init__(self, cfa: CFA | str = "RGGB", criterion: Criterion = "log") -> None:
+        super().__init__(cfa)
+        if criterion not in get_args(Criterion):
+            raise ValueError(f"criterion {criterion!r} is unknown; use one of {', '.join(get_args(Criterion))}")
+        self.criterion = criterion
+        self.matrix = nn.Parameter(torch.eye(3), requires_grad=False)
+        self.gains = nn.Parameter(torch.ones(3), requires_grad=False)
+
+    def default_params(self, batch: int) -> UPIParams:
+        return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
+
+    def tune(self, pairs: Iterable[FramePair], seed: int = 0) -> TunedUPI:
+        """Fit matrix and gains; pairs of any CFA, registered or not.
+
+        Raises:
+            ValueError: if there is no pair, a frame has too few pixels below the highlights, or what fits best turns
+                white black.
+        """
+        moments = Moments.of(sample_pixels(pairs, PIXELS, seed)[0])
+        if self.criterion == "mean":
+            own = moments.solve_each()
+            scale = own.sum(2)
+            product = (own / scale[:, :, None]).mean(0) / (1.0 / scale).mean(0)[:, None]
+        else:
+            product = moments.solve(torch.ones(len(moments.energy)).double())
+            for _ in range(ROUNDS if self.criterion == "log" else 0):
+                product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
+        sums = product.sum(1)
+        if (sums <= 0.0).any():
+            raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
+        self.gains.copy_(1.0 / sums)
+        self.matrix.copy_(product / sums[:, None])
+        return self
+
+
+class Moments(NamedTuple):
+    """What the frames' squared errors depend on, in double precision, as means over each frame's known readings.
+
+    Args:
+        a: ``(F, 3, 3, 3)`` channel by channel, of linear sRGB with itself.
+        b: ``(F, 3, 3)`` of linear sRGB with the readings.
+        energy: ``(F,)`` of the readings.
+    """
+
+    a: Tensor
+    b: Tensor
+    energy: Tensor
+
+    @classmethod
+    def of(cls, samples: PixelSamples) -> Moments:
+        """Of pixels below the highlights, where the inverse gains are plain divisions."""
+        linear = stages.gamma_expand(inverse_smoothstep(samples.srgb), GAMMA)
+        known = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
+        x, y, weight = (value[:, :, 0].double() for value in (linear, samples.target, known))
+        if (weight.sum(2) < 32).any():
+            frame = int((weight.sum(2) < 32).any(1).nonzero()[0])
+            raise ValueError(f"frame {frame}: too few pixels below the highlights; use a better exposed frame")
+        weight = weight / weight.sum((1, 2), keepdim=True)
+        a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
+        return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
+
+    def solve_each(self) -> Tensor:
+        """Each frame's own matrix ``(F, 3, 3)``."""
+        return torch.linalg.solve(self._ridge(self.a), self.b)
+
+    def solve(self, weights: Tensor) -> Tensor:
+        """The matrix ``(3, 3)`` of least weighted error, weights ``(F,)``."""
+        a, b = torch.einsum("f,fcij->cij", weights, self.a), torch.einsum("f,fci->ci", weights, self.b)
+        return torch.linalg.solve(self._ridge(a), b)
+
+    def error(self, product: Tensor) -> Tensor:
+        """The frames' mean squared errors ``(F,)``."""
+        square = torch.einsum("ci,fcij,cj->f", product, self.a, product)
+        return (square - 2.0 * (product * self.b).sum((1, 2)) + self.energy).clamp_min(0.0)
+
+    @staticmethod
+    def _ridge(a: Tensor) -> Tensor:
+        return a + 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)

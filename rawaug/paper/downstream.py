@@ -1,0 +1,162 @@
+"""PSNR_d: a denoiser trained on a method's RAW from sRGB pictures, scored on real RAW.
+
+Pictures, network, steps and noise are the same for every method; what differs is the way from sRGB to RAW. The
+dictionary ISP draws camera settings from its hull, UPI from its published distributions; a network has one answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import singledispatch
+from pathlib import Path
+from statistics import fmean
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from denoisers import Denoiser
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs
+from rawaug.data.folders import each_readable
+from rawaug.data.pairs import Sample, SomePairs
+from rawaug.evaluation.scores import Score, score_denoiser
+from rawaug.isp.config import ReverseISP
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import as_float
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
+from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.loop import train
+from rawaug.training.stream import PictureCrops, Source, TrainingStream
+from rawaug.training.validation import Watched
+
+WATCHED = 16
+"""Samples made from the pictures on which training is watched."""
+
+
+@dataclass
+class DownstreamConfig:
+    """The denoising experiment.
+
+    Args:
+        methods: families to compare.
+        test: RAW frames of unseen cameras; folders, or ``kind:path``.
+        test_crop: side of the central crop scored of each test frame; null for the whole frame.
+        test_count: number of frames of each of ``test``; null for all.
+        exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
+            headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
+        noise: preset, in training and on the test frames.
+        denoiser: the network.
+        train: the loop.
+    """
+
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi"])
+    test: list[str] = field(default_factory=lambda: ["demo:test"])
+    test_crop: int | None = 1024
+    test_count: int | None = None
+    exposure: tuple[float, float] | None = (-1.5, 0.0)
+    noise: str = "cycleisp_sidd"
+    denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def sampling(self) -> tuple[object, ...]:
+        """What the training samples depend on."""
+        return self.noise, self.exposure
+
+    def smoke(self) -> DownstreamConfig:
+        """In seconds, on the demo camera."""
+        few = TrainConfig(steps=2, batch=2, crop=32, warmup=1, validate_every=2, checkpoint_every=2)
+        return replace(
+            self, test=["demo:validation"], denoiser=DenoiserConfig("UNet", {"width": 4, "scales": 2}), train=few
+        )
+
+
+class DownstreamScore(NamedTuple):
+    """PSNR in dB, in RAW and developed to sRGB."""
+
+    psnr: float
+    psnr_srgb: float
+
+
+def mean_of(scores: Sequence[Score]) -> DownstreamScore:
+    """The mean over frames; sRGB over those that can be developed."""
+    developed = [score.psnr_srgb for score in scores if score.psnr_srgb is not None]
+    return DownstreamScore(fmean(score.psnr for score in scores), fmean(developed))
+
+
+def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
+    """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
+    net = trained_on(_crops(model, pictures, noise_model(config.noise), config), config, place, seed)
+    return score_on(net, config, CFA(model.cfa)).psnr
+
+
+def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) -> Denoiser:
+    """A denoiser trained on these samples, and watched by others of them."""
+    stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
+    drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
+    watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
+    folder = place / f"seed{seed}"
+    return train(stream, watched, config.denoiser, config.train, folder, seed, label=f"{place.name} {seed}")
+
+
+def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamScore:
+    """Mean scores on the test frames; their noise is frozen with seed 0."""
+    opened = ((open_pairs(spec, split="test"), spec) for spec in config.test)
+    chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
+    pairs = (pair for frames, spec in chosen for pair in each_readable(frames, spec))
+    frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
+    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
+    return mean_of(scores)
+
+
+@singledispatch
+def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+
+
+@_crops.register
+def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+    """By the plugin, so that each crop keeps its place in its frame."""
+    augment = RawAugment(model, noise, exposure=None if model.config.cameras else config.exposure)
+    return PictureCrops(RawPairs(pictures, augment, config.train.crop))
+
+
+class MadeCrops:
+    """Crops of pictures, turned at random, made RAW by any function.
+
+    Args:
+        pictures: ``(3, H, W)`` uint8.
+        make: sRGB ``(1, 3, h, w)`` in [0, 1] and a generator to the mosaic ``(1, 1, h, w)``.
+        cfa: of that mosaic.
+        noise: drawn anew for every crop.
+        crop: side, even.
+    """
+
+    def __init__(
+        self,
+        pictures: Sequence[Tensor],
+        make: Callable[[Tensor, torch.Generator], Tensor],
+        cfa: CFA,
+        noise: NoiseModel,
+        crop: int,
+    ) -> None:
+        self.pictures, self.make, self.cfa, self.noise, self.crop = pictures, make, cfa, noise, crop
+
+    @torch.no_grad()
+    def draw(self, generator: torch.Generator) -> Sample:
+        """One crop of a random picture."""
+        picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
+        height, width = picture.shape[-2:]
+        top = 2 * int(torch.randint((height - self.crop) // 2 + 1, (), generator=generator))
+        left = 2 * int(torch.randint((width - self.crop) // 2 + 1, (), generator=generator))
+        patch = bayer.crop(picture, top, left, self.crop, self.crop)
+        patch = bayer.turn(patch, int(torch.randint(bayer.N_VIEWS, (), generator=generator)))
+        clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)
+        params = self.noise.sample(1, generator)
+        noisy = self.noise.apply(clean, params)
+        return Sample(noisy[0], clean[0], self.noise.variance(noisy, params)[0])

@@ -1,0 +1,270 @@
+r"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
+
+A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
+samples, and with the best setting that can be found (oracle, :mod:`rawaug.paper.methods`), the limit of the
+dictionaries. A shipped ISP, or the file of one, is a method that is not fitted.
+
+The oracle of the reconstruction table: the setting of an ISP that comes closest to a frame's RAW.
+
+.. math:: \min_{w, v, g} \; \log \bigl( \| y - f^{-1}(x; w, v, g) \|^2 / P + \epsilon \bigr)
+
+over the weights of the atoms and, for an ISP of published cameras, the gains, which there follow from any light. There
+the problem is convex in each of the three alone, not in all of them, so that descent starts where alternating least
+squares end (:mod:`rawaug.isp.conditioning`), with all P pixels for readings. A fitted ISP's gains stay within the hull
+of its own, and descent starts from the middle of the hulls. The settings of rows that know less are compared as well:
+none of them is better than the oracle.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import singledispatch
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
+from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
+from rawaug.files import find_weights
+from rawaug.isp import conditioning
+from rawaug.isp.config import ISPParams, ReverseISP
+from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import as_float, placed
+from rawaug.metrics import PATCH, psnr
+from rawaug.paper.baselines import BASELINES, InvISP, fit_baseline
+from rawaug.paper.baselines.base import CropTrainedISP
+from rawaug.paper.baselines.upi import SmoothstepISP
+from rawaug.paper.metrics import balanced_psnr
+from rawaug.seeding import keyed_generator
+
+FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
+ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
+SAMPLES = 64
+
+Maker = Callable[[Tensor, Tensor], Tensor]
+"""An sRGB patch and its place in the frame to a mosaic."""
+
+
+class Fitted(NamedTuple):
+    """A fitted family.
+
+    Args:
+        model: what was fitted.
+        seconds: that it took, reading not counted.
+        parameters: of its reverse pass.
+    """
+
+    model: ReverseISP
+    seconds: float
+    parameters: int
+
+
+def is_method(family: str) -> bool:
+    """Whether this is a family to fit, or an ISP that exists: the name of a shipped one or a file."""
+    if family in FAMILIES:
+        return True
+    try:
+        find_weights(family)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def learns_by_descent(family: str) -> bool:
+    """Whether a family trains on crops: it has a budget, and needs pairs that are registered pixel by pixel."""
+    return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
+
+
+def fit_family(
+    family: str, pairs: Sequence[Pair], config: FitConfig, budget: tuple[float, int, int], seed: int
+) -> Fitted:
+    """Fit a family to pairs of one CFA; methods that learn by descent have a budget of (seconds, crop, batch)."""
+    start = time.perf_counter()
+    if family not in FAMILIES:
+        isp = DictionaryISP.from_pretrained(family)
+        if isp.cfa != CFA(pairs[0].cfa):
+            raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
+        return Fitted(isp, 0.0, isp.reverse_parameters)
+    if family.startswith("dictionary"):
+        isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
+        return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
+    method = BASELINES[family]
+    start_of: dict[str, Any] = {"seed": seed} if issubclass(method, CropTrainedISP) else {}
+    model = method(cfa=pairs[0].cfa, **start_of)
+    seconds, crop, batch = budget
+    fit_baseline(model, pairs, seconds, crop=crop, batch=batch, seed=seed)
+    return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
+
+
+def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
+    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass.
+
+    An unregistered pair is scored over blocks, by methods that do not learn by descent.
+    """
+    pair.require_rendered()
+    model = fitted.model
+    if not pair.registered:
+        return {"rows": _block_rows(model, pair), "mpix_s": None}
+    makers = {row: _maker(model, setting) for row, setting in settings(model, pair).items()}
+    start = time.perf_counter()
+    rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
+    if "oracle" in rows:  # chosen by the error on some pixels of the frame, which is not the mean of the patches' PSNR
+        rows["oracle"] = max(rows.values())
+    area = min(PATCH, pair.raw.shape[-2]) * min(PATCH, pair.raw.shape[-1])
+    pixels = len(makers) * len(windows_of(pair, patches)) * area
+    return {"rows": rows, "mpix_s": pixels / (time.perf_counter() - start) / 1e6}
+
+
+def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
+    """InvISP's PSNR (:func:`rawaug.paper.metrics.balanced_psnr`) of every row that the family fills."""
+    found = settings(fitted.model, pair)
+    return {row: balanced_psnr(_maker(fitted.model, setting), pair) for row, setting in found.items()}
+
+
+@singledispatch
+def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
+    """Row to the camera setting that it is made with; a method that knows nothing of settings has one row."""
+    return {"blind": None}
+
+
+@settings.register
+def _(model: SmoothstepISP, pair: Pair) -> dict[str, Any]:
+    return {"blind": None} | ({"as-shot": model.balanced(pair.white_balance)} if pair.balance_known else {})
+
+
+@settings.register
+def _(model: InvISP, pair: Pair) -> dict[str, Any]:
+    return {"blind": None} | ({"as-shot": pair.white_balance} if pair.balance_known else {})
+
+
+@singledispatch
+def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
+    blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
+    with torch.no_grad():
+        made = model.unprocess(blocks.srgb[None])[0]
+    return {"blind": block_psnr(made, blocks.raw, blocks.clipped)}
+
+
+@_block_rows.register
+def _(model: DictionaryISP, pair: Pair) -> dict[str, float]:
+    rows = {"blind": psnr_r(model, pair)}
+    return rows | ({"as-shot": psnr_r(model, pair, white_balance=True)} if pair.balance_known else {})
+
+
+def _maker(model: ReverseISP, setting: Any) -> Maker:
+    return lambda patch, place: model.make(patch, setting, place)
+
+
+@settings.register
+def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
+    """The camera settings of the dictionary's rows for a frame."""
+    with torch.no_grad():
+        blind = isp.choose(pair.srgb[None])
+        as_shot = conditioning.with_white_balance(isp, blind, pair.white_balance, None)
+        known = {
+            "blind": blind,
+            **({"as-shot": as_shot} if pair.balance_known else {}),
+            "samples": _from_samples(isp, pair, blind),
+        }
+        return known | {"oracle": oracle(isp, pair, list(known.values()))}
+
+
+def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams:
+    height, width = pair.raw.shape[-2:]
+    generator = keyed_generator("raw samples", pair.name)
+    rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in (height, width))
+    readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
+    x = as_float(pair.srgb[None])
+    return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
+
+
+@torch.no_grad()
+def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
+    """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back.
+
+    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, is the loss of its stages alone.
+    """
+    model, through, without = fitted.model, [], []
+    if not model.bidirectional:
+        return {}
+    for picture in pictures:
+        x = as_float(picture[None])
+        through.append(psnr(model.cycle(x), x).item())
+        if (back := model.cycle_without_mosaic(x)) is not None:
+            without.append(psnr(back, x).item())
+    result_ = {"cycle": sum(through) / len(through)}
+    return result_ | ({"cycle_without_mosaic": sum(without) / len(without)} if without else {})
+
+
+def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:
+    """What the mosaic and bilinear interpolation alone leave of sRGB pictures: the ceiling of a cycle through them."""
+    values = [as_float(p[None]) for p in pictures]
+    scores = [psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values]
+    return sum(scores) / len(scores)
+
+
+PIXELS = 16384
+STEPS = 300
+RATE = 0.1
+LOG_RATE = 0.01
+"""Of log gains, which start near their end."""
+EPS = 1e-9
+FLOOR = 1e-3
+"""Added to weights before their logarithm, or an atom that starts at 0 stays there."""
+
+
+@torch.no_grad()
+def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPParams:
+    """The best setting for the frame among what descent finds and the ``others``, one or more."""
+    pixels, _ = sample_pixels([pair], PIXELS, seed=0)
+    start = None
+    if isp.config.cameras:
+        own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))
+        start = conditioning.with_readings(isp, pixels.srgb, pixels.place, own, value, others[0])
+    found = [*others, _descended(isp, pixels, start)]
+    return min(found, key=lambda setting: squared_error(isp, pixels, setting).item())
+
+
+def squared_error(isp: DictionaryISP, pixels: PixelSamples, setting: ISPParams) -> Tensor:
+    """Mean over the readings that are not clipped: a few that are would outweigh all others. Held to [0, 1]."""
+    made = isp.reverse_pixels(pixels.srgb, setting, pixels.place).clamp(0.0, 1.0)
+    return ((made - pixels.target) ** 2 * pixels.known).sum() / pixels.known.sum()
+
+
+@torch.enable_grad()
+def _descended(isp: DictionaryISP, pixels: PixelSamples, start: ISPParams | None) -> ISPParams:
+    """From ``start``, with free gains; or from uniform weights of all atoms, those of the gains among them."""
+    config = isp.config
+    if start is None:
+        logits = [torch.zeros(1, n) for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
+        log_gains = torch.zeros(0)
+    else:
+        logits = [(weights + FLOOR).log() for weights in (start.colour_weights, start.tone_weights) if weights.shape[1]]
+        log_gains = start.gains.log()
+    logits, log_gains = [value.clone().requires_grad_() for value in logits], log_gains.clone().requires_grad_()
+
+    def setting() -> ISPParams:
+        weights = [value.softmax(dim=1) for value in logits]
+        if start is None:
+            return isp.params_from_weights(*weights)
+        tones = weights[1] if len(weights) > 1 else start.tone_weights
+        return ISPParams(weights[0], start.gain_weights[:, :0], isp.colour.combine(weights[0]), log_gains.exp(), tones)
+
+    optimiser = torch.optim.Adam([{"params": logits, "lr": RATE}, {"params": [log_gains], "lr": LOG_RATE}])
+    best, least = setting(), torch.inf
+    for _ in range(STEPS):
+        tried = setting()
+        error = squared_error(isp, pixels, tried)
+        if error.item() < least:
+            best, least = tried, error.item()
+        optimiser.zero_grad()
+        (error + EPS).log().backward()
+        optimiser.step()
+    return ISPParams(*(value.detach() for value in best))

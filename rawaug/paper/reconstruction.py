@@ -1,0 +1,375 @@
+"""The reconstruction table in print: a row a method and setting, a column a figure.
+
+The reconstruction table: every method fitted on the same pairs, measured on frames left out.
+
+PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
+that of a published split: a method is fitted once to all frames, and scored on every frame of another set.
+PSNR_d is that of a denoiser trained on the RAW that a method makes of sRGB pictures, on frames of cameras that no
+method has seen. Each fit's figures go into a file of their own, so that a stopped run can resume.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data import open_pairs, open_pictures
+from rawaug.data.folders import Readable, each_readable
+from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
+from rawaug.evaluation.scores import frozen_sample
+from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.experiment.early_checks import require_precision
+from rawaug.experiment.run_folder import claim, require_free, run_folder
+from rawaug.files import fingerprint, write_json
+from rawaug.isp.fit import FitConfig
+from rawaug.metrics import worst_and_best_quarter
+from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper.downstream import DownstreamConfig, psnr_d
+from rawaug.paper.methods import (
+    FAMILIES,
+    ROWS,
+    Fitted,
+    balanced_rows,
+    cycle_psnr,
+    fit_family,
+    is_method,
+    learns_by_descent,
+    mosaic_only_psnr,
+    score_rows,
+)
+from rawaug.paper.metrics import ALTERED
+from rawaug.plugin.pictures import even_sided
+from rawaug.progress import progress
+from rawaug.training.config import weights_key
+
+COLUMNS = {
+    "psnr_r": "PSNR_r",
+    "worst25": "worst 25%",
+    "best25": "best 25%",
+    "balanced": "balanced",
+    "cycle": "cycle",
+    "cycle_without_mosaic": "no mosaic",
+    "psnr_d": "PSNR_d",
+}
+
+
+def _cells(row: dict[str, Any], columns: Sequence[str]) -> list[str]:
+    def figures(name: str) -> str:
+        value = row.get(name)
+        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
+
+    cells = [figures(name) for name in columns]
+    speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
+    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
+
+
+def print_methods(title: str, rows: dict[str, dict[str, Any]], balanced: bool, ceiling: float) -> None:
+    """Print the rows of a comparison; ``ceiling`` is the PSNR that the mosaic alone leaves of a cycle."""
+    columns = [name for name in COLUMNS if name != "balanced" or balanced]
+    heads = [COLUMNS[name] for name in columns] + ["M par.", "s to fit", "Mpix/s"]
+    print_rows(title, ["method", *heads], [[name, *_cells(row, columns)] for name, row in rows.items()])
+    threads = torch.get_num_threads()
+    print(f"mosaic and bilinear interpolation alone: {ceiling:.2f} dB (ceiling of the cycle); threads: {threads}")
+
+
+def row_name(family: str, row: str) -> str:
+    """Of a row of a fold: "as-shot, overexposed" and the like."""
+    setting, _, kind = row.partition(", ")
+    return ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
+
+
+@dataclass
+class Comparison:
+    """A table of methods.
+
+    Args:
+        experiment: "reconstruction".
+        name: of the output folder within ``out``.
+        data: the pairs, of one CFA; methods that train on crops need them registered. A dataset's split is ``train``.
+        test: score on these pairs, of the split ``test``, instead of on frames left out of ``data``; frames of any
+            pattern are brought to that of the first training frame.
+        count, select: of ``data``, as in recipes that train, see :mod:`rawaug.data.pairs`.
+        test_count: number of test pairs; null for all.
+        noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
+            frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
+        methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
+            a shipped one's name or a file.
+        seconds: training budget of methods trained by gradient descent, without file reading.
+        crop, batch: of these methods' training: small ones give more steps to a short budget.
+        longer: factor of a second, longer budget for them; 0 for none.
+        longer_frames: left-out frames on which the longer budget is tried (first seed).
+        patches: random patches of each left-out frame that are scored; null scores all.
+        balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
+            gamma-compressed RAW.
+        altered: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
+            :mod:`rawaug.paper.metrics`; methods are fitted to frames as they are.
+        pictures: sRGB pictures for the cycle and for PSNR_d.
+        fit: of the dictionary ISP.
+        downstream: PSNR_d; null skips it.
+        seed: of the first run.
+        seeds: number of runs.
+        out: folder of all runs.
+    """
+
+    experiment: str = "reconstruction"
+    name: str = "reconstruction"
+    data: str = "demo:train"
+    test: str | None = None
+    count: int | None = None
+    select: str | list[str] = "first"
+    test_count: int | None = None
+    noise: str | None = None
+    methods: list[str] = field(default_factory=lambda: ["dictionary", "upi", "upi-tuned"])
+    seconds: float = 20.0
+    crop: int = 64
+    batch: int = 2
+    longer: float = 0.0
+    longer_frames: int = 2
+    patches: int | None = 8
+    balanced: bool = False
+    altered: list[str] = field(default_factory=list)
+    pictures: str = "demo:"
+    fit: FitConfig = field(default_factory=FitConfig)
+    downstream: DownstreamConfig | None = None
+    seed: int = 0
+    seeds: int = 3
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        unknown = [method for method in self.methods or [] if not is_method(method)]
+        if unknown or not self.methods:
+            listed = ", ".join(FAMILIES)
+            raise ValueError(f"methods: {unknown or 'none'}; choose from {listed}, or name an ISP or its file")
+        if self.seeds < 1:
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
+        if self.patches is not None and self.patches < 1:
+            raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
+        if unknown := [kind for kind in self.altered if kind not in ALTERED]:
+            raise ValueError(f"altered: {unknown}; choose from {', '.join(ALTERED)}")
+        if self.noise and any(not method.startswith("dictionary") for method in self.methods):
+            raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
+
+
+def smoke_comparison(comparison: Comparison) -> Comparison:
+    """The comparison in seconds, on the demo camera."""
+    downstream = comparison.downstream and comparison.downstream.smoke()
+    quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
+    return replace(
+        comparison,
+        name=f"{comparison.name}-smoke",
+        data="demo:validation",
+        test=comparison.test and "demo:test",
+        count=None,
+        select="first",
+        test_count=1,
+        pictures="demo:",
+        methods=quick or ["dictionary"],
+        longer=0.0,
+        patches=1,
+        seeds=1,
+        fit=comparison.fit.smoke(),
+        downstream=downstream,
+    )
+
+
+def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
+    """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
+    prepared = PreparedComparison(comparison, overwrite)
+    claim(comparison, overwrite)
+    return prepared.table()
+
+
+class PreparedComparison:
+    """A comparison whose data are open and checked; nothing is written yet.
+
+    Args:
+        settings: of the comparison.
+        overwrite: it may replace another of its name.
+        seconds: for reading the frames that are fitted; what then remains unread is left out.
+    """
+
+    def __init__(self, settings: Comparison, overwrite: bool = False, seconds: float = math.inf) -> None:
+        require_free(settings, overwrite)
+        if settings.downstream is not None:
+            require_precision(settings.downstream.train.precision)
+        self.settings, self.folder = settings, run_folder(settings)
+        found = open_pairs(settings.data, split="train")
+        self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+        self.available = len(found)
+        self.pairs = list(each_readable(self.chosen, "data", seconds, least=2))
+        if len(self.pairs) < 2 and not settings.test:
+            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
+        if settings.test:
+            self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
+        exact = any(learns_by_descent(method) for method in settings.methods)
+        for pair in self.pairs:
+            if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
+                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has a different CFA"
+                raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
+        if settings.noise:
+            noise = noise_model(settings.noise)
+            self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
+        self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
+        names = names_of(self.chosen)
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
+        self.scored: Sequence[Pair] = self.pairs
+        if settings.test:
+            test = open_pairs(settings.test, split="test")
+            tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+            deque(each_readable(tested, "test", seconds), maxlen=0)
+            self.scored = tested.kept()
+            if (seen := shared_frame(self.scored, found)) is not None:
+                raise ValueError(f"test: {seen} is also in data; score on unseen frames")
+        if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
+            where, count = settings.test or settings.data, len(self.scored)
+            raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
+        self._fitted: tuple[str, Fitted] | None = None
+        side = settings.downstream.train.crop if settings.downstream else 2
+        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """All rows; printed, and written with every single figure."""
+        rows: dict[str, dict[str, Any]] = {}
+        for family, scale in self._families():
+            rows |= self._rows(family, scale)
+        ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
+        write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
+        frames, settings = len(next(iter(rows.values()))["frames"]), self.settings
+        on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
+        title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
+        print_methods(title, rows, settings.balanced, ceiling)
+        return rows
+
+    def _families(self) -> Iterator[tuple[str, float]]:
+        for family in self.settings.methods:
+            yield family, 1.0
+            if self.settings.longer and learns_by_descent(family):
+                yield family, self.settings.longer
+
+    def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
+        settings, longer = self.settings, scale != 1.0
+        seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
+        frames = range(settings.longer_frames if longer else len(self.scored))
+        names = names_of(self.scored)
+        bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
+        folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
+        whole = {} if longer else self._whole(family)
+        rows = {}
+        for row in folds[0][2]["rows"]:
+            by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+            quarters = [worst_and_best_quarter(values) for values in by_seed]
+            name = row_name(family, row)
+            name = f"{name}, {scale:g} times as long" if longer else name
+            rows[name] = {
+                "psnr_r": [statistics.fmean(values) for values in by_seed],
+                "frames": {names[k]: [values[k] for values in by_seed] for k in frames},
+                "worst25": [worst for worst, _ in quarters],
+                "best25": [best for _, best in quarters],
+                "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
+                "mpix_s": _median([fold["mpix_s"] for *_, fold in folds]),
+                "parameters": folds[0][2]["parameters"],
+                **(whole if row == "blind" else {}),
+            }
+            if row in folds[0][2].get("balanced", {}):
+                by_seed = [[fold["balanced"][row] for s, _, fold in folds if s == seed] for seed in seeds]
+                rows[name]["balanced"] = [statistics.fmean(values) for values in by_seed]
+        return rows
+
+    def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
+        """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
+        settings, name = self.settings, names_of(self.scored)[frame]
+        seconds = settings.seconds * scale
+        budget = (seconds, settings.crop, settings.batch)
+        more = [settings.balanced, settings.altered] if settings.balanced or settings.altered else []
+        key = fingerprint(family, budget, seed, settings.patches, *self._frames(), *more)
+        path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
+        if (known := _read(path, key)) is not None:
+            return known
+        pair = self.scored[frame]
+        if settings.test:
+            pair = pair.in_pattern(self.pairs[0].cfa)
+            if self._fitted is None or self._fitted[0] != key:
+                self._fitted = key, fit_family(family, self.pairs, self.fit, budget, seed)
+            fitted = self._fitted[1]
+        else:
+            fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
+        result = score_rows(fitted, pair, settings.patches)
+        for kind in settings.altered:
+            found = score_rows(fitted, ALTERED[kind](pair), settings.patches)["rows"]
+            result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
+        if settings.balanced:
+            result["balanced"] = balanced_rows(fitted, pair)
+        result |= {**fitted.model.info, "key": key, "seconds": fitted.seconds, "parameters": fitted.parameters}
+        write_json(result, path)
+        return result
+
+    def _whole(self, family: str) -> dict[str, Any]:
+        """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
+        settings = self.settings
+        downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
+        seeds = range(settings.seed, settings.seed + settings.seeds)
+        budget = (settings.seconds, settings.crop, settings.batch)
+        parts = (
+            self.fit.key(),
+            settings.noise,
+            downstream and asdict(downstream),
+            settings.data,
+            [p.name for p in self.pairs],
+        )
+        key = fingerprint(family, budget, list(seeds), settings.pictures, *parts)
+        path = self._path(f"{family}-all-frames")
+        if (known := _read(path, key)) is not None:
+            return known
+        fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
+        result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
+        if downstream:
+            samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
+            trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
+            place = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
+            result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
+        write_json(result, path)
+        return result
+
+    def _frames(self) -> tuple[Any, ...]:
+        """What a fit depends on besides its family, budget and seed."""
+        test = [self.settings.test] if self.settings.test else []
+        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs], *test
+
+    def _path(self, stem: str) -> Path:
+        return self.folder / f"{stem.replace('/', '_')}.json"
+
+
+def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
+    """The frame with noise keyed by its name, as a noisy capture."""
+    cfa = CFA(pair.cfa)
+    noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
+    return replace(pair, noisy=noisy)
+
+
+def _each(pictures: Any) -> Iterator[Tensor]:
+    for index in range(len(pictures)):
+        yield pictures[index]
+
+
+def _read(path: Path, key: str) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    known: dict[str, Any] = json.loads(path.read_text())
+    return known if known.get("key") == key else None
+
+
+def _median(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return statistics.median(known) if known else None
