@@ -32,7 +32,7 @@ from rawaug.commands.frame_denoisers import (
     stored_noise,
 )
 from rawaug.commands.pair_maker import require_same_settings
-from rawaug.data.folders import EXTENSIONS
+from rawaug.data.folders import RAW_FOLDER_EXTENSIONS as EXTENSIONS
 from rawaug.errors import printable
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
