@@ -18,10 +18,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data import folders as picture_folder
-from rawaug.data import folders as raw_folder
 from rawaug.data.dnd import Dnd
-from rawaug.data.folders import PictureFolder
+from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Pair
 from rawaug.data.published import CAMERAS, Rawir, Zurich, fivek_numbers
@@ -158,11 +156,11 @@ def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     if path.is_dir() and looks_like_pairs(files):
         yield "noisy/clean pairs", lambda: PairFolder(path)
         return
-    raws = sorted(file for file in files if file.suffix.lower() in raw_folder.EXTENSIONS)
+    raws = sorted(file for file in files if file.suffix.lower() in RAW_EXTENSIONS)
     numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
     if raws:
         yield f"RAW files{_fivek(numbers)}", lambda: _RawFrames(raws)
-    if any(file.suffix.lower() in picture_folder.EXTENSIONS for file in files) and path.is_dir():
+    if any(file.suffix.lower() in PICTURE_EXTENSIONS for file in files) and path.is_dir():
         yield "pictures", lambda: PictureFolder(path, allowed_share=1)
 
 

@@ -161,7 +161,7 @@ def each_readable(pairs: Sequence[Pair], of: str, seconds: float = math.inf, lea
         print("\n".join(lines))
 
 
-EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
 _COUNTERS = 64
 _NAMED = 20
 _log = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class PictureFolder(Dataset[Tensor]):
     are logged as a warning; :attr:`skipped` and :meth:`report` list them at any time.
 
     Args:
-        path: a folder; files with the extensions of :data:`EXTENSIONS` are taken, links to folders not followed.
+        path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
         min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
         max_pixels: larger pictures are skipped.
         allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
@@ -201,7 +201,7 @@ class PictureFolder(Dataset[Tensor]):
         self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
         self.names = _Names(sorted(_listed(self.path)))
         if not len(self.names):
-            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(EXTENSIONS)}")
+            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
         self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
         self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
         self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
@@ -344,11 +344,11 @@ def _listed(folder: Path) -> Iterator[str]:
     for parent, _, files in os.walk(folder, onerror=refuse):
         inside = Path(parent).relative_to(folder)
         for file in files:
-            if file.lower().endswith(EXTENSIONS):
+            if file.lower().endswith(PICTURE_EXTENSIONS):
                 yield str(inside / file)
 
 
-RAW_FOLDER_EXTENSIONS = (
+RAW_EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
 )
@@ -398,7 +398,7 @@ class RawFolder(LazyPairs):
             raise FileNotFoundError(f"{missing[0]}: no such RAW file")
         if not self.files:
             raise ValueError(
-                f"{path}: contains no RAW file; supported extensions are {', '.join(RAW_FOLDER_EXTENSIONS)}; "
+                f"{path}: contains no RAW file; supported extensions are {', '.join(RAW_EXTENSIONS)}; "
                 "noisy/clean pairs of other formats are read as pairs:PATH"
             )
         self.camera_jpeg = camera_jpeg
@@ -459,7 +459,7 @@ def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
 def _raw_files(path: str | Path) -> list[Path]:
     path = Path(path)
     if path.is_dir():
-        return sorted(file for file in path.rglob("*") if file.suffix.lower() in RAW_FOLDER_EXTENSIONS)
+        return sorted(file for file in path.rglob("*") if file.suffix.lower() in RAW_EXTENSIONS)
     return [path]
 
 

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.folders import EXTENSIONS
+from rawaug.data.folders import RAW_EXTENSIONS
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
 from rawaug.data.mosaic_metadata import KINDS, Statements, levels, shown
 from rawaug.errors import extra
@@ -45,7 +45,7 @@ from rawaug.io.pictures import MAX_PIXELS, read_plane
 from rawaug.io.tiff import opened_tiff
 
 ARRAYS = (".npz", ".tif", ".tiff", ".png", ".mat")
-READABLE = (*EXTENSIONS, *ARRAYS)
+READABLE = (*RAW_EXTENSIONS, *ARRAYS)
 TWO_IN_ONE = (".npz", ".mat")
 """Files that may hold both mosaics of a pair."""
 
@@ -86,7 +86,7 @@ def read_mosaic(file: Path, which: str, given: Statements, alone: bool = False, 
         ValueError: if CFA or levels are unknown or contradict ``given``, or the numbers are not a mosaic within them.
     """
     suffix = file.suffix.lower()
-    if suffix in EXTENSIONS:
+    if suffix in RAW_EXTENSIONS:
         return _camera_file(file, given)
     if suffix in TWO_IN_ONE:
         numbers, values = apart(_npz, file, which, alone) if suffix == ".npz" else _mat(file, which, alone)
