@@ -13,13 +13,14 @@ from rawaug.noise.cameras import (
     noise_model,
     noise_names,
 )
-from rawaug.noise.dark import DarkNoise, from_dark_frames
+from rawaug.noise.dark import DarkFrames, DarkNoise, from_dark_frames
 from rawaug.noise.estimate import NoiseEstimate, NoisePoints, estimate_noise, plot_noise
 from rawaug.noise.levels import EldLevels, FixedLevels, NoiseLevels, PmridLevels, Preset, SiddLevels
 from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import (
     BlackOffset,
     ColourBias,
+    ColumnNoise,
     Compose,
     DefectPixels,
     EldNoise,
@@ -33,7 +34,9 @@ __all__ = [
     "BlackOffset",
     "CalibratedNoise",
     "ColourBias",
+    "ColumnNoise",
     "Compose",
+    "DarkFrames",
     "DarkNoise",
     "DefectPixels",
     "EldLevels",

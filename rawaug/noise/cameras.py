@@ -402,6 +402,8 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     """
     if isinstance(spec, Mapping) and "pair_psnr" in spec:
         spec = {"name": "CalibratedNoise", "settings": dict(spec)}
+    if isinstance(spec, Mapping) and "settings" not in spec:  # {name: DarkFrames, path: ...}
+        spec = {"name": spec.get("name"), "settings": {key: spec[key] for key in spec if key != "name"}}
     if isinstance(spec, (str, Mapping)):
         name, settings = name_and_settings(spec)
         if name not in NOISE:

@@ -3,6 +3,8 @@ r"""Read noise, banding and black level from dark frames: pictures taken with th
 Without light, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours of one colour hold n alone,
 twice its variance; those between the means of successive sensor rows hold the banding as well (after Wei et al. 2020).
 Slow gradients (amplifier glow) cancel in both. Signals are black-subtracted with the file's own black level, white = 1.
+
+Or no model at all: :class:`DarkFrames` takes the frames as they are, with the photons that they lack.
 """
 
 from __future__ import annotations
@@ -14,6 +16,10 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, pack
+from rawaug.io import read_raw
+from rawaug.noise.models import Params, PoissonGaussianNoise, new_seeds
+from rawaug.noise.sensor import Range, draw
+from rawaug.registry import NOISE
 
 _OUTLIER = 8.0  # in robust standard deviations: hot pixels, not tails
 _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can be measured
@@ -64,3 +70,54 @@ def _measure(planes: Tensor) -> Tensor:
     rows = levelled.reshape(2, 2, *planes.shape[1:]).mean((1, 3))
     row_var = rows.diff(dim=-1).square().mean() / 2 - read_var / (2 * planes.shape[-1])
     return torch.cat([read_var[None], row_var[None], levelled.mean((1, 2)) + offsets])
+
+
+@NOISE.register("DarkFrames")
+class DarkFrames(PoissonGaussianNoise):
+    """Photons, and read noise cut out of a camera's own dark frames: ``shot_var Poisson(y / shot_var) + dark``.
+
+    Every picture has a patch of a random frame at a random place of the same CFA phase, with all that the sensor does
+    in it: tails, banding, offsets, hot pixels, rounding. At its edges a frame goes on at the other side.
+
+    Args:
+        path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
+        shot_var: of the photons at the frames' ISO, or limits that it is drawn between; by default that of each file's
+            NoiseProfile tag.
+
+    Raises:
+        FileNotFoundError, OSError: if there is no such file, or it cannot be read.
+        ValueError: if there is no RAW file, one is clipped at black, or ``shot_var`` is neither given nor in the tags.
+
+    Example:
+        >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
+    """
+
+    by_plane = True
+
+    def __init__(self, path: str, shot_var: Range | None = None) -> None:
+        from rawaug.data.folders import RawFolder
+
+        frames = [read_raw(file) for file in RawFolder(path).files]
+        untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
+        if untagged:
+            raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
+        self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
+        self.read_var = torch.tensor([from_dark_frames([frame.mosaic], frame.cfa).read_var for frame in frames])
+        self.shot_var = [shot_var or frame.noise_profile[0] for frame in frames]  # type: ignore[index]
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
+        shot = torch.stack([draw(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
+        read = self.read_var.to(generator.device)[frame]
+        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": new_seeds(batch, generator)}
+
+    def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        noise = torch.empty_like(like, memory_format=torch.contiguous_format)
+        for picture, index, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
+            planes = self.planes[index].to(like)
+            rows, columns = (
+                (torch.arange(size) + int(torch.randint(side, (), generator=generator, device=like.device))) % side
+                for side, size in zip(planes.shape[-2:], like.shape[-2:], strict=True)
+            )
+            picture.copy_(planes[:, rows[:, None], columns])
+        return noise

@@ -33,7 +33,10 @@ from rawaug.noise.models import (
     new_seeds,
     per_picture,
 )
-from rawaug.registry import NOISE
+from rawaug.registry import NOISE, require_between
+
+_NO_STEP = 1e-12
+"""Replaces a quantum of 0, where nothing is rounded; too small to affect the picture."""
 
 Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
@@ -46,7 +49,8 @@ def _require_not_negative(**values: Range) -> None:
             raise ValueError(f"{name} must be at least 0, or a range (low, high) with 0 < low <= high, got {value}")
 
 
-def _draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
+def draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
+    """``(batch,)``: the value, or log-uniform draws between its limits."""
     if isinstance(value, tuple):
         return log_uniform(value, batch, generator)
     return torch.full((batch,), float(value), device=generator.device, dtype=torch.float32)
@@ -117,7 +121,7 @@ class RowNoise(NoiseModel):
         self.row_var = row_var
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"row_var": _draw(self.row_var, batch, generator), "seed": new_seeds(batch, generator)}
+        return {"row_var": draw(self.row_var, batch, generator), "seed": new_seeds(batch, generator)}
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -127,6 +131,28 @@ class RowNoise(NoiseModel):
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         return per_picture(params["row_var"], clean).expand_as(clean).clone()
+
+
+class ColumnNoise(NoiseModel):
+    """The same of columns, of which R and Gb share one, and Gr and B the next."""
+
+    stream = "column"
+
+    def __init__(self, column_var: Range) -> None:
+        _require_not_negative(column_var=column_var)
+        self.column_var = column_var
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        return {"column_var": draw(self.column_var, batch, generator), "seed": new_seeds(batch, generator)}
+
+    @torch.no_grad()
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        columns = drawn_normals(clean[:, :2, :1], self.generators(params, clean.device))
+        columns *= per_picture(params["column_var"], clean).sqrt()
+        return torch.add(clean, columns.repeat(1, 2, 1, 1), out=out)
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        return per_picture(params["column_var"], clean).expand_as(clean).clone()
 
 
 class _FixedPattern(NoiseModel):
@@ -173,20 +199,22 @@ class DefectPixels(_FixedPattern):
     """Dead pixels read black; hot ones add a dark current of U(0, 1), so that many reach white.
 
     Args:
-        dead, hot: the share of pixels, typically 1e-5 to 1e-3. ``variance`` leaves them out: they are not noise of a
-            pixel's signal but pixels to be found.
+        dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it. ``variance`` leaves them out: they are
+            not noise of a pixel's signal but pixels to be found.
+        clusters: the share of these whose whole 2 x 2 cell is alike.
     """
 
     stream = "defects"
 
-    def __init__(self, dead: float = 0.0, hot: float = 0.0) -> None:
+    def __init__(self, dead: Range = 0.0, hot: Range = 0.0, clusters: float = 0.0) -> None:
         _require_not_negative(dead=dead, hot=hot)
-        if dead + hot > 1:
+        require_between("clusters", clusters, 0.0, 1.0)
+        if sum(max(share) if isinstance(share, tuple) else share for share in (dead, hot)) > 1:
             raise ValueError(f"shares of dead and hot pixels must add up to at most 1, got {dead} and {hot}")
-        self.dead, self.hot = dead, hot
+        self.dead, self.hot, self.clusters = dead, hot, clusters
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        shares = {"dead_share": _draw(self.dead, batch, generator), "hot_share": _draw(self.hot, batch, generator)}
+        shares = {"dead_share": draw(self.dead, batch, generator), "hot_share": draw(self.hot, batch, generator)}
         return shares | {"seed": new_seeds(batch, generator)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -195,6 +223,9 @@ class DefectPixels(_FixedPattern):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
             drawn = torch.rand((2, *clean.shape[1:]), generator=generator, device=clean.device, dtype=torch.float32)
             place, current = drawn.to(clean)
+            if self.clusters:
+                cell = torch.rand(clean.shape[-2:], generator=generator, device=clean.device, dtype=torch.float32)
+                place = torch.where(cell < self.clusters, place[:1], place)
             noisy[i].masked_fill_(place < dead, 0.0)
             noisy[i] += torch.where(place >= 1 - hot, current, 0.0)
         return noisy
@@ -204,7 +235,7 @@ class Quantisation(NoiseModel):
     """Rounding to the sensor's digital numbers.
 
     Args:
-        bits: the sensor's depth.
+        bits: the sensor's depth, or several, of which each picture has one.
         black_level: in digital numbers; the grid has 2^bits - 1 - black_level steps from black to white.
 
     The claimed variance, a twelfth of a squared step, holds where the other noise is at least half a step strong.
@@ -212,16 +243,20 @@ class Quantisation(NoiseModel):
 
     stream = "quantisation"
 
-    def __init__(self, bits: int, black_level: int = 0) -> None:
-        if not 1 <= bits <= 16 or not 0 <= black_level < 2**bits - 1:
+    def __init__(self, bits: int | tuple[int, ...], black_level: int = 0) -> None:
+        depths = bits if isinstance(bits, tuple) else (bits,)
+        if not all(1 <= depth <= 16 and 0 <= black_level < 2**depth - 1 for depth in depths) or not depths:
             raise ValueError(f"bits must be 1 to 16 and the black level below white, got {bits} and {black_level}")
-        self.quantum = 1 / (2**bits - 1 - black_level)
+        self.quanta = [1 / (2**depth - 1 - black_level) for depth in depths]
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"quantum": _draw(self.quantum, batch, generator)}
+        if len(self.quanta) == 1:
+            return {"quantum": draw(self.quanta[0], batch, generator)}
+        chosen = torch.randint(len(self.quanta), (batch,), generator=generator, device=generator.device)
+        return {"quantum": torch.tensor(self.quanta, device=generator.device)[chosen]}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        quantum = per_picture(params["quantum"], clean)
+        quantum = per_picture(params["quantum"], clean).clamp_min(_NO_STEP)
         return torch.div(clean, quantum, out=out).round_().mul_(quantum)
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
@@ -263,6 +298,13 @@ class Compose(NoiseModel):
         return torch.stack([model.variance(clean, params) for model in self.models]).sum(0)
 
 
+_ABSENT = {
+    "row_var": 0.0, "column_var": 0.0, "black_offset": 0.0, "colour_bias": 0.0, "dead_share": 0.0, "hot_share": 0.0,
+    "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14,
+}  # fmt: skip
+"""What the parameters of :class:`SensorNoise` are where the effect is absent; 0.14 is near the normal."""
+
+
 @NOISE.register("SensorNoise")
 class SensorNoise(Compose):
     """Shot and read noise with a switch for everything else that a sensor does; what is 0 or None is off.
@@ -271,11 +313,15 @@ class SensorNoise(Compose):
         levels: what samples (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
         poisson: exact photon statistics instead of the Gaussian.
         tukey_lambda: shape of heavy-tailed read noise instead of Gaussian, or a range of it. Implies ``poisson``.
-        row_var: variance of banding, or a range of it.
+        row_var, column_var: variance of banding along rows and columns, or a range of it.
         black_offset_sd: standard deviation of the black level's error.
         colour_bias_sd: standard deviation of the colours' offsets.
-        dead, hot: shares of defect pixels.
-        bits, black_level: the grid of digital numbers.
+        dead, hot: shares of defect pixels, or ranges of them.
+        clusters: share of the defects whose whole 2 x 2 cell is defect.
+        bits, black_level: the grid of digital numbers; of several depths each picture has one.
+        told: range of the factor by which the variance map is wrong, as levels in tags are.
+        share: of the pictures that have an effect, drawn for each effect on its own; all have shot and read noise. So
+            that a denoiser meets sensors as they are without forgetting ideal ones.
 
     Example:
         >>> from rawaug.noise import Preset
@@ -289,28 +335,51 @@ class SensorNoise(Compose):
         poisson: bool = False,
         tukey_lambda: float | tuple[float, float] | None = None,
         row_var: Range = 0.0,
+        column_var: Range = 0.0,
         black_offset_sd: float = 0.0,
         colour_bias_sd: float = 0.0,
-        dead: float = 0.0,
-        hot: float = 0.0,
-        bits: int | None = None,
+        dead: Range = 0.0,
+        hot: Range = 0.0,
+        clusters: float = 0.0,
+        bits: int | tuple[int, ...] | None = None,
         black_level: int = 0,
+        told: tuple[float, float] = (1.0, 1.0),
+        share: float = 1.0,
     ) -> None:
+        _require_not_negative(told=told)
+        require_between("share", share, 0.0, 1.0)
+        self.told, self.share = told, share
         levels = noise_levels(levels) if isinstance(levels, (str, Sequence)) else levels
         models: list[NoiseModel] = [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
         if tukey_lambda is not None:
             models = [TukeyLambdaNoise(levels, tukey_lambda)]
         if row_var:
             models.append(RowNoise(row_var))
+        if column_var:
+            models.append(ColumnNoise(column_var))
         if black_offset_sd:
             models.append(BlackOffset(black_offset_sd))
         if colour_bias_sd:
             models.append(ColourBias(colour_bias_sd))
         if dead or hot:
-            models.append(DefectPixels(dead, hot))
+            models.append(DefectPixels(dead, hot, clusters))
         if bits is not None:
             models.append(Quantisation(bits, black_level))
         super().__init__(models)
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        params = super().sample(batch, generator)
+        if self.told != (1.0, 1.0):
+            params["told"] = log_uniform(self.told, batch, generator)
+        for name, none in _ABSENT.items() if self.share < 1 else ():
+            if name in params:
+                absent = torch.rand(batch, generator=generator, device=generator.device) >= self.share
+                params[name][absent] = none
+        return params
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        variance = super().variance(clean, params)
+        return variance.mul_(per_picture(params["told"], clean)) if "told" in params else variance
 
 
 @NOISE.register("EldNoise")

@@ -129,8 +129,8 @@ def test_an_iso_outside_the_measured_range_is_refused(name: str) -> None:
 
 def test_noise_by_name() -> None:
     known = noise_names()
-    models, known = known[:4], known[4:]
-    assert models == ["CalibratedNoise", "EldNoise", "MeasuredNoise", "SensorNoise"]
+    models, known = known[:5], known[5:]
+    assert models == ["CalibratedNoise", "DarkFrames", "EldNoise", "MeasuredNoise", "SensorNoise"]
     assert camera_names() == known[4:15] and known[15] == "any camera" and len(known) == 4 + 5 + 1 + 5 + 1 + 369
     for name in known[:20]:
         assert type(noise_model(name)) is ShotReadNoise

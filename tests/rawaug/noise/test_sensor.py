@@ -7,7 +7,17 @@ import torch
 from scipy import stats
 
 from rawaug.bayer import CFA, unpack
-from rawaug.noise import BlackOffset, ColourBias, DefectPixels, FixedLevels, Quantisation, RowNoise, TukeyLambdaNoise
+from rawaug.noise import (
+    BlackOffset,
+    ColourBias,
+    ColumnNoise,
+    DefectPixels,
+    FixedLevels,
+    Quantisation,
+    RowNoise,
+    SensorNoise,
+    TukeyLambdaNoise,
+)
 from rawaug.noise.sensor import tukey_lambda_variance
 
 
@@ -37,11 +47,16 @@ def test_tukey_lambda_shapes_are_drawn_and_checked() -> None:
         TukeyLambdaNoise(FixedLevels(0, 0), -0.5)
 
 
+@pytest.mark.parametrize("model", [RowNoise(1e-4), ColumnNoise(1e-4)])
 @pytest.mark.parametrize("cfa", list(CFA))
-def test_banding_is_constant_along_rows_of_the_mosaic_and_independent_between_them(cfa: CFA) -> None:
-    model = RowNoise(1e-4)
-    noise = model.apply(torch.zeros(2, 4, 512, 16), model.sample(2, generator()))
+def test_banding_is_constant_along_lines_of_the_mosaic_and_independent_between_them(
+    cfa: CFA, model: RowNoise | ColumnNoise
+) -> None:
+    along_rows = isinstance(model, RowNoise)
+    shape = (512, 16) if along_rows else (16, 512)
+    noise = model.apply(torch.zeros(2, 4, *shape), model.sample(2, generator()))
     mosaic = unpack(noise, cfa)[:, 0]
+    mosaic = mosaic if along_rows else mosaic.mT
     assert torch.equal(mosaic, mosaic[..., :1].expand_as(mosaic))
     rows = mosaic[..., 0]
     assert abs(float(torch.corrcoef(torch.stack([rows[0, :-1], rows[0, 1:]]))[0, 1])) < 0.1
@@ -77,6 +92,44 @@ def test_defects_are_as_many_as_asked_for() -> None:
     assert (hot == 1).float().mean() == pytest.approx(0.3, abs=0.03)
     with pytest.raises(ValueError, match="add up to at most 1"):
         DefectPixels(0.6, 0.6)
+
+
+def test_defects_in_clusters_fill_their_cell() -> None:
+    model = DefectPixels(hot=1e-2, clusters=0.5)
+    noisy = model.apply(torch.full((1, 4, 512, 512), 0.0), model.sample(1, generator()))
+    hot = (noisy > 0).sum(dim=1)
+    assert hot.float().mean() / 4 == pytest.approx(1e-2, rel=0.1)
+    assert (hot == 4).float().mean() == pytest.approx(0.5e-2, rel=0.1)  # by chance 1e-8
+
+
+def test_several_depths_are_drawn_per_picture() -> None:
+    model = Quantisation((8, 12))
+    quantum = model.sample(1000, generator())["quantum"]
+    assert (quantum == 1 / 255).float().mean() == pytest.approx(0.5, abs=0.05)
+    assert set(quantum.tolist()) == set(torch.tensor([1 / 255, 1 / 4095]).tolist())
+
+
+def test_a_share_of_the_pictures_has_an_effect_and_the_others_ideal_noise() -> None:
+    every = {"row_var": 1e-4, "column_var": 1e-4, "black_offset_sd": 1e-2, "colour_bias_sd": 1e-2, "dead": 1e-2}
+    model = SensorNoise((1e-3, 1e-5), **every, hot=1e-2, bits=6, told=(0.5, 2.0), share=0.25)  # type: ignore[arg-type]
+    params = model.sample(2000, generator())
+    switched = ("row_var", "column_var", "black_offset", "colour_bias", "dead_share", "hot_share", "quantum")
+    present = torch.stack([params[name].reshape(2000, -1)[:, 0] != 0 for name in switched])
+    torch.testing.assert_close(present.float().mean(1), torch.full((7,), 0.25), atol=0.04, rtol=0)
+    assert torch.corrcoef(present.float()).triu(1).abs().max() < 0.1  # each on its own
+    told = params["told"]
+    assert (told != 1).float().mean() == pytest.approx(0.25, abs=0.04) and 0.5 <= told.min() < told.max() <= 2
+    ideal, clean = SensorNoise((1e-3, 1e-5), **every, bits=6, share=0.0), torch.rand(2, 4, 32, 32)  # type: ignore[arg-type]
+    drawn = ideal.sample(2, generator())
+    plain = SensorNoise((1e-3, 1e-5))
+    torch.testing.assert_close(ideal.apply(clean, drawn), plain.apply(clean, drawn), rtol=0, atol=1e-6)
+
+
+def test_told_levels_are_wrong_by_their_factor() -> None:
+    clean, wrong = torch.rand(2, 4, 8, 8, generator=generator()), SensorNoise((1e-3, 1e-5), told=(0.5, 0.5))
+    params = wrong.sample(2, generator())
+    assert torch.equal(wrong.apply(clean, params), SensorNoise((1e-3, 1e-5)).apply(clean, params))
+    torch.testing.assert_close(wrong.variance(clean, params), 0.5 * (1e-3 * clean + 1e-5))
 
 
 def test_impossible_depths_are_refused() -> None:
