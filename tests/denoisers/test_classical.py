@@ -1,5 +1,6 @@
 """Classical denoisers: less noise on a picture with edges, none is the identity, scale-free, shot noise stabilised."""
 
+import math
 import sys
 
 import pytest
@@ -25,12 +26,13 @@ def mse(a: Tensor, b: Tensor) -> float:
     return (a - b).square().mean().item()
 
 
-@pytest.mark.parametrize("method", OWN)
-def test_most_of_the_noise_goes(method: type[Classical]) -> None:
+@pytest.mark.parametrize(("method", "psnr"), [(NonLocalMeans, 41.38), (Wavelet, 40.79), (TotalVariation, 36.99)])
+def test_most_of_the_noise_goes(method: type[Classical], psnr: float) -> None:
+    """30.44 dB before. The figures are pinned: published tables rest on these settings."""
     clean, noisy = scene()
     denoised = method()(noisy, torch.full_like(noisy, SIGMA**2))
     assert denoised.shape == noisy.shape and denoised.dtype == noisy.dtype
-    assert mse(denoised, clean) < 0.35 * mse(noisy, clean)
+    assert -10 * math.log10(mse(denoised, clean)) == pytest.approx(psnr, abs=0.1)
     assert (denoised - clean).mean().abs() < 1e-3
 
 

@@ -64,6 +64,8 @@ def test_weak_shot_noise_is_bounded_and_the_noise_map_says_by_how_much() -> None
         assert DOMAINS["anscombe"].forward(y, *of(shot, 0.0)).max().item() < 2.0 * (1.0 / LEAST_SHOT) ** 0.5
         deviation = relative_deviation(y, shot * y, *of(shot, 0.0))
         assert deviation.mean().item() == pytest.approx((shot / LEAST_SHOT) ** 0.5, rel=1e-4)
+    above_the_law = relative_deviation(y, 4.0 * (1e-2 * y + 1e-5), *of(1e-2, 1e-5))
+    assert above_the_law.max().item() == 1.0, "the network was trained on 1 and less"
     # Read noise alone: photons are invented, a thousandth of its deviation, so that r / s^2 stays a number.
     seen = DOMAINS["ksigma"].forward(y, *of(0.0, 1.0))
     assert seen.isfinite().all() and seen.max() < 1e6

@@ -46,6 +46,23 @@ def test_the_average_of_many_is_that_of_the_network_over_the_noise() -> None:
     assert error(64) == pytest.approx(error(1) / 64, rel=0.3)
 
 
+def test_in_shadows_the_extra_noise_does_not_follow_the_noise() -> None:
+    """Drawn with the variance at the noisy value, bright readings would get more of it than dark ones."""
+    clean, shot_var, read_var = torch.full((1, 4, 128, 128), 0.02), 8e-3, 3e-4
+    deviation = (shot_var * 0.02 + read_var) ** 0.5
+    noisy = clean + deviation * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    seen: list[Tensor] = []
+
+    def perfect(image: Tensor, noise_map: Tensor | None) -> Tensor:
+        seen.append(image)
+        return clean
+
+    Recorrupted(perfect, ALPHA, draws=4)(noisy, shot_var * noisy.clamp_min(0.0) + read_var)
+    added = (torch.stack(seen[1:]) - noisy) / (ALPHA * deviation)
+    for side in (noisy > clean, noisy < clean):
+        assert added.square().mean(0)[side].mean().item() == pytest.approx(1.0, abs=0.03)
+
+
 def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
     noisy, variance = frame()
     average = Recorrupted(lambda z, _: z, ALPHA, 3)

@@ -24,7 +24,7 @@ def test_a_name_is_given_once_and_a_module_may_run_again() -> None:
     kinds = Registry("thing", "rawaug.things", "denoisers")
     kinds.register("a")(R2R)
     assert kinds.register("a")(R2R) is R2R and kinds["a"] is R2R and kinds.name_of(R2R) == "a"
-    with pytest.raises(ValueError, match=r"thing 'a' is .*r2r\.R2R already; give .*Noisier another name"):
+    with pytest.raises(ValueError, match=r"thing 'a' is .*estimators\.R2R already; give .*Noisier another name"):
         kinds.register("a")(Noisier)
 
 
