@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from denoisers.files import DENOISERS, build, from_pretrained, load, save
     from denoisers.inference import SelfEnsemble, tiled
     from denoisers.network import Denoiser
-    from denoisers.networks import DHDN, DnCNN, NAFNet, UNet
+    from denoisers.networks import DHDN, DnCNN, DRUNet, NAFNet, UNet
     from denoisers.pmrid import PMRID
 
 _MODULES = {
@@ -23,6 +23,7 @@ _MODULES = {
     "DENOISERS": "denoisers.files",
     "CycleISPDenoiser": "denoisers.cycleisp",
     "DHDN": "denoisers.networks",
+    "DRUNet": "denoisers.networks",
     "Denoiser": "denoisers.network",
     "DnCNN": "denoisers.networks",
     "NAFNet": "denoisers.networks",
@@ -47,6 +48,7 @@ __all__ = [
     "DHDN",
     "PMRID",
     "CycleISPDenoiser",
+    "DRUNet",
     "Denoiser",
     "DnCNN",
     "NAFNet",

@@ -10,8 +10,8 @@ anscombe    :math:`z = 2 \sqrt{u + 3/8}`                     variance 1 everywhe
 
 After a transform every exposure of every camera is the same problem. The network is trained to give the transformed
 *clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays
-invertible for any noise. Photons are counted with s of at least :data:`LEAST_SHOT`; a noise map then holds the noise's
-deviation relative to that, which is 1 for stronger noise.
+invertible for any noise. Photons are counted with s of at least the domain's ``least_shot``; a noise map then holds the
+noise's deviation relative to that, which is 1 for stronger noise.
 
 Sources: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020 (k-sigma; its anchor is ISO 1600
 of a Reno-10x on a scale with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
@@ -22,13 +22,11 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from types import MappingProxyType
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-LEAST_SHOT = 6e-4
-"""Least shot_var of the transforms, white at 1,700 photons: inputs need a bound, and white at ISO 100 is 400
-times its noise."""
 _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
@@ -57,16 +55,32 @@ def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Domain(ABC):
-    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``."""
+    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``.
+
+    Attributes:
+        least_shot: the least shot_var that photons are counted with.
+    """
+
+    least_shot: ClassVar[float]
 
     def forward(self, y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """RAW to what the network sees."""
-        return self.encode(_photons(y, *_bounded(shot, read)))
+        shot = self.bounded(shot, read)
+        return self.encode(y / shot + read / shot.square())
 
     def inverse(self, z: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """What the network gives back to RAW."""
-        shot, read = _bounded(shot, read)
+        shot = self.bounded(shot, read)
         return shot * (self.decode(z) - read / shot.square())
+
+    def bounded(self, shot: Tensor, read: Tensor) -> Tensor:
+        """The shot_var that photons are counted with."""
+        return torch.maximum(shot.clamp_min(self.least_shot), _LEAST_RATIO * read.sqrt())
+
+    def relative_deviation(self, y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """The noise's deviation over what the transform takes it for: below 1 where shot_var is below its bound."""
+        expected = self.bounded(shot, read) * y.clamp_min(0.0) + read
+        return (variance / expected.clamp_min(1e-20)).sqrt().clamp_max(1.0)
 
     @abstractmethod
     def encode(self, u: Tensor) -> Tensor:
@@ -78,8 +92,9 @@ class Domain(ABC):
 
 
 class KSigma(Domain):
-    """PMRID's: noise as that of ISO 1600, in PMRID's units."""
+    """PMRID's: noise as that of ISO 1600, in PMRID's units. White grows with 1 / s, so its bound is a high one."""
 
+    least_shot = 6e-4
     shot = 5.995267e-4 * 1600 + 8.68861e-3
     read = 7.11772e-7 * 1600**2 + 6.514934e-4 * 1600 + 0.11492713
     scale = 256.0 / 959.0
@@ -94,36 +109,22 @@ class KSigma(Domain):
 
 
 class Anscombe(Domain):
-    """The generalised Anscombe transform: noise of deviation 1, white at 10 (ISO 25,600) to 400 (ISO 100)."""
+    """The generalised Anscombe transform: noise of deviation 1, white at 13 (ISO 25,600) to 400 (ISO 100)."""
 
-    scale = 1.0
+    least_shot = 1e-5
     offset = 0.375
 
     def encode(self, u: Tensor) -> Tensor:
         """The root of u + 3/8, below u = 0 its tangent."""
         root = 2.0 * (u.clamp_min(0.0) + self.offset).sqrt()
-        return self.scale * (root + u.clamp_max(0.0) / math.sqrt(self.offset))
+        return root + u.clamp_max(0.0) / math.sqrt(self.offset)
 
     def decode(self, z: Tensor) -> Tensor:
         """The square, below the root's value at 0 the tangent's inverse."""
-        z, least = z / self.scale, 2.0 * math.sqrt(self.offset)
+        least = 2.0 * math.sqrt(self.offset)
         square = (z.clamp_min(least) / 2.0).square() - self.offset
         return square + (z - least).clamp_max(0.0) * math.sqrt(self.offset)
 
 
 DOMAINS = MappingProxyType({"ksigma": KSigma(), "anscombe": Anscombe()})
 """Name to transform; ``linear`` is none."""
-
-
-def _photons(y: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-    return y / shot + read / shot.square()
-
-
-def _bounded(shot: Tensor, read: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.maximum(shot.clamp_min(LEAST_SHOT), _LEAST_RATIO * read.sqrt()), read
-
-
-def relative_deviation(y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-    """The noise's deviation over what a transform takes it for: below 1 where shot_var is below its bound."""
-    shot, read = _bounded(shot, read)
-    return (variance / (shot * y.clamp_min(0.0) + read).clamp_min(1e-20)).sqrt().clamp_max(1.0)

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from denoisers.domains import DOMAINS, levels_of, relative_deviation
+from denoisers.domains import DOMAINS, levels_of
 from rawaug.registry import require_between
 
 PACKED = 4
@@ -27,6 +27,9 @@ PACKED = 4
 
 MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
 """Larger networks are refused before they are built: a few bytes of a file or a recipe can ask for any size."""
+
+NEAR = 8.0
+"""Deviations of the noise within which a network is told of the limits of the signal."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""
@@ -89,6 +92,8 @@ class Denoiser(nn.Module, ABC):
         config: the constructor's arguments, kept with the weights so that the same network can be built again.
         domain: ``linear``, or a transform of :mod:`denoisers.domains`; calls must then pass ``variance``, a map
             ``shot_var max(noisy, 0) + read_var``.
+        limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
+            at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
 
     Raises:
         ValueError: if there is no such domain.
@@ -105,12 +110,15 @@ class Denoiser(nn.Module, ABC):
         stride: int,
         config: dict[str, Any],
         domain: str = "linear",
+        limits: bool = False,
     ) -> None:
         super().__init__()
+        if limits and domain == "linear":
+            raise ValueError("limits are those of a transformed signal; choose domain ksigma or anscombe")
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         require_between("channels", channels, 1, MOST_FEATURES)
-        self.domain = domain
+        self.domain, self.limits = domain, limits
         self.channels = channels
         self.variance_map = variance_map
         self.deviation = deviation
@@ -121,7 +129,7 @@ class Denoiser(nn.Module, ABC):
     @property
     def inputs(self) -> int:
         """Channels that enter the first layer."""
-        return self.channels * (1 + self.variance_map)
+        return self.channels * (1 + self.variance_map + 2 * self.limits)
 
     @property
     def reads_variance(self) -> bool:
@@ -160,14 +168,17 @@ class Denoiser(nn.Module, ABC):
             return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
-        noise_map = relative_deviation(noisy.float(), variance.float(), *levels) if self.variance_map else None
-        correction = self._correction(signal, noise_map)
-        correction = correction if noise_map is None else noise_map * correction
+        maps = [domain.relative_deviation(noisy.float(), variance.float(), *levels)] if self.variance_map else []
+        if self.limits:
+            white = domain.forward(torch.ones_like(levels[0]), *levels)
+            maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
+        correction = self._correction(signal, *maps)
+        correction = maps[0] * correction if self.variance_map else correction
         denoised = domain.inverse(signal + correction, *levels)
         return torch.where(variance > 0, denoised, noisy).to(noisy.dtype)
 
-    def _correction(self, signal: Tensor, noise_map: Tensor | None = None) -> Tensor:
-        features = signal if noise_map is None else torch.cat([signal, noise_map], dim=1)
+    def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
+        features = torch.cat([signal, *maps], dim=1) if maps else signal
         correction = self.residual(pad_to_multiple(features.to(self._dtype), self.stride))
         return correction[..., : signal.shape[-2], : signal.shape[-1]]
 

@@ -26,6 +26,15 @@ each enters with a learned factor that starts at 0. Convolutions 2 x 2 of stride
 are added. Source: Chen et al., "Simple Baselines for Image Restoration", ECCV 2022.
 
 The channel attention averages over the whole input: a tile and the whole picture differ a little.
+
+DRUNet: a U-Net of residual blocks without biases; ``denoised = noisy + D(features)``.
+
+Domain: packed RAW. A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise
+convolution and a pixel shuffle up (the source has transposed convolutions), skips are added. Without biases a network
+that is trained at some noise levels denoises at others too. Here it sees the signal less its mean over 8 x 8 pixels,
+interpolated: light and shade are then the same problem, and bfloat16 has digits for the noise, not for the brightness.
+Sources: Zhang et al., "Plug-and-Play Image Restoration with Deep Denoiser Prior", TPAMI 2021; Mohan et al., "Robust and
+Interpretable Blind Image Denoising via Bias-Free Convolutional Neural Networks", ICLR 2020.
 """
 
 from __future__ import annotations
@@ -38,6 +47,9 @@ from torch.nn import functional as F
 
 from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS, require_between
+
+MEAN_OVER = 8
+"""Sides of the squares whose mean DRUNet's signal is without."""
 
 PUBLISHED_WIDTH = 32
 """Features of the first scale in the paper."""
@@ -354,3 +366,85 @@ class NAFNet(Denoiser):
 
 def _blocks(width: int, number: int) -> nn.Sequential:
     return nn.Sequential(*(Block(width) for _ in range(number)))
+
+
+class ResidualBlock(nn.Module):
+    """``x + conv(ReLU(conv(x)))``."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = conv(width, width, bias=False), conv(width, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Of any shape ``(B, width, h, w)``."""
+        return x + self.conv2(self.conv1(x).relu_())
+
+
+@DENOISERS.register("DRUNet")
+class DRUNet(Denoiser):
+    """See the module's head. Any h, w >= 2: padded by reflection inside.
+
+    Args:
+        width: features of the first scale, doubled at each further one; 64 is published.
+        scales: of the pyramid; 4 is published.
+        blocks: of each scale, going down and going up; 4 is published.
+        limits: feed how near black and white the transformed signal is; not in the domain linear.
+        channels: 4 for packed RAW.
+        variance_map: take the noise map as ``channels`` more inputs.
+        deviation: the map is sqrt(variance).
+        domain: linear, ksigma or anscombe; see :mod:`denoisers.domains`.
+        seed: of the initial weights.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> DRUNet(width=4, blocks=1)(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 4, 33, 50])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2, "blocks": 1}
+
+    def __init__(
+        self,
+        width: int = 64,
+        scales: int = 4,
+        blocks: int = 4,
+        limits: bool = False,
+        channels: int = PACKED,
+        variance_map: bool = True,
+        deviation: bool = True,
+        domain: str = "linear",
+        seed: int = 0,
+    ) -> None:
+        require_width(width)
+        require_between("scales", scales, 1, MOST_SCALES)
+        require_bounded(seed, blocks=blocks)
+        config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits}
+        stride = max(MEAN_OVER, 2 ** (scales - 1))
+        super().__init__(channels, variance_map, deviation, stride, config, domain, limits)
+        sizes = [width * 2**k for k in range(scales)]
+        self.head = conv(self.inputs, width, bias=False)
+        self.encoder = nn.ModuleList(_residuals(size, blocks) for size in sizes)
+        self.downs = nn.ModuleList(conv(c, 2 * c, 2, bias=False, stride=2, padding=0) for c in sizes[:-1])
+        self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
+        self.decoder = nn.ModuleList(_residuals(size, blocks) for size in reversed(sizes[:-1]))
+        self.tail = conv(width, channels, bias=False)
+        # As in DHDN: residual blocks one after another stay tame when each starts as the identity.
+        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+        self.initialise(seed, self.tail, *ends, gain=1.0)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+        signal, maps = features[:, : self.channels], features[:, self.channels :]
+        mean = F.interpolate(F.avg_pool2d(signal, MEAN_OVER), scale_factor=MEAN_OVER, mode="bilinear")
+        x, skips = self.head(torch.cat([signal - mean, maps], dim=1)), []
+        for k, blocks in enumerate(self.encoder):
+            x = blocks(self.downs[k - 1](x) if k else x)
+            skips.append(x)
+        for up, blocks, skip in zip(self.ups, self.decoder, reversed(skips[:-1]), strict=True):
+            x = blocks(F.pixel_shuffle(up(x), 2) + skip)
+        correction: Tensor = self.tail(x)
+        return correction
+
+
+def _residuals(width: int, number: int) -> nn.Sequential:
+    return nn.Sequential(*(ResidualBlock(width) for _ in range(number)))

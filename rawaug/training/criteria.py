@@ -21,7 +21,7 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from denoisers.domains import DOMAINS, Anscombe, levels_of
+from denoisers.domains import DOMAINS, levels_of
 from rawaug.data.pairs import Sample
 from rawaug.registry import LOSSES
 
@@ -75,7 +75,7 @@ def normalised(loss: Criterion, sample: Sample) -> Criterion:
 def stabilised(loss: Criterion, sample: Sample) -> Criterion:
     """``loss`` where the noise has deviation 1 in shadow and light alike."""
     levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
-    return lambda denoised, clean: loss(*(root.forward(y, *levels) / Anscombe.scale for y in (denoised, clean)))
+    return lambda denoised, clean: loss(*(root.forward(y, *levels) for y in (denoised, clean)))
 
 
 def mixed(loss: Criterion, sample: Sample) -> Criterion:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
 from denoisers.network import pad_to_multiple
-from denoisers.networks import NAFNet
+from denoisers.networks import DRUNet, NAFNet
 from denoisers.pmrid import PMRID
 
 Make = Callable[..., Any]
@@ -25,6 +25,7 @@ SMALL: dict[str, Make] = {
     "DnCNN": lambda **settings: DnCNN(width=8, depth=4, **settings),
     "PMRID": lambda **settings: PMRID(width=4, **{"domain": "linear", "variance_map": True, **settings}),
     "NAFNet": lambda **settings: NAFNet(width=4, encoder=(1, 1), middle=1, decoder=(1, 1), **settings),
+    "DRUNet": lambda **settings: DRUNet(width=4, scales=3, blocks=1, **settings),
 }
 
 
@@ -164,6 +165,29 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
     torch.testing.assert_close(model(2 * noisy, 4 * variance), 2 * model(noisy, variance), rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="domain 'log' is unknown; use one of linear, ksigma, anscombe"):
         make(domain="log")
+
+
+@torch.no_grad()
+def test_drunet_s_correction_does_not_depend_on_brightness_away_from_the_limits() -> None:
+    """Nor, having no biases, is it limited to the size of the errors that it was trained on."""
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False))
+    signal = torch.randn(1, 4, 32, 32, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(net.residual(signal + 100.0), net.residual(signal), rtol=0, atol=1e-4)
+    torch.testing.assert_close(net.residual(7.0 * signal), 7.0 * net.residual(signal), rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_limits_tell_a_network_where_the_sensor_clips() -> None:
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False, domain="anscombe", limits=True))
+    seen: list[Tensor] = []
+    net.get_submodule("head").register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    noisy = torch.tensor([0.0, 0.5, 0.97, 1.0]).repeat_interleave(16).expand(1, 4, 64, 64)
+    net(noisy, 1e-3 * noisy)
+    black, white = (maps[0, 0, 0, ::16].tolist() for maps in (seen[0][:, 4:8], seen[0][:, 8:]))
+    assert black == pytest.approx([2 * 0.375**0.5, 8, 8, 8], abs=0.01)
+    assert white == pytest.approx([8, 8, 2 * (1000.375**0.5 - 970.375**0.5), 0], abs=0.01)
+    with pytest.raises(ValueError, match="limits are those of a transformed signal"):
+        DRUNet(limits=True)
 
 
 @torch.no_grad()

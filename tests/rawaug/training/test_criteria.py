@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers.domains import LEAST_SHOT
+from denoisers.domains import Anscombe
 from rawaug.data.pairs import Sample
 from rawaug.training.criteria import L1, L2, Charbonnier, weighed
 
@@ -63,7 +63,7 @@ def test_stabilised_is_the_loss_of_the_roots() -> None:
         assert weighed(L1(), "stabilised", SAMPLE)(level(denoised), level(clean)).item() == pytest.approx(
             expected, rel=1e-3
         )
-    assert SHOT > LEAST_SHOT  # below it the root has fewer photons
+    assert Anscombe.least_shot < SHOT  # below it the root has fewer photons
 
 
 def test_mixed_is_the_mean_of_both_in_units_of_the_noise() -> None:
