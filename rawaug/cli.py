@@ -122,13 +122,13 @@ def _recipe_of(argv: list[str]) -> tuple[list[str], str, Path | None]:
 def _require_known_keys(recipe: Path, kind: str, run: Any, helps: bool) -> None:
     """Refuse a recipe with a key that its kind does not have; the help shows the values of the recipe."""
     from rawaug.commands.spelling import require_known_keys
-    from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.kinds import kind_named
     from rawaug.experiment.plain_yaml import read_yaml
     from rawaug.experiment.recipe import defaults_of
 
     require_known_keys(recipe, read_yaml(recipe), run)
     if helps:
-        run.set_defaults(defaults_of(recipe, KINDS[kind].settings))
+        run.set_defaults(defaults_of(recipe, kind_named(kind).settings))
 
 
 def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
@@ -172,7 +172,7 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
 
 
 def _add_run_arguments(run: Any, kind: str) -> None:
-    from rawaug.experiment.kinds import KINDS
+    from rawaug.experiment.kinds import kind_named
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
     run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
@@ -182,15 +182,15 @@ def _add_run_arguments(run: Any, kind: str) -> None:
         help="show which data would be used and rehearse the run in seconds, without writing",
     )
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
-    run.add_class_arguments(KINDS[kind].settings)
+    run.add_class_arguments(kind_named(kind).settings)
 
 
 def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
-    from rawaug.experiment.kinds import KINDS, quickly
+    from rawaug.experiment.kinds import kind_named, quickly
     from rawaug.experiment.plan import with_own_pairs
     from rawaug.experiment.recipe import Recipe
 
-    experiment = KINDS[kind]
+    experiment = kind_named(kind)
     file, _ = settings.pop("recipe"), settings.pop("quiet")
     quick, dry, overwrite = (settings.pop(flag) for flag in ("smoke", "dry_run", "overwrite"))
     recipe = experiment.settings(**settings)

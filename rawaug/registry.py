@@ -117,7 +117,7 @@ class Registry(Mapping[str, Any]):
     Args:
         kind: what one of them is called in messages.
         group: of the entry points of other packages.
-        package: whose modules register the built-in ones.
+        packages: whose modules register the built-in ones.
 
     Example:
         >>> filters = Registry("filter", "rawaug.filters", "denoisers")
@@ -132,8 +132,8 @@ class Registry(Mapping[str, Any]):
         ValueError: filter Identity has no setting 'strenght'; it has strength (nearest: strength)
     """
 
-    def __init__(self, kind: str, group: str, package: str) -> None:
-        self.kind, self.group, self.package = kind, group, package
+    def __init__(self, kind: str, group: str, *packages: str) -> None:
+        self.kind, self.group, self.packages = kind, group, packages
         self._things: dict[str, Any] = {}
         self._complete = False
 
@@ -194,9 +194,9 @@ class Registry(Mapping[str, Any]):
     def _import_builtin(self) -> None:
         if self._complete:
             return
-        package = import_module(self.package)
-        for module in pkgutil.walk_packages(package.__path__, f"{self.package}."):
-            import_module(module.name)
+        for name in self.packages:
+            for module in pkgutil.walk_packages(import_module(name).__path__, f"{name}."):
+                import_module(module.name)
         self._complete = True
 
     @cached_property
@@ -252,6 +252,9 @@ LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
 """Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
 BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
 """Subclasses of :class:`rawaug.paper.baselines.base.BaselineISP`."""
+EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
+"""``run(settings, overwrite)``, named by a recipe's key ``experiment``; ``settings`` is a dataclass of its keys, whose
+method ``shortest()`` gives the settings with one step of everything."""
 COMMANDS = Registry("command", "rawaug.commands", "rawaug.commands")
 """Functions behind ``rawaug NAME``: arguments and help are those of the signature and the docstring."""
 

@@ -30,7 +30,7 @@ from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, noise_model
-from rawaug.registry import Spec
+from rawaug.registry import EXPERIMENTS, Spec
 
 TITLES = {"psnr": "PSNR, RAW (dB)", "ssim": "SSIM, RAW", "psnr_srgb": "PSNR, sRGB (dB)", "ssim_srgb": "SSIM, sRGB"}
 
@@ -90,6 +90,7 @@ def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
     return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
 
 
+@EXPERIMENTS.register("denoisers")
 def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     """Run a sweep; what stands in ``table.json``: by method its scores by ISO and its seconds a mosaic megapixel.
 

@@ -47,6 +47,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
+from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
 from rawaug.training.loop import train
 from rawaug.training.noisy_frames import noisy_only
@@ -62,6 +63,7 @@ Results = dict[str, list[dict[str, Any]]]
 """By arm, one entry a seed: the summaries ``plain`` and ``self_ensemble``."""
 
 
+@EXPERIMENTS.register("training")
 def run(
     recipe: Recipe,
     overwrite: bool = False,

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, get_type_hints
 
-from rawaug.experiment.denoiser_sweep import DenoiserSweep, smoke_sweep, sweep
-from rawaug.experiment.denoising import dry_run, run
+from rawaug.experiment.denoiser_sweep import smoke_sweep
+from rawaug.experiment.denoising import dry_run
 from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.recipe import Recipe, smoke
-from rawaug.experiment.tables_rehearsed import (
-    rehearse_ablation,
-    rehearse_comparison,
-    rehearse_learned,
-    rehearse_sweep,
-)
-from rawaug.paper.ablation import Ablation, ablate, smoke_ablation
-from rawaug.paper.component_ablation import LearnedParts, smoke_learned, weigh_parts
-from rawaug.paper.reconstruction import Comparison, compare, smoke_comparison
+from rawaug.experiment.recipe import smoke
+from rawaug.experiment.run_folder import require_free
+from rawaug.experiment.tables_rehearsed import rehearse_sweep
+from rawaug.registry import EXPERIMENTS, UnknownName
 
 
 class Kind(NamedTuple):
@@ -40,13 +36,26 @@ class Kind(NamedTuple):
 _DATA = ("data", "test", "pictures")
 """Keys of data, and what those below begin with."""
 
-KINDS = {
-    "training": Kind(Recipe, run, smoke, dry_run),
-    "reconstruction": Kind(Comparison, compare, smoke_comparison, rehearse_comparison),
-    "ablation": Kind(Ablation, ablate, smoke_ablation, rehearse_ablation),
-    "learned": Kind(LearnedParts, weigh_parts, smoke_learned, rehearse_learned),
-    "denoisers": Kind(DenoiserSweep, sweep, smoke_sweep, rehearse_sweep),
-}
+_QUICK = {"training": (smoke, dry_run), "denoisers": (smoke_sweep, rehearse_sweep)}
+
+
+def kind_named(name: str) -> Kind:
+    """The kind of experiment of this name.
+
+    Raises:
+        UnknownName: if there is none.
+    """
+    run = EXPERIMENTS[name]
+    settings = next(iter(get_type_hints(run).values()))
+    return Kind(settings, run, *(_QUICK[name] if name in _QUICK else (settings.smoke, _shortest_run)))  # noqa: SIM401, two lack it
+
+
+def _shortest_run(settings: Any, overwrite: bool = False) -> None:
+    """The run itself in its shortest form, in a temporary folder."""
+    folder = require_free(settings, overwrite)
+    with TemporaryDirectory() as elsewhere:
+        EXPERIMENTS[settings.experiment](replace(settings.shortest(), out=elsewhere))
+    print(f"dry run: nothing wrong found, nothing written to {folder}")
 
 
 def quickly(kind: str, settings: Any, given: set[str]) -> Any:
@@ -60,7 +69,7 @@ def quickly(kind: str, settings: Any, given: set[str]) -> Any:
     Raises:
         ValueError: if one of them names data.
     """
-    quick = KINDS[kind].smoke(settings)
+    quick = kind_named(kind).smoke(settings)
     replaced = {key: _value(quick, key) for key in sorted(given) if _value(settings, key) != _value(quick, key)}
     for key in replaced:
         if key.partition(".")[0] in _DATA and isinstance(_value(settings, key), (str, list)):
@@ -87,6 +96,8 @@ def kind_of(recipe: str | Path) -> str:
     """
     content = read_yaml(recipe)
     kind = content.get("experiment", "training") if isinstance(content, dict) else "training"
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ValueError(f"{recipe}: unknown experiment {kind!r:.80}; use one of {', '.join(KINDS)}")
-    return kind
+    try:
+        kind_named(str(kind))
+    except UnknownName as error:
+        raise ValueError(f"{recipe}: {error}") from None
+    return str(kind)

@@ -31,6 +31,7 @@ from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.progress import progress
+from rawaug.registry import EXPERIMENTS
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """RGB to YUV, ITU-R BT.601."""
@@ -63,12 +64,16 @@ class Ablation:
     seed: int = 0
     out: str = "runs"
 
+    def shortest(self) -> Ablation:
+        """A few steps on two frames."""
+        return replace(self, count=2, fit=self.fit.smoke())
 
-def smoke_ablation(ablation: Ablation) -> Ablation:
-    """The ablation in seconds, on the demo camera."""
-    return replace(ablation, name=f"{ablation.name}-smoke", data="demo:validation", count=2, fit=ablation.fit.smoke())
+    def smoke(self) -> Ablation:
+        """The same on the demo camera."""
+        return replace(self.shortest(), name=f"{self.name}-smoke", data="demo:validation")
 
 
+@EXPERIMENTS.register("ablation")
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
     require_free(ablation, overwrite)

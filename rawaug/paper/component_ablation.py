@@ -33,6 +33,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr, worst_and_best_quarter
 from rawaug.paper.synthetic_frames import varied_frames
 from rawaug.progress import progress
+from rawaug.registry import EXPERIMENTS
 from rawaug.seeding import keyed_generator
 
 CAMERAS = (
@@ -89,6 +90,15 @@ class LearnedParts:
                 raise ValueError(f"variants: {name}: {sorted(unknown)} are no keys of fit that a variant can change")
             replace(self.fit, **changes)
 
+    def shortest(self) -> LearnedParts:
+        """A few steps of every variant, on two frames."""
+        few = {name: changes | {"steps": 2, "joint_steps": 0} for name, changes in self.variants.items()}
+        return replace(self, frames=2, left_out=1, fit=replace(self.fit.smoke(), joint_steps=0), variants=few, seeds=1)
+
+    def smoke(self) -> LearnedParts:
+        """The same on the built-in pictures."""
+        return replace(self.shortest(), name=f"{self.name}-smoke", pictures="demo:")
+
 
 def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
     """YAML reads ``on`` and ``off`` as truth values."""
@@ -97,21 +107,7 @@ def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
     return changes | switches
 
 
-def smoke_learned(learned: LearnedParts) -> LearnedParts:
-    """The comparison in seconds, on the built-in pictures."""
-    variants = {name: changes | {"steps": 2, "joint_steps": 0} for name, changes in learned.variants.items()}
-    return replace(
-        learned,
-        name=f"{learned.name}-smoke",
-        pictures="demo:",
-        frames=2,
-        left_out=1,
-        fit=replace(learned.fit.smoke(), joint_steps=0),
-        variants=dict(list(variants.items())[:2]),
-        seeds=1,
-    )
-
-
+@EXPERIMENTS.register("learned")
 def weigh_parts(learned: LearnedParts, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another of its name."""
     require_free(learned, overwrite)

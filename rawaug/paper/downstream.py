@@ -37,6 +37,7 @@ from rawaug.training.validation import Watched
 
 WATCHED = 16
 """Samples made from the pictures on which training is watched."""
+SHORTEST_CROP = 256
 
 
 @dataclass
@@ -68,12 +69,16 @@ class DownstreamConfig:
         """What the training samples depend on."""
         return self.noise, self.exposure
 
+    def shortest(self) -> DownstreamConfig:
+        """One step, one small test frame."""
+        one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
+        return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
+
     def smoke(self) -> DownstreamConfig:
-        """In seconds, on the demo camera."""
-        few = TrainConfig(steps=2, batch=2, crop=32, warmup=1, validate_every=2, checkpoint_every=2)
-        return replace(
-            self, test=["demo:validation"], denoiser=DenoiserConfig("UNet", {"width": 4, "scales": 2}), train=few
-        )
+        """The same with a tiny network, on the demo camera."""
+        tiny = DenoiserConfig("UNet", {"width": 4, "scales": 2})
+        quick = self.shortest()
+        return replace(quick, test=["demo:validation"], denoiser=tiny, train=replace(quick.train, crop=32))
 
 
 class DownstreamScore(NamedTuple):

@@ -11,7 +11,6 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 from __future__ import annotations
 
 import json
-import math
 import statistics
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -51,6 +50,7 @@ from rawaug.paper.methods import (
 from rawaug.paper.metrics import ALTERED
 from rawaug.plugin.pictures import even_sided
 from rawaug.progress import progress
+from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
 
 COLUMNS = {
@@ -160,29 +160,27 @@ class Comparison:
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
+    def shortest(self) -> Comparison:
+        """One step of every method, on the first frames."""
+        few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "longer": 0.0, "seconds": 0.1}
+        downstream = self.downstream and self.downstream.shortest()
+        return replace(self, **few, select="first", fit=self.fit.smoke(), downstream=downstream)
 
-def smoke_comparison(comparison: Comparison) -> Comparison:
-    """The comparison in seconds, on the demo camera."""
-    downstream = comparison.downstream and comparison.downstream.smoke()
-    quick = [method for method in comparison.methods if method in ("dictionary", "upi", "upi-tuned")]
-    return replace(
-        comparison,
-        name=f"{comparison.name}-smoke",
-        data="demo:validation",
-        test=comparison.test and "demo:test",
-        count=None,
-        select="first",
-        test_count=1,
-        pictures="demo:",
-        methods=quick or ["dictionary"],
-        longer=0.0,
-        patches=1,
-        seeds=1,
-        fit=comparison.fit.smoke(),
-        downstream=downstream,
-    )
+    def smoke(self) -> Comparison:
+        """The same of the quick methods, on the demo camera."""
+        quick = [method for method in self.methods if method in ("dictionary", "upi", "upi-tuned")]
+        return replace(
+            self.shortest(),
+            name=f"{self.name}-smoke",
+            data="demo:validation",
+            test=self.test and "demo:test",
+            pictures="demo:",
+            methods=quick or ["dictionary"],
+            downstream=self.downstream and self.downstream.smoke(),
+        )
 
 
+@EXPERIMENTS.register("reconstruction")
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
     prepared = PreparedComparison(comparison, overwrite)
@@ -196,18 +194,16 @@ class PreparedComparison:
     Args:
         settings: of the comparison.
         overwrite: it may replace another of its name.
-        seconds: for reading the frames that are fitted; what then remains unread is left out.
     """
 
-    def __init__(self, settings: Comparison, overwrite: bool = False, seconds: float = math.inf) -> None:
+    def __init__(self, settings: Comparison, overwrite: bool = False) -> None:
         require_free(settings, overwrite)
         if settings.downstream is not None:
             require_precision(settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
         self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
-        self.available = len(found)
-        self.pairs = list(each_readable(self.chosen, "data", seconds, least=2))
+        self.pairs = list(each_readable(self.chosen, "data"))
         if len(self.pairs) < 2 and not settings.test:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         if settings.test:
@@ -228,7 +224,7 @@ class PreparedComparison:
         if settings.test:
             test = open_pairs(settings.test, split="test")
             tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
-            deque(each_readable(tested, "test", seconds), maxlen=0)
+            deque(each_readable(tested, "test"), maxlen=0)
             self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")

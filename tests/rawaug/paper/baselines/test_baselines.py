@@ -74,7 +74,7 @@ def test_bad_pictures_are_refused(name: str) -> None:
 
 
 def test_the_unet_says_that_it_does_not_render() -> None:
-    with pytest.raises(ValueError, match=r"unet only converts sRGB to RAW; rawaug\.isp\.baselines lists"):
+    with pytest.raises(ValueError, match=r"unet only converts sRGB to RAW; rawaug\.paper\.baselines lists"):
         small("unet")(torch.rand(1, 1, 8, 8))
 
 

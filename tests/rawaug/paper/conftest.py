@@ -48,3 +48,11 @@ def frame_of(known_camera: DictionaryISP) -> FrameOf:
         return Pair(name, srgb, raw, CFA.GRBG, light, torch.linalg.inv(torch.tensor(MATRIX)), camera="known")
 
     return make
+
+
+@pytest.fixture
+def exact_pairs(known_camera: DictionaryISP, frame_of: FrameOf) -> list[Pair]:
+    """Three small frames without fall-off, each in a light of its own."""
+    cast(Any, known_camera.stages["shading"]).mask.set(torch.zeros(2), torch.zeros(2, 2))
+    lights = ((1.6, 1.0, 1.5), (2.0, 1.0, 1.2), (1.8, 1.0, 1.9))
+    return [frame_of(f"shot{k}", light, (96, 128)) for k, light in enumerate(lights)]

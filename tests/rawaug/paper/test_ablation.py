@@ -19,7 +19,7 @@ from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper import ablation
-from rawaug.paper.ablation import LEFT_OUT, SPACES, TITLES, Ablation, ablate, smoke_ablation, stage_psnr
+from rawaug.paper.ablation import LEFT_OUT, SPACES, TITLES, Ablation, ablate, stage_psnr
 
 FrameOf = Callable[..., Pair]
 LAMPS = (1.2, 1.0, 2.6)
@@ -140,6 +140,6 @@ def test_one_frame_leaves_none_to_fit(given: list[Pair], frame_of: FrameOf) -> N
 
 
 def test_the_smoke_form_keeps_what_is_fitted() -> None:
-    quick = smoke_ablation(Ablation(name="a", fit=FitConfig(atoms=3, shading="on"), seed=7))
+    quick = Ablation(name="a", fit=FitConfig(atoms=3, shading="on"), seed=7).smoke()
     assert (quick.name, quick.data, quick.count, quick.seed) == ("a-smoke", "demo:validation", 2, 7)
     assert quick.fit == FitConfig(atoms=3, shading="on").smoke()

@@ -19,7 +19,7 @@ from rawaug.paper import methods, reconstruction
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.baselines.base import CropTrainedISP
 from rawaug.paper.downstream import DownstreamConfig
-from rawaug.paper.reconstruction import Comparison, compare, smoke_comparison
+from rawaug.paper.reconstruction import Comparison, compare
 
 FrameOf = Callable[..., Pair]
 TINY = FitConfig(steps=1, curve_steps=2, pixels=256, batch=64, prior_steps=20)
@@ -308,11 +308,11 @@ def test_settings_that_cannot_be_are_refused() -> None:
 
 def test_the_smoke_form_keeps_what_is_quick() -> None:
     whole = Comparison(name="a", methods=list(methods.FAMILIES), longer=10.0, downstream=DownstreamConfig())
-    quick = smoke_comparison(whole)
+    quick = whole.smoke()
     assert quick.methods == ["dictionary", "upi", "upi-tuned"] and quick.name == "a-smoke" and quick.longer == 0
-    assert quick.downstream is not None and quick.downstream.train.steps == 2 and quick.downstream.methods
-    assert smoke_comparison(Comparison()).downstream is None
-    assert smoke_comparison(Comparison(methods=["unet"])).methods == ["dictionary"]
+    assert quick.downstream is not None and quick.downstream.train.steps == 1 and quick.downstream.methods
+    assert Comparison().smoke().downstream is None
+    assert Comparison(methods=["unet"]).smoke().methods == ["dictionary"]
 
 
 class Fitting(Laboratory):

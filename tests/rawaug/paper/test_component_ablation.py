@@ -17,7 +17,7 @@ from rawaug.io import write_picture
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper import component_ablation as learned_parts
-from rawaug.paper.component_ablation import LearnedParts, score, smoke_learned, weigh_parts
+from rawaug.paper.component_ablation import LearnedParts, score, weigh_parts
 
 FrameOf = Any
 TINY = FitConfig(encoders="on", joint_steps=0, steps=2, curve_steps=5, pixels=256, batch=64)
@@ -108,7 +108,7 @@ def test_scores_are_those_of_the_passes(known_camera: DictionaryISP, frame_of: F
 
 @pytest.mark.long
 def test_the_smoke_form_runs(tmp_path: Path) -> None:
-    quick = smoke_learned(LearnedParts(fit=TINY, variants=VARIANTS, out=str(tmp_path)))
+    quick = LearnedParts(fit=TINY, variants=VARIANTS, out=str(tmp_path)).smoke()
     rows = weigh_parts(quick)
     assert (quick.name, quick.seeds, list(rows)) == ("learned-smoke", 1, list(VARIANTS))
     assert all(10.0 < row["psnr_r"][0] < 60.0 for row in rows.values())

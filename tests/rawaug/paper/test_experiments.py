@@ -1,0 +1,52 @@
+"""The paper's experiments as the command line runs them: their shortest form goes through and writes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rawaug.data.pairs import Pair
+from rawaug.experiment.kinds import kind_named
+from rawaug.isp.fit import FitConfig
+from rawaug.paper import ablation, reconstruction
+from rawaug.paper.ablation import Ablation
+from rawaug.paper.component_ablation import LearnedParts
+from rawaug.paper.reconstruction import Comparison
+
+
+@pytest.fixture
+def frames(frame_of: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch) -> list[Pair]:
+    """Three frames, which every dataset consists of."""
+    made = [frame_of(name) for name in "abc"]
+    for module in (reconstruction, ablation):
+        monkeypatch.setattr(module, "open_pairs", lambda spec, split: made)
+    return made
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Comparison(data="mine", methods=["dictionary", "upi"], seeds=3),
+        Ablation(data="mine", fit=FitConfig(atoms=3)),
+        LearnedParts(frames=4, variants={"all parts": {}, "without encoders": {"encoders": "off"}}),
+    ],
+    ids=lambda settings: settings.experiment,
+)
+def test_a_dry_run_tries_everything_once_and_writes_nothing(
+    settings: Comparison | Ablation | LearnedParts,
+    frames: list[Pair],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    kind_named(settings.experiment).dry_run(replace(settings, out=str(tmp_path)), False)
+    assert "nothing wrong found" in capsys.readouterr().out and not list(tmp_path.iterdir())
+
+
+def test_a_dry_run_finds_what_the_run_would(frames: list[Pair], tmp_path: Path) -> None:
+    dry_run = kind_named("ablation").dry_run
+    del frames[1:]
+    with pytest.raises(ValueError, match="mine has 1 frame; leave-one-out needs two or more"):
+        dry_run(Ablation(data="mine", out=str(tmp_path)), False)
