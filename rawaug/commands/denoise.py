@@ -32,7 +32,7 @@ from rawaug.commands.frame_denoisers import (
     stored_noise,
 )
 from rawaug.commands.pair_maker import require_same_settings
-from rawaug.data.folders import RAW_EXTENSIONS
+from rawaug.data.folders import RAW_EXTENSIONS, files_below
 from rawaug.errors import printable
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
@@ -267,7 +267,7 @@ def denoise_folder(
 def _targets(source: Path, out: Path) -> dict[Path, Path]:
     if out.resolve().is_relative_to(source.resolve()):
         raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
-    files = sorted(file for file in source.rglob("*") if file.suffix.lower() in RAW_EXTENSIONS)
+    files = sorted(files_below(source, RAW_EXTENSIONS))
     if not files:
         raise ValueError(f"{source}: contains no RAW file; supported extensions are {', '.join(RAW_EXTENSIONS)}")
     targets: dict[Path, Path] = {}

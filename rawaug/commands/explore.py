@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rawaug.data.demo.pairs import demo_files
-from rawaug.data.folders import PICTURE_EXTENSIONS
+from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.explore.page import address, build, listening, server_of
 from rawaug.registry import COMMANDS
 
@@ -41,7 +41,7 @@ def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
         return [source], [source.name]
     if not source.is_dir():
         raise FileNotFoundError(f"{source}: no such picture, and no such folder of pictures")
-    files = sorted(file for file in source.rglob("*") if file.suffix.lower() in PICTURE_EXTENSIONS)
+    files = sorted(files_below(source, PICTURE_EXTENSIONS))
     if not files:
         raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
     return files, [file.relative_to(source).as_posix() for file in files]

@@ -27,7 +27,7 @@ from rawaug.commands import pair_shards
 from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
-from rawaug.data.folders import PICTURE_EXTENSIONS
+from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.errors import printable
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import NAME, find_weights, locked, sha256
@@ -208,7 +208,7 @@ def _pictures(source: Path, out: Path) -> list[Path]:
         raise FileNotFoundError(f"{source}: no such folder of pictures, and no picture")
     if out.resolve().is_relative_to(source):
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
-    pictures = sorted(file for file in source.rglob("*") if file.suffix.lower() in PICTURE_EXTENSIONS)
+    pictures = sorted(files_below(source, PICTURE_EXTENSIONS))
     if not pictures:
         raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
     return pictures

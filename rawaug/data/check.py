@@ -7,7 +7,6 @@ one that crashes its decoder, or hangs, is named and the rest is read.
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ from typing import Any
 from torch import Tensor
 
 from rawaug.data.dnd import Dnd
-from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder
+from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Pair
 from rawaug.data.published import CAMERAS, Rawir, Zurich, fivek_numbers
@@ -72,7 +71,7 @@ class PartReport:
             counts: Counter[str] = getattr(self, name)
             if counts:
                 more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
-                shown = ", ".join(f"{value} ({count})" for value, count in counts.most_common(_SHOWN))
+                shown = ", ".join(f"{printable(value)} ({count})" for value, count in counts.most_common(_SHOWN))
                 lines.append(f"  {name}: {shown}{more}")
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
@@ -127,9 +126,9 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The published datasets recognised by file names, and how to open each."""
-    files = {name for _, _, names in os.walk(path) for name in names}
-    scenes = {Path(parent) for parent, _, names in os.walk(path) if is_scene(Path(parent).name) and names}
-    if any("GT_RAW" in file.name.upper() for scene in scenes for file in scene.iterdir()):
+    found = list(files_below(path)) if path.is_dir() else []
+    files = {file.name for file in found}
+    if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in found):
         yield "SIDD, full frames", lambda: SiddFrames(path)
     if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
         yield "SIDD, validation blocks", lambda: SiddBlocks(path)
@@ -152,7 +151,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
-    files = [path] if path.is_file() else [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
+    files = [path] if path.is_file() else list(files_below(path))
     if path.is_dir() and looks_like_pairs(files):
         yield "noisy/clean pairs", lambda: PairFolder(path)
         return

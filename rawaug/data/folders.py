@@ -37,6 +37,27 @@ from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
 from rawaug.io.apart import apart, apart_each, prepare
 from rawaug.io.pictures import MAX_PIXELS, decode_picture, through_jpeg
 
+_OF_NO_DATASET = (".DS_Store", "Thumbs.db")
+
+
+def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
+    """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
+
+    What macOS and Windows leave beside one's files is no part of a dataset.
+
+    Raises:
+        OSError: if a folder cannot be listed.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for parent, folders, files in os.walk(folder, onerror=refuse):
+        folders[:] = [name for name in folders if name != "__MACOSX"]
+        for file in files:
+            if file.lower().endswith(extensions) and not file.startswith("._") and file not in _OF_NO_DATASET:
+                yield Path(parent, file)
+
 
 class Remembered(Dataset[Tensor]):
     """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read again each time.
@@ -199,7 +220,8 @@ class PictureFolder(Dataset[Tensor]):
         if not self.path.is_dir():
             raise FileNotFoundError(f"{path}: no such folder of pictures")
         self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
-        self.names = _Names(sorted(_listed(self.path)))
+        files = files_below(self.path, PICTURE_EXTENSIONS)
+        self.names = _Names(sorted(str(file.relative_to(self.path)) for file in files))
         if not len(self.names):
             raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
         self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
@@ -335,19 +357,6 @@ class _Names(Sequence[str]):
         return os.fsdecode(self._bytes[start : self._ends[index]].tobytes())
 
 
-def _listed(folder: Path) -> Iterator[str]:
-    """Paths below ``folder`` that have a picture's extension, unordered; folders with such a name are skipped."""
-
-    def refuse(error: OSError) -> None:
-        raise error
-
-    for parent, _, files in os.walk(folder, onerror=refuse):
-        inside = Path(parent).relative_to(folder)
-        for file in files:
-            if file.lower().endswith(PICTURE_EXTENSIONS):
-                yield str(inside / file)
-
-
 RAW_EXTENSIONS = (
     *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
     *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
@@ -459,7 +468,7 @@ def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
 def _raw_files(path: str | Path) -> list[Path]:
     path = Path(path)
     if path.is_dir():
-        return sorted(file for file in path.rglob("*") if file.suffix.lower() in RAW_EXTENSIONS)
+        return sorted(files_below(path, RAW_EXTENSIONS))
     return [path]
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 
 from rawaug.data.development import develop_mosaic
-from rawaug.data.folders import RawFolder
+from rawaug.data.folders import RawFolder, files_below
 from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
 from rawaug.data.mosaic_metadata import Statements
 from rawaug.data.pairs import LazyPairs, Pair
@@ -179,7 +179,7 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder of noisy/clean pairs")
     top = path if path.is_dir() else path.parent
-    readable = sorted(file for file in top.rglob("*") if file.suffix.lower() in READABLE and file.is_file())
+    readable = sorted(files_below(top, READABLE))
     by_pattern = _by_pattern(top, readable, noisy or NOISY, clean or _clean_pattern(noisy or NOISY))
     found = list(by_pattern)
     if noisy is None:

@@ -43,7 +43,6 @@ RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
 from __future__ import annotations
 
 import json
-import os
 import re
 import tokenize
 import zipfile
@@ -58,7 +57,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
-from rawaug.data.folders import RawFolder
+from rawaug.data.folders import RawFolder, files_below
 from rawaug.data.mat import MAX_BYTES
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.io import read_picture
@@ -95,12 +94,7 @@ def fivek_pairs(
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of FiveK")
     wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
-    files = {
-        found[1]: Path(parent, file)
-        for parent, _, names in os.walk(path)
-        for file in names
-        if (found := _DNG.fullmatch(file))
-    }
+    files = {found[1]: file for file in files_below(path) if (found := _DNG.fullmatch(file.name))}
     missing = [number for number in wanted if number not in files]
     if missing:
         raise FileNotFoundError(
@@ -186,9 +180,7 @@ class Rawir(LazyPairs):
             raise FileNotFoundError(f"{path}: no such folder of RAWIR")
         if any((folder / name).is_dir() for name in _SPLITS.values()):
             folder = folder / _SPLITS[split]
-        self.files = sorted(
-            Path(parent, file) for parent, _, files in os.walk(folder) for file in files if file.endswith(_ARRAYS)
-        )
+        self.files = sorted(files_below(folder, _ARRAYS))
         if not self.files:
             raise ValueError(f"{folder}: contains no .npy or .npz file of RAWIR")
         self.pictures = [picture_beside(file) for file in self.files]

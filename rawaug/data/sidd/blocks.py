@@ -29,6 +29,7 @@ import base64
 import csv
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -42,6 +43,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.captured_noise import captured_noise
 from rawaug.data.development import develop_mosaic
+from rawaug.data.folders import files_below
 from rawaug.data.mat import read_array
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.data.sidd.frames import (
@@ -321,7 +323,7 @@ def find_file(path: Path, pattern: str) -> Path:
         FileNotFoundError: if there is no such file.
         ValueError: if there are several.
     """
-    found = [path] if path.is_file() and path.match(pattern) else sorted(path.rglob(pattern))
+    found = [path] if path.is_file() and path.match(pattern) else _matching(path, pattern)
     if not found:
         raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")
     if len(found) > 1:
@@ -331,12 +333,16 @@ def find_file(path: Path, pattern: str) -> Path:
     return found[0]
 
 
+def _matching(folder: Path, pattern: str) -> list[Path]:
+    return sorted(file for file in files_below(folder) if fnmatchcase(file.name, pattern)) if folder.is_dir() else []
+
+
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
     """The pictures of the clean and of the noisy blocks, of those that there are."""
     found = {}
     for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
         name = pattern.format(kind)
-        if any(path.rglob(name)):
+        if _matching(path, name):
             side = (clean.shape[-2], clean.shape[-1])
             found[key] = read_block_pictures(find_file(path, name), tuple(clean.shape[:-3]), side)
     return found

@@ -18,7 +18,6 @@ the dataset's ``noise_level_functions.csv``.
 from __future__ import annotations
 
 import csv
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ from torch import Tensor
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.captured_noise import measured_levels
 from rawaug.data.development import color_matrix, develop_mosaic, white_balance
+from rawaug.data.folders import files_below
 from rawaug.data.mat import read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair
 from rawaug.io import read_picture
@@ -215,7 +215,7 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
     Raises:
         ValueError: if the file has other columns.
     """
-    file = next(iter(sorted(path.rglob("noise_level_functions.csv"))), None)
+    file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
     if file is None:
         return {}
     with file.open(encoding="utf-8-sig", newline="") as stream:
@@ -241,12 +241,10 @@ def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of SIDD")
     index: dict[tuple[str, str], dict[str, Path]] = {}
-    for parent, _, files in os.walk(path):
-        folder = Path(parent)
-        for file in files if is_scene(folder.name) else ():
-            found = _FILE.fullmatch(file)
-            if found:
-                index.setdefault((folder.name, found[2]), {})[found[1].upper()] = folder / file
+    for file in files_below(path):
+        scene = file.parent.name
+        if is_scene(scene) and (found := _FILE.fullmatch(file.name)):
+            index.setdefault((scene, found[2]), {})[found[1].upper()] = file
     return index
 
 

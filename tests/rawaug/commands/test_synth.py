@@ -200,6 +200,15 @@ def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) 
         replay(params, picture=moved, isp=tmp_path / "other.safetensors")
 
 
+def test_the_first_pair_that_is_not_finite_ends_the_run(tmp_path: Path, pictures: Path) -> None:
+    isp = DictionaryISP.from_pretrained("universal")
+    isp.colour.known.fill_(3e38)
+    isp.save(tmp_path / "absurd.safetensors")
+    with pytest.raises(ValueError, match=r"a\.jpg: pair 0 is not finite; the weights .*absurd.* are damaged"):
+        synth(pictures, tmp_path / "out", format="npz", isp=str(tmp_path / "absurd.safetensors"), workers=0)
+    assert not list((tmp_path / "out").glob("*.npz"))
+
+
 def test_the_command(tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["synth", str(pictures), str(tmp_path / "out"), "--noise", "[0.001, 1e-5]", "--workers", "0"]
     assert main([*command, "--per-image", "2"]) == 0

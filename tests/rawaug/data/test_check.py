@@ -11,7 +11,8 @@ import torch
 from scipy.io import savemat
 
 from rawaug.cli import main
-from rawaug.data import check
+from rawaug.data import PictureFolder, RawFolder, check
+from rawaug.data.folders import files_below
 from rawaug.data.sidd.frames import HELD_BACK
 from rawaug.io import read_picture, write_picture
 from rawaug.io.apart import time_limit
@@ -38,6 +39,25 @@ def test_pictures_are_counted_by_size_and_the_broken_ones_named(tmp_path: Path) 
     (line,) = report.broken
     assert "3.png: cannot be read as a picture" in line
     assert "pictures: 5, 2 examined" in str(check(tmp_path, first=2))
+
+
+def test_files_that_no_dataset_means_are_not_counted(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    write_pictures(tmp_path)
+    bayer_dng(tmp_path / "a.dng", np.full((32, 48), 1000, np.uint16))
+    (tmp_path / "__MACOSX").mkdir()
+    for name in ("__MACOSX/._0.png", "__MACOSX/1.png", "._0.png", "._a.dng", ".DS_Store", "Thumbs.db"):
+        (tmp_path / name).write_bytes(b"Mac OS X")
+    raws, pictures = check(tmp_path).parts
+    assert (raws.items, pictures.items) == (1, 3) and not raws.broken and not pictures.broken
+    assert len(PictureFolder(tmp_path)) == 3 and RawFolder(tmp_path).names == ["a"]
+    assert len(list(files_below(tmp_path))) == 4
+
+
+def test_control_characters_in_a_camera_name_are_escaped(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
+    named = [(271, 2, 0, "Maker", True), (272, 2, 0, "\x1b[2JModel", True)]
+    bayer_dng(tmp_path / "a.dng", np.full((32, 48), 1000, np.uint16), extra=named)
+    report = str(check(tmp_path))
+    assert r"\x1b[2JModel" in report and "\x1b" not in report
 
 
 def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:

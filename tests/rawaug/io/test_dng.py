@@ -124,8 +124,12 @@ def test_metadata_of_a_source_are_kept(tmp_path: Path, bayer_dng: Callable[..., 
     numbers = np.random.default_rng(0).integers(0, 4096, (32, 48)).astype(np.uint16)
     matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     extra = [(50940, 11, 4, (0.0, 0.0, 1.0, 1.0), True), (50936, 2, 0, "Vivid", True), (51111, 1, 16, bytes(16), True)]
-    source = bayer_dng(tmp_path / "source.dng", numbers, color_matrix=matrix, orientation=6, extra=extra)
+    profile = (1e-3, 1e-5)
+    source = bayer_dng(
+        tmp_path / "source.dng", numbers, color_matrix=matrix, orientation=6, extra=extra, noise_profile=profile
+    )
     frame = read_raw(source)
+    assert frame.noise_profile == profile
     write_dng(tmp_path / "plain.dng", dataclasses.replace(frame, iso=1600.0))  # a file with EXIF, to be a source too
     halved = dataclasses.replace(frame, mosaic=frame.mosaic.clamp(max=0.5), noise_profile=None)
     write_dng(tmp_path / "a.dng", halved, source)
@@ -136,6 +140,7 @@ def test_metadata_of_a_source_are_kept(tmp_path: Path, bayer_dng: Callable[..., 
         assert np.array_equal(tags["ColorMatrix1"].value[::2], 10000 * np.eye(3).ravel())
     back = read_raw(tmp_path / "a.dng")
     assert back.mosaic.max() < 0.51 and back.orientation == frame.orientation
+    assert back.noise_profile is None  # that of the source described the old pixels
     write_dng(tmp_path / "b.dng", frame, tmp_path / "plain.dng")
     assert read_raw(tmp_path / "b.dng").iso == 1600
 
