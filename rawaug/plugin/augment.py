@@ -12,6 +12,7 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
@@ -242,6 +243,7 @@ class RawAugment(nn.Module):
         with _float32(srgb):
             clean = self._clean(srgb, params)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
+            _require_finite(noisy)
             if self.pattern is None:
                 return RawPair(noisy, clean, variance, params)
             noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
@@ -355,6 +357,12 @@ def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
     """Checkpoints of version 0.1 hold the ISP."""
     for name in [name for name in state if name.startswith((f"{prefix}isp.", f"{prefix}baked."))]:
         del state[name]
+
+
+def _require_finite(raw: Tensor) -> None:
+    """Refuse what damaged weights make; on the CPU only, elsewhere it would stall the device."""
+    if raw.device.type == "cpu" and not math.isfinite(raw.sum()):
+        raise ValueError("the RAW has values that are not finite: the ISP's weights are damaged; fit or copy it again")
 
 
 def _float32(like: Tensor) -> torch.autocast:

@@ -169,11 +169,11 @@ class RawPairs(Dataset[Any]):
         try:
             picture = even_sided(to_rgb_tensor(picked(sample, where)))
             place = random_place(picture, self.crop, self.turns, generator, self.zoom)
+            patch = placed(picture, place, self.crop)[None]
+            batch: RawPair = self.augment.apply(patch, self.augment.sample(patch, generator, place[None]))
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
-        patch = placed(picture, place, self.crop)[None]
-        pair: RawPair = self.augment.apply(patch, self.augment.sample(patch, generator, place[None]))
-        pair = pair.map(lambda t: t[0])
+        pair = batch.map(lambda t: t[0])
         return replaced(sample, where, pair if self.keys is None else pair.under(self.keys))
 
 

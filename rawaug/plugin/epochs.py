@@ -196,7 +196,8 @@ class Visits(_Epochs):
         world = world_size()
         if world == 1 or not len(visits):
             return visits
-        return torch.full_like(visits, math.ceil(world * int(visits.sum()) / len(visits)))
+        share = math.ceil(len(visits) / world)  # a sampler fills the shares up where they do not divide
+        return torch.full_like(visits, max(math.ceil(int(visits.sum()) / share), int(visits.max())))
 
 
 class Passes(_Epochs):

@@ -52,6 +52,8 @@ def test_patch_psnr_averages_decibels_not_errors() -> None:
 def test_quarters() -> None:
     assert worst_and_best_quarter([4.0, 1.0, 3.0, 2.0, 5.0, 6.0, 7.0, 8.0]) == (1.5, 7.5)
     assert worst_and_best_quarter([4.0]) == (4.0, 4.0)
+    assert worst_and_best_quarter([6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) == (1.5, 5.5)  # a quarter of 6 is 2
+    assert worst_and_best_quarter([7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) == (1.5, 6.5)
 
 
 def test_shapes_must_agree() -> None:

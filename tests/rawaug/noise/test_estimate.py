@@ -112,6 +112,18 @@ def test_levels_too_near_white_are_left_out() -> None:
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.02)
 
 
+def test_blocks_of_fine_texture_are_left_out() -> None:
+    """Checkers on a third of a flat frame: nothing in the low frequencies of a block, all of it in the highest."""
+    levels = torch.tensor([0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8]).repeat_interleave(64)
+    site = torch.arange(512)
+    textured = torch.rand(64, 64, generator=torch.Generator().manual_seed(0)) < 0.3
+    checkers = 2.0 * ((site[:, None] + site) % 2) - 1.0
+    clean = levels * (1 + 0.3 * checkers * textured.repeat_interleave(8, 0).repeat_interleave(8, 1))
+    estimate = estimate_noise(shoot(clean.expand(1, 4, -1, -1).contiguous(), 1e-3, 1e-5, 0), "GRBG")
+    assert estimate.shot_var == pytest.approx(1e-3, rel=0.02)
+    assert estimate.points.used.float().mean() > 0.7
+
+
 def test_smoothed_levels_are_left_out() -> None:
     """A codec that smooths the blue plane: the others show the noise."""
     packed = shoot(scene(2), 1e-3, 1e-5, 2)

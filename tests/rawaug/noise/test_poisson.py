@@ -31,6 +31,13 @@ def test_counts_follow_the_distribution(rate: float, device: str) -> None:
     assert stats.chisquare(observed, [N * p for p in expected], sum_check=False).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("rate", [10.0, 10.5, 14.3, 40.0])
+def test_expansion_gives_the_exact_quantiles(rate: float) -> None:
+    uniform = (torch.arange(50_000, dtype=torch.float64) + 0.5) / 50_000
+    counts = poisson(torch.full_like(uniform, rate), torch.special.ndtri(uniform)).numpy()
+    assert (counts != stats.poisson.ppf(uniform, rate)).mean() < 1e-3
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("rate", [0.1, 1.0, 5.0, 30.0])
 def test_skewness_is_that_of_photons(rate: float, device: str) -> None:

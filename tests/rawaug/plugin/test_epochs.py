@@ -12,7 +12,14 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset, Subset, WeightedRandomSampler, get_worker_info
+from torch.utils.data import (
+    DataLoader,
+    DistributedSampler,
+    IterableDataset,
+    Subset,
+    WeightedRandomSampler,
+    get_worker_info,
+)
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -183,6 +190,19 @@ def test_processes_draw_apart(as_rank: Callable[[int, int], None], monkeypatch: 
     assert in_a_spawned_worker.key(0) == (1, 0, 1)
     visits.pin(5)
     assert visits.key(1) == (5, 1)
+
+
+@pytest.mark.parametrize("count", [3, 1001])
+@pytest.mark.parametrize("drop_last", [False, True])
+def test_a_state_of_two_processes_counts_passes(
+    as_rank: Callable[[int, int], None], count: int, drop_last: bool
+) -> None:
+    as_rank(0, 2)
+    visits = Visits(count)
+    for number in (1, 2):
+        for picture in DistributedSampler(range(count), 2, 0, shuffle=False, drop_last=drop_last):  # type: ignore[arg-type]
+            visits.key(picture)
+            assert visits.state_dict()["visits"].tolist() == [number] * count, "a pass that has begun counts"
 
 
 def test_another_number_of_workers_repeats_no_pass() -> None:

@@ -152,6 +152,19 @@ def test_torchrun_on_two_nodes_reads_every_sample_of_the_shards_once(tmp_path: P
     assert all(torch.equal(noisy, alone[key]) for own in (first, second) for key, noisy in own.items())
 
 
+@pytest.mark.parametrize("drop_last", [False, True])
+def test_an_odd_picture_is_dropped_or_given_twice(
+    augment: RawAugment, as_rank: Callable[[int, int], None], drop_last: bool
+) -> None:
+    given = []
+    for rank in range(2):
+        as_rank(rank, 2)
+        loader: Any = DataLoader(pictures()[:7], batch_size=1, drop_last=drop_last)  # type: ignore[arg-type]
+        share = wrap(loader, augment).share
+        given += [int(level) for batch in share for level in batch[:, 0, 0, 0]]
+    assert sorted(given) == (list(LEVELS)[:6] if drop_last else sorted([*LEVELS[:7], LEVELS[0]]))
+
+
 @pytest.mark.parametrize("chosen", ["sampler", "batch sampler", "replacement", "no loader"])
 def test_a_chosen_order_is_left_alone(augment: RawAugment, as_rank: Callable[[int, int], None], chosen: str) -> None:
     shown: Any = pictures()
