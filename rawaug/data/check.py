@@ -126,7 +126,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The published datasets recognised by file names, and how to open each."""
-    found = list(files_below(path)) if path.is_dir() else []
+    found = list(files_below(path))
     files = {file.name for file in found}
     if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in found):
         yield "SIDD, full frames", lambda: SiddFrames(path)

@@ -43,14 +43,15 @@ _OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
     """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
 
-    What macOS and Windows leave beside one's files is no part of a dataset.
+    What macOS and Windows leave beside one's files is no part of a dataset. No folder, no files.
 
     Raises:
-        OSError: if a folder cannot be listed.
+        OSError: if a folder may not be listed.
     """
 
     def refuse(error: OSError) -> None:
-        raise error
+        if not isinstance(error, (FileNotFoundError, NotADirectoryError)):
+            raise error
 
     for parent, folders, files in os.walk(folder, onerror=refuse):
         folders[:] = [name for name in folders if name != "__MACOSX"]

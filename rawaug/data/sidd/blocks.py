@@ -334,7 +334,7 @@ def find_file(path: Path, pattern: str) -> Path:
 
 
 def _matching(folder: Path, pattern: str) -> list[Path]:
-    return sorted(file for file in files_below(folder) if fnmatchcase(file.name, pattern)) if folder.is_dir() else []
+    return sorted(file for file in files_below(folder) if fnmatchcase(file.name, pattern))
 
 
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
