@@ -11,8 +11,10 @@ from scipy.optimize import nnls
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.conditioning import with_white_balance
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.start import best_constants, reach_atoms
+from rawaug.isp.fit.samples import sample_pixels
+from rawaug.isp.fit.start import best_constants, reach_atoms, set_priors
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
@@ -86,6 +88,22 @@ def test_constants_serve_the_many_and_not_the_odd_one_out() -> None:
     a = torch.tensor([0.1, 0.2, 0.3, 5.0])[:, None].expand(4, 3)  # the last has by far the largest error to offer
     weights = best_constants(a, wanted * a, inverse)
     torch.testing.assert_close(weights @ inverse, torch.tensor([0.8, 1.0, 0.8]), atol=0.005, rtol=0)
+
+
+def test_clipped_readings_say_nothing_of_the_gains(
+    exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
+) -> None:
+    gains = (2.0, 1.0, 1.5)
+    pair = exact_pair("shot", gains, 0)
+    clipped = (torch.arange(pair.raw.shape[-1]) % 8 < 4).expand_as(pair.raw)
+    srgb, raw = torch.where(clipped, 255, pair.srgb), torch.where(clipped, 1.0, pair.raw)
+    isp = DictionaryISP(ISPConfig(colour_atoms=1, gain_atoms=2, attention=False))
+    with torch.no_grad():
+        isp.colour.matrices.copy_(camera_matrix[None])
+        isp.gain.log_gains.copy_(torch.tensor([[1.0, 2.0, 1.5], [1.0, 1.0, 1.0]]).log())
+    samples, _ = sample_pixels([replace(pair, srgb=srgb.to(torch.uint8), raw=raw)], 4096, seed=0)
+    set_priors(isp, samples, FitConfig())
+    torch.testing.assert_close(isp.choose(pair.srgb[None]).gains, torch.tensor([gains]), atol=0.02, rtol=0)
 
 
 def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[Pair]) -> None:
