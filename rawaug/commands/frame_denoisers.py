@@ -45,9 +45,14 @@ from rawaug.seeding import keyed_generator
 Noise = str | Sequence[float] | MeasuredLevels
 """``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
 
+DISAGREE = 1.75
+"""Ratio of tag and estimate, in the variance at the mean signal, from which ``auto`` trusts the estimate: it is within
+1.24 on frames whose noise is known, and a denoiser that is told half the variance leaves most of the noise."""
+
 
 def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame and their source; ``auto`` is the profile, else the estimate.
+    """(shot_var, read_var) of a frame and their source; ``auto`` is the profile where the frame bears it out, else the
+    estimate.
 
     Raises:
         ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
@@ -62,7 +67,7 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
             raise ValueError(
                 f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or --noise '[shot_var, read_var]'"
             )
-        return *frame.noise_profile, "profile"
+        return (*frame.noise_profile, "profile") if noise == "profile" else _checked_profile(frame, frame.noise_profile)
     if noise in ("auto", "estimate"):
         try:
             estimate = estimate_noise(frame.mosaic, frame.cfa)
@@ -87,6 +92,19 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
         return *levels.typical(), noise
     shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
     return float(shot_var), float(read_var), noise
+
+
+def _checked_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float, float, str]:
+    """The profile, unless the frame's own noise is :data:`DISAGREE` times as strong or as weak."""
+    try:
+        estimate = estimate_noise(frame.mosaic, frame.cfa)
+    except ValueError:  # too little of the frame is flat to tell
+        return *profile, "profile"
+    signal = frame.mosaic.mean().clamp_min(0.0).item()
+    told, found = (shot * signal + read for shot, read in (profile, (estimate.shot_var, estimate.read_var)))
+    if max(told, found) < DISAGREE * min(told, found) or found <= 0:
+        return *profile, "profile"
+    return estimate.shot_var, estimate.read_var, f"estimate; the NoiseProfile tag says {told / found:.2g} times as much"
 
 
 def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:

@@ -132,15 +132,32 @@ def test_where_the_levels_come_from(tmp_path: Path, bayer_dng: Dng) -> None:
         levels_of(bare)
 
 
+@pytest.mark.parametrize("wrong", [0.5, 1.0, 1.4, 4.0])
+def test_a_tag_that_the_frame_contradicts_gives_way(wrong: float) -> None:
+    frame = dataclasses.replace(gradient(), noise_profile=(wrong * LEVELS[0], wrong * LEVELS[1]))
+    shot_var, _, noise_source = levels_of(frame)
+    if wrong in (0.5, 4.0):
+        assert noise_source.startswith("estimate; the NoiseProfile tag says ")
+        assert float(noise_source.split()[5]) == pytest.approx(wrong, rel=0.1)
+        assert shot_var == pytest.approx(LEVELS[0], rel=0.1)
+    else:
+        assert (shot_var, noise_source) == (wrong * LEVELS[0], "profile")
+    assert levels_of(frame, "profile")[0] == wrong * LEVELS[0]
+
+
 def test_levels_are_estimated_without_a_profile() -> None:
+    shot_var, read_var, noise_source = levels_of(gradient())
+    assert noise_source == "estimate" and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
+
+
+def gradient() -> RawFrame:
+    """From dark to light, with noise of :data:`LEVELS` and no tag."""
     generator = torch.Generator().manual_seed(0)
     clean = torch.linspace(0.02, 0.9, 640).expand(1, 640, 640)
     noisy = clean + (LEVELS[0] * clean + LEVELS[1]).sqrt() * torch.randn(clean.shape, generator=generator)
-    frame = RawFrame(
+    return RawFrame(
         noisy.clamp(max=1), CFA.RGGB, (64.0,) * 4, 1023.0, (1.0,) * 3, (1.0,) * 3, torch.eye(3), "x", None, None, 0, "a"
     )
-    shot_var, read_var, noise_source = levels_of(frame)
-    assert noise_source == "estimate" and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
 
 
 def test_folders_are_resumed(tmp_path: Path, bayer_dng: Dng, identity: Path) -> None:
