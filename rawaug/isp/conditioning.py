@@ -18,7 +18,7 @@ from torch import Tensor
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import CameraDictionary, ToneDictionary, nearest_in_hull
 from rawaug.isp.staged import StagedISP
-from rawaug.kernels.raw_torch import through_curves
+from rawaug.kernels.reference import through_curves
 
 CLIPPED = 0.98
 SHADOW = 0.01

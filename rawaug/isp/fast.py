@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
-from importlib import import_module
 from itertools import pairwise
 from typing import cast
 
@@ -30,13 +29,11 @@ from rawaug import bayer
 from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import Dials, Stage, Tables, as_float, node_colours
+from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, node_colours
 from rawaug.isp.thumbnail_encoder import Chooser
 from rawaug.isp.tone import STEPS
-from rawaug.kernels import compiled, raw_torch
-from rawaug.kernels import runtime as fallback
-from rawaug.kernels.raw_torch import frame_of
-from rawaug.kernels.runtime import one_thread
+from rawaug.kernels.reference import Camera, frame_of, unprocess
+from rawaug.kernels.runtime import fastest, one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
@@ -114,10 +111,10 @@ class BakedISP(nn.Module):
             rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), white), CFA.RGGB))
         return torch.cat(rgb, dim=1)
 
-    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> raw_torch.Camera:
+    def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         batch, _, height, width = srgb.shape
         table = self.table
-        dials = Dials(
+        batch_params = BatchParams(
             torch.eye(3).to(table).expand(batch, 3, 3),
             torch.ones(batch, 1, 3).to(table),
             table.new_zeros(batch, 6),
@@ -125,31 +122,20 @@ class BakedISP(nn.Module):
             table.new_empty(0),
         )
         for stage in self.stages:
-            dials = cast(Stage, stage).adjust(dials, params, place, (height, width))
-        matrix, floor, frame, curves, shading = dials
+            batch_params = cast(Stage, stage).adjust(batch_params, params, place, (height, width))
+        matrix, floor, frame, curves, shading = batch_params
         if curves.numel():
             table = table[:0]
             curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
         colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
         knee, where = self.config.knee, torch.tensor(sites)
-        return raw_torch.Camera(table, curves, self.attention, colour, knee, frame, shading, where)
+        return Camera(table, curves, self.attention, colour, knee, frame, shading, where)
 
 
-def _pass(srgb: Tensor, camera: raw_torch.Camera, white: float) -> Tensor:
-    """By the kernel for the device of ``srgb``."""
-    if srgb.dtype != torch.uint8:
-        srgb = srgb.float()
-    if fallback.usable(srgb):  # imported late, for Triton may be missing
-        return fallback.kernel_or(
-            lambda: import_module("rawaug.kernels.raw_triton").unprocess(srgb, camera, white),
-            lambda: raw_torch.unprocess(srgb, camera, white),
-        )
-    if srgb.device.type != "cpu" or not compiled.available():
-        return raw_torch.unprocess(srgb, camera, white)
-    from rawaug.kernels import raw_numba
-
-    return raw_numba.unprocess(srgb, camera, white)
+def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:
+    srgb = srgb if srgb.dtype == torch.uint8 else srgb.float()
+    return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))
 
 
 def bakeable(order: Sequence[Stage]) -> bool:

@@ -49,7 +49,7 @@ from torch import Tensor, nn
 from rawaug.isp.config import HIGHLIGHT_KNEE, ISPConfig, ISPParams
 from rawaug.isp.dictionary import ToneDictionary
 from rawaug.isp.tone import NODES, STEPS, to_code, to_linear
-from rawaug.kernels.raw_torch import frame_of
+from rawaug.kernels.reference import frame_of
 
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
@@ -267,13 +267,13 @@ class Tables(NamedTuple):
     attention: Tensor | None = None
 
 
-class Dials(NamedTuple):
+class BatchParams(NamedTuple):
     """What the baked pass uses of a batch's settings.
 
     Args:
         matrix: ``(B, 3, 3)`` x2 to x3.
         floor: ``(B, 1, 3)`` one over the gains.
-        frame: ``(B, 6)`` see :class:`rawaug.kernels.raw_torch.Camera`.
+        frame: ``(B, 6)`` see :class:`rawaug.kernels.reference.Camera`.
         curves: ``(B, 1021)`` x to x2, in place of the table; or ``(B, 0)``.
         shading: ``(3,)`` of the mask ``2^-(a y^2 + b x y + c x^2)``, or empty.
     """
@@ -324,16 +324,18 @@ class Stage(nn.Module, ABC):
     def bake(self, tables: Tables) -> Tables:
         """The tables with what this stage does to every picture alike."""
 
-    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
-        """The dials with what this stage does to these pictures.
+    def adjust(
+        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
+    ) -> BatchParams:
+        """The batch_params with what this stage does to these pictures.
 
         Args:
-            dials: as the stages before set them.
+            batch_params: as the stages before set them.
             params: the pictures' settings.
             place: ``(B, 4 or 5)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
             size: height and width of the pictures.
         """
-        return dials
+        return batch_params
 
     def describe(self) -> str:
         """The stage's parameters in one line; empty if the settings hold them all."""
@@ -488,8 +490,10 @@ class ColorCorrection(Stage):
     def bake(self, tables: Tables) -> Tables:
         return tables
 
-    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
-        return dials._replace(matrix=params.matrix.to(dials.matrix))
+    def adjust(
+        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
+    ) -> BatchParams:
+        return batch_params._replace(matrix=params.matrix.to(batch_params.matrix))
 
 
 @register
@@ -507,8 +511,10 @@ class WhiteBalance(Stage):
     def bake(self, tables: Tables) -> Tables:
         return tables
 
-    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
-        return dials._replace(floor=1.0 / params.gains.to(dials.floor)[:, None])
+    def adjust(
+        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
+    ) -> BatchParams:
+        return batch_params._replace(floor=1.0 / params.gains.to(batch_params.floor)[:, None])
 
 
 @register
@@ -536,13 +542,17 @@ class LensShading(Stage):
             tables if self.reverse_attention is None else tables._replace(attention=self.reverse_attention(tables.cube))
         )
 
-    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
+    def adjust(
+        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
+    ) -> BatchParams:
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
-        places = [[0, 0, *size]] * len(dials.frame) if place is None else place.tolist()
-        frame = dials.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(len(dials.frame), 6)
+        places = [[0, 0, *size]] * len(batch_params.frame) if place is None else place.tolist()
+        frame = batch_params.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(
+            len(batch_params.frame), 6
+        )
         precision = self.mask.precision * (0.5 / math.log(2.0))
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
-        return dials._replace(frame=frame, shading=shading)
+        return batch_params._replace(frame=frame, shading=shading)
 
     def describe(self) -> str:
         mean, precision = self.mask.mean.tolist(), self.mask.precision.flatten().tolist()
@@ -594,8 +604,10 @@ class ToneCurve(Stage):
     def bake(self, tables: Tables) -> Tables:
         return tables._replace(x2=self.reverse(tables.x2, None))
 
-    def adjust(self, dials: Dials, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> Dials:
-        return dials._replace(curves=self.dictionary.combine(params.tone_weights.to(dials.matrix)))
+    def adjust(
+        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
+    ) -> BatchParams:
+        return batch_params._replace(curves=self.dictionary.combine(params.tone_weights.to(batch_params.matrix)))
 
     def describe(self) -> str:
         return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(

@@ -5,7 +5,7 @@ An encoder looks at the N images that the atoms make of one picture. They are li
 .. math:: D_n x_2 \quad\text{and}\quad x_3 (floor_n + m \, rise_n) = floor_n x_3 + rise_n (m x_3),
 
 and so is a convolution of them: one of 3 maps, or 6, instead of 3 N, with the same result (symbols as in
-:mod:`rawaug.kernels.raw_torch`).
+:mod:`rawaug.kernels.reference`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.stages import as_float
-from rawaug.kernels import compiled
-from rawaug.kernels.raw_torch import look_up
+from rawaug.kernels import runtime
+from rawaug.kernels.reference import look_up
 
 
 class Chooser(nn.Module):
@@ -65,9 +65,9 @@ class Chooser(nn.Module):
 
 def small(srgb: Tensor, table: Tensor) -> Tensor:
     """x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
-    if srgb.dtype != torch.uint8 or srgb.device.type != "cpu" or not compiled.available():
+    if srgb.dtype != torch.uint8 or srgb.device.type != "cpu" or not runtime.has_numba():
         return look_up(table, thumbnail(as_float(srgb)))[:, :3]
-    from rawaug.kernels.raw_numba import thumbnails
+    from rawaug.kernels.cpu import thumbnails
 
     height, width = srgb.shape[-2:]
     scale = THUMBNAIL / max(height, width, THUMBNAIL)

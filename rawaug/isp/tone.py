@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.kernels.raw_torch import through_curves
+from rawaug.kernels.reference import through_curves
 
 STEPS = 4
 """Entries of a table for each 8-bit level."""

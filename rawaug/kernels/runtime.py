@@ -1,56 +1,51 @@
-"""Devices by name, found or refused before any work.
+"""Where code runs: devices by name, threads, loops compiled by Numba, kernels compiled by Triton.
 
-PyTorch on one thread.
+A pass over pixels exists up to three times, with one result: in PyTorch (:mod:`rawaug.kernels.reference`), as loops
+for the CPU (:mod:`rawaug.kernels.cpu`), and as Triton kernels for CUDA (:mod:`rawaug.kernels.gpu`), among which
+:func:`fastest` chooses. PyTorch runs where Numba or Triton is missing, switched off (``NUMBA_DISABLE_JIT=1``), or fails
+to compile. With ``TRITON_INTERPRET=1`` Triton's kernels run step by step on CPU tensors, for tests.
 
-Its loops share a tensor out among the threads, and the ends of a share are worked on by other instructions than its
-middle: the last bit of a power or an exponential depends on the number of threads. One thread gives the same bits
-everywhere. Where a step is so small that more threads gain nothing, it also spares the tenfold loss that they bring on
-a busy machine.
-
-A child of a fork stays on one thread: the threads of OpenMP, on which PyTorch's loops run, do not survive a fork, and a
-loop that waits for them never ends. DataLoader's workers are on one thread anyway.
-
-What ``torch.compile`` leaves as it is written: loops that are compiled already, draws from keyed generators.
-
-Dynamo traces Python into tensor operations. It cannot trace Numba's compiler, and a hash or a generator's seed that it
-traced would be a constant of the graph. A step marked :func:`eager` breaks the graph instead and runs as it always
-does: the same bits with and without ``torch.compile``.
-
-Whether Triton kernels run on this machine's GPU, and the fallback where they do not.
-
-PyTorch's CUDA builds include Triton. Where it is missing, or a kernel cannot be compiled, callers use the same pass in
-PyTorch, which is slower, after one warning. With ``TRITON_INTERPRET=1`` in the environment the kernels run on tensors
-of the CPU, step by step: for tests.
+PyTorch's loops divide a tensor among threads, and the ends of each share go through other instructions than its middle,
+so the last bit of a power depends on the number of threads; :func:`one_thread` gives the same bits everywhere. OpenMP's
+threads do not survive a fork, and a loop waiting for them never ends, so a forked child stays on one thread.
 """
 
 from __future__ import annotations
 
 import os
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import pairwise
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from rawaug.registry import nearest
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 KINDS = ("auto", "cpu", "cuda", "gpu", "mps")
-"""What may be asked for: ``gpu`` is CUDA or Apple's MPS, whichever there is, and ``auto`` that or else the CPU."""
+"""``gpu`` is CUDA or Apple's MPS, whichever is there; ``auto`` is that, or else the CPU."""
 
 
 def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
-    """The device called ``name``, which this machine has.
+    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``.
 
     Args:
-        name: one of :data:`KINDS`; of several GPUs one is chosen by number, as in ``cuda:1``.
-        key: opens the messages.
+        name: of the device.
+        key: starts the error messages.
         count: how many such devices are needed.
 
     Raises:
-        ValueError: if there is no such kind of device, or this machine has none of it, or fewer.
+        ValueError: if the name is unknown, or this machine does not have that many.
 
     Example:
         >>> find_device("cpu")
@@ -73,7 +68,7 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within this block, or the decorated function, PyTorch's CPU loops run on one thread.
+    """PyTorch's CPU loops use one thread within this block, or within the decorated function.
 
     Example:
         >>> with one_thread():
@@ -88,28 +83,10 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _after_fork() -> None:
-    if torch.get_num_threads() > 1:
-        torch.set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
-
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
 def eager(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: ``torch.compiler.disable``, without loading the compiler where nothing is compiled (seconds).
+    """Decorator: leave the function out of ``torch.compile``, without loading the compiler, which takes seconds.
 
-    Example:
-        >>> @eager
-        ... def doubled(x):
-        ...     return 2 * x
-        >>> doubled(3)
-        6
+    Dynamo cannot trace Numba, and would make a constant of a generator's seed. A graph break gives the same bits.
     """
 
     @wraps(function)
@@ -121,40 +98,115 @@ def eager(function: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-Result = TypeVar("Result")
-
-_refused: list[str] = []
+_GRAIN = 2**15  # numbers below which waking a thread costs more than it saves
+_PIECES = 4  # for each thread, so that a late one does not hold up the others
+_OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+"""Fused multiply-adds are allowed: they do not depend on the order of pixels or threads."""
 
 
 @cache
-def _installed() -> bool:
+def has_numba() -> bool:
+    """Whether loops can be compiled for the CPU."""
     try:
-        import triton  # noqa: F401
+        import numba
     except ImportError:
         return False
-    return True
+    return not numba.config.DISABLE_JIT
 
 
-def usable(image: Tensor) -> bool:
-    """Whether a kernel should be tried on ``image``."""
-    return image.device.type == "cuda" and not _refused and _installed()
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator: the function as machine code that releases the GIL, cached on disk where a folder is writable."""
+    from numba import njit
+
+    try:
+        return njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no writable folder
+        return njit(**_OPTIONS)(function)
 
 
-def kernel_or(kernel: Callable[[], Result], fallback: Callable[[], Result]) -> Result:
-    """The result of ``kernel`` or, from its first failure on, of ``fallback``; the failure is reported as a warning.
+def part(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator: for functions that only :func:`compiled` ones of the same module call."""
+    from numba import njit
+
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+"""By number of threads."""
+
+
+def _after_fork() -> None:
+    _pools.clear()
+    if torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
+    """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on ``torch.get_num_threads()`` threads.
 
     Example:
-        >>> kernel_or(lambda: 1, lambda: 2)
-        1
+        >>> done = []
+        >>> over_rows(3, 4, lambda start, stop: done.extend(range(start, stop)))
+        >>> done
+        [0, 1, 2]
     """
+    threads = torch.get_num_threads()
+    pieces = min(threads * _PIECES, rows, rows * width // _GRAIN)
+    if threads == 1 or pieces < 2:
+        run(0, rows)
+        return
+    waiting = deque(pairwise(rows * piece // pieces for piece in range(pieces + 1)))
+
+    def work() -> None:
+        while waiting:
+            try:
+                start, stop = waiting.popleft()
+            except IndexError:  # another thread was faster
+                return
+            run(start, stop)
+
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads, "rawaug")
+    helpers = [_pools[threads].submit(work) for _ in range(min(threads, pieces) - 1)]
+    work()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+
+
+_failed: list[str] = []
+"""Names of the errors that Triton's kernels have raised; after one they are not tried again."""
+
+
+def triton_usable(image: Tensor) -> bool:
+    """Whether to try a Triton kernel on ``image``."""
+    return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
+
+
+def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
+    """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
+    if triton_usable(image):
+        return kernel_or(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
+    if image.device.type == "cpu" and has_numba():
+        result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
+        return result
+    return otherwise()
+
+
+def kernel_or(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
+    """The result of ``kernel``, or of ``otherwise`` after a warning if it fails."""
     try:
         return kernel()
-    except torch.OutOfMemoryError:  # says nothing of the kernel
+    except torch.OutOfMemoryError:  # says nothing about the kernel
         raise
     except Exception as error:  # whatever a compiler, its driver or its cache may raise
-        _refused.append(type(error).__name__)
+        _failed.append(type(error).__name__)
         reason = (str(error).splitlines() or [""])[-1]
         warnings.warn(
             f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
         )
-        return fallback()
+        return otherwise()

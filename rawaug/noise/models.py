@@ -19,16 +19,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
-from importlib import import_module
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from rawaug.kernels import compiled
-from rawaug.kernels import runtime as fallback
-from rawaug.kernels.philox import normals
-from rawaug.kernels.runtime import eager
+from rawaug.kernels.reference import normals
+from rawaug.kernels.runtime import eager, fastest
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.poisson import poisson
 from rawaug.seeding import derived_seed, keyed_generator
@@ -182,21 +179,13 @@ class ShotReadNoise(ShotReadModel):
     def _disturbed(
         self, clean: Tensor, params: Params, white: float, with_variance: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """The noisy RAW and, if asked for, its variance map."""
-        if clean.dtype == torch.float32:
-            levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
-            if fallback.usable(clean):  # imported late, for Triton may be missing
-                return fallback.kernel_or(
-                    lambda: import_module("rawaug.kernels.noise_triton").shot_read(
-                        clean, levels, self._keys(params), white, with_variance
-                    ),
-                    lambda: self._in_pytorch(clean, params, white, with_variance),
-                )
-            if clean.device.type == "cpu" and compiled.available():
-                from rawaug.kernels import noise_numba
-
-                return noise_numba.shot_read(clean, levels, self._keys(params), white, with_variance)
-        return self._in_pytorch(clean, params, white, with_variance)
+        if clean.dtype != torch.float32:
+            return self._in_pytorch(clean, params, white, with_variance)
+        levels = torch.stack([params["shot_var"], params["read_var"]], dim=1)
+        settings = (levels, self._keys(params), white, with_variance)
+        return fastest(
+            "shot_read", clean, *settings, otherwise=lambda: self._in_pytorch(clean, params, white, with_variance)
+        )
 
     def _in_pytorch(self, clean: Tensor, params: Params, white: float, with_variance: bool) -> tuple[Tensor, Tensor]:
         deviation = self.variance(clean, params).sqrt_()

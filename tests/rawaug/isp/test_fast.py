@@ -10,7 +10,7 @@ from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
 from rawaug.isp.fast import BakedISP, UnbakedISP, reverse_pass
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap, place_in_frame
-from rawaug.kernels import compiled
+from rawaug.kernels import runtime
 from rawaug.metrics import psnr
 
 
@@ -32,7 +32,7 @@ def curved_isp(**settings: object) -> DictionaryISP:
 @pytest.fixture(params=["compiled", "pytorch"])
 def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """With and without compiled loops."""
-    monkeypatch.setattr(compiled, "available", lambda: request.param == "compiled")
+    monkeypatch.setattr(runtime, "has_numba", lambda: request.param == "compiled")
 
 
 @pytest.mark.usefixtures("either_way")

@@ -11,10 +11,7 @@ import torch
 
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import noise_numba, raw_torch
-from rawaug.kernels import noise_triton as noise_kernel
-from rawaug.kernels import raw_triton as raw_kernel
-from rawaug.kernels import runtime as fallback
+from rawaug.kernels import cpu, gpu, reference, runtime
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
@@ -25,7 +22,7 @@ FLOATS = ("all stages", "curves")
 """Configurations for float pictures too: a table or curves are what looks a pixel up."""
 
 
-def camera_of(srgb: torch.Tensor, **settings: Any) -> raw_torch.Camera:
+def camera_of(srgb: torch.Tensor, **settings: Any) -> reference.Camera:
     isp = full_isp(**settings)
     place = torch.tensor([[6, 34, 40, 60, 5], [0, 0, *srgb.shape[-2:], 0]])
     return BakedISP(isp)._camera(srgb, isp.choose(srgb), place)
@@ -35,18 +32,18 @@ def check_raw(settings: dict[str, Any], dtype: torch.dtype) -> None:
     srgb = torch.randint(256, (2, 3, 18, 34), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
     srgb = srgb if dtype == torch.uint8 else srgb / 255.0
     camera = camera_of(srgb, **settings)
-    raw = raw_kernel.unprocess(srgb, camera, 0.3)
-    torch.testing.assert_close(raw, raw_torch.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
+    raw = gpu.unprocess(srgb, camera, 0.3)
+    torch.testing.assert_close(raw, reference.unprocess(srgb, camera, 0.3), atol=2e-6, rtol=1e-5)
     assert raw.max() == torch.tensor(0.3)
 
 
 def check_noise(white: float) -> None:
     clean = 1.3 * torch.rand(2, 4, 12, 50, generator=torch.Generator().manual_seed(0)) - 0.1
     levels, keys = torch.tensor([[1e-2, 1e-3], [1e-3, 0.0]]), [2**64 - 5, 123456789012345]
-    ours = noise_kernel.shot_read(clean, levels, keys, white, True)
-    for a, b in zip(ours, noise_numba.shot_read(clean, levels, keys, white, True), strict=True):
+    ours = gpu.shot_read(clean, levels, keys, white, True)
+    for a, b in zip(ours, cpu.shot_read(clean, levels, keys, white, True), strict=True):
         torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-5)
-    assert noise_kernel.shot_read(clean, levels, keys, white, False)[1].numel() == 0
+    assert gpu.shot_read(clean, levels, keys, white, False)[1].numel() == 0
 
 
 def check_kernels_are_used() -> None:
@@ -60,10 +57,10 @@ def check_kernels_are_used() -> None:
         asked.append(image.shape)
         return True
 
-    with mock.patch.object(fallback, "usable", usable):
+    with mock.patch.object(runtime, "triton_usable", usable):
         torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
-    assert asked == [clean.shape, srgb.shape] and not fallback._refused
+    assert asked == [clean.shape, srgb.shape] and not runtime._failed
 
 
 if __name__ == "__main__":

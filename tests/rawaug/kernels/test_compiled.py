@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch.utils.data import DataLoader, Dataset
 
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import compiled
+from rawaug.kernels import runtime
 from rawaug.plugin.augment import RawAugment
 
 PICTURE = torch.randint(256, (1, 3, 512, 512), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
@@ -33,7 +33,7 @@ def test_every_row_is_done_once(rows: int, width: int, threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     done: list[int] = []
-    compiled.over_rows(rows, width, lambda start, stop: done.extend(range(start, stop)))
+    runtime.over_rows(rows, width, lambda start, stop: done.extend(range(start, stop)))
     torch.set_num_threads(before)
     assert sorted(done) == list(range(rows))
 
@@ -43,7 +43,7 @@ def test_an_error_in_a_thread_is_raised(two_threads: None) -> None:
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError, match="no"):
-        compiled.over_rows(8, 10**6, fail)
+        runtime.over_rows(8, 10**6, fail)
 
 
 class Augmented(Dataset[torch.Tensor]):
@@ -98,4 +98,4 @@ def test_the_same_noise_where_nothing_can_be_compiled(tmp_path: Path) -> None:
 def test_code_that_cannot_be_kept_is_compiled_all_the_same() -> None:
     made: dict[str, Callable[[int], int]] = {}
     exec("def double(x):\n    return 2 * x", made)  # no file, so no place beside it
-    assert compiled.compiled(made["double"])(21) == 42
+    assert runtime.compiled(made["double"])(21) == 42

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.kernels import runtime as fallback
+from rawaug.kernels import runtime
 
 triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
 
@@ -28,16 +28,16 @@ def test_step_by_step_they_do_what_the_cpu_does() -> None:
 
 @pytest.mark.parametrize("with_map", [True, False])
 def test_the_noise_compiles_for_a_gpu(with_map: bool) -> None:
-    from rawaug.kernels import noise_triton as noise
+    from rawaug.kernels import gpu
 
     names = ("clean", "levels", "keys", "noisy", "variance", "cells", "white")
     types = dict(zip(names, ("*fp32", "*fp32", "*i64", "*fp32", "*fp32", "i32", "fp32"), strict=True))
-    assert "st.global" in compiled_for_a_gpu(noise._cells, types, {"MAP": with_map, "BLOCK": 512})
+    assert "st.global" in compiled_for_a_gpu(gpu._noise_cells, types, {"MAP": with_map, "BLOCK": 512})
 
 
 @pytest.mark.parametrize(("pixels", "all_stages"), [("*u8", True), ("*fp32", False)])
 def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
-    from rawaug.kernels import raw_triton as raw
+    from rawaug.kernels import gpu
 
     types = {
         "srgb": pixels,
@@ -46,7 +46,7 @@ def test_the_raw_compiles_for_a_gpu(pixels: str, all_stages: bool) -> None:
     types |= {"h": "i32", "w": "i32", **dict.fromkeys(("scale", "knee", "white"), "fp32")}
     constants = {"S0": 0, "S1": 6, "S2": 5, "S3": 11, "NODES": 65, "ENTRIES": 0 if all_stages else 256, "BLOCK": 256}
     constants |= {"ATTENDS": all_stages, "SHADES": all_stages}
-    assert "st.global" in compiled_for_a_gpu(raw._cells, types, constants)
+    assert "st.global" in compiled_for_a_gpu(gpu._raw_cells, types, constants)
 
 
 def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, Any]) -> str:
@@ -59,18 +59,18 @@ def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, 
 
 
 def test_a_kernel_that_fails_is_reported_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fallback, "_refused", [])
+    monkeypatch.setattr(runtime, "_failed", [])
 
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
     with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
-        assert fallback.kernel_or(fails, lambda: 2) == 2
-    assert not fallback.usable(torch.zeros(1, device="meta"))
+        assert runtime.kernel_or(fails, lambda: 2) == 2
+    assert not runtime.triton_usable(torch.zeros(1, device="meta"))
 
     def has_no_room() -> int:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     with pytest.raises(torch.OutOfMemoryError):
-        fallback.kernel_or(has_no_room, lambda: 2)
-    assert fallback._refused == ["RuntimeError"]
+        runtime.kernel_or(has_no_room, lambda: 2)
+    assert runtime._failed == ["RuntimeError"]

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import raw_torch
-from rawaug.kernels import runtime as fallback
+from rawaug.kernels import reference, runtime
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment
@@ -43,7 +42,7 @@ def assert_same_bits(a: RawPair, b: RawPair) -> None:
 def test_the_kernels_are_the_ones_that_run() -> None:
     srgb = pictures().to(DEVICE)
     on_device()(srgb)
-    assert fallback.usable(srgb) and not fallback._refused
+    assert runtime.triton_usable(srgb) and not runtime._failed
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -56,7 +55,7 @@ def test_raw_is_that_of_the_cpu_and_of_pytorch(name: str, dtype: torch.dtype) ->
     baked, there, params = baked.to(DEVICE), srgb.to(DEVICE), type(params)(*(p.to(DEVICE) for p in params))
     raw = baked(there, params, place, white=0.3)
     assert raw.device.type == torch.device(DEVICE).type and raw.max() == torch.tensor(0.3)
-    plain = raw_torch.unprocess(there, baked._camera(there, params, place), 0.3)
+    plain = reference.unprocess(there, baked._camera(there, params, place), 0.3)
     assert psnr(raw.cpu(), expected).min() >= SAME and psnr(raw, plain).min() >= SAME
 
 

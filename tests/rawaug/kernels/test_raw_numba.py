@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rawaug.kernels import raw_numba
-from rawaug.kernels.raw_torch import Camera, frame_of, look_up, through_curves, unprocess
+from rawaug.kernels import cpu
+from rawaug.kernels.reference import Camera, frame_of, look_up, through_curves, unprocess
 
 NODES = 9
 
@@ -50,9 +50,7 @@ def threads() -> Iterator[None]:
 def test_compiled_is_the_same_pass(attention: bool, shading: bool, white: float) -> None:
     srgb, setting = pictures(3, 3, 6, 1100), camera(3, attention, shading)
     for x in (srgb, srgb / 255.0):
-        torch.testing.assert_close(
-            raw_numba.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0
-        )
+        torch.testing.assert_close(cpu.unprocess(x, setting, white), unprocess(x, setting, white), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("entries", [256, 1021])
@@ -61,10 +59,8 @@ def test_curves_by_picture_are_the_same_pass(entries: int, all_stages: bool) -> 
     srgb, setting = pictures(3, 3, 6, 1100), camera(3, all_stages, all_stages, entries=entries)
     for x in (srgb, srgb / 255.0):
         expected = unprocess(x, setting, 0.9)
-        torch.testing.assert_close(raw_numba.unprocess(x, setting, 0.9), expected, atol=1e-5, rtol=0)
-        assert torch.equal(
-            raw_numba.unprocess(x[1:2], one_of(setting, 1), 0.9)[0], raw_numba.unprocess(x, setting, 0.9)[1]
-        )
+        torch.testing.assert_close(cpu.unprocess(x, setting, 0.9), expected, atol=1e-5, rtol=0)
+        assert torch.equal(cpu.unprocess(x[1:2], one_of(setting, 1), 0.9)[0], cpu.unprocess(x, setting, 0.9)[1])
 
 
 def test_a_curve_has_every_code_of_a_byte() -> None:
@@ -92,9 +88,7 @@ def one_of(setting: Camera, picture: int) -> Camera:
 @given(st.integers(0, 3), st.integers(0, 9), st.integers(0, 300))
 def test_any_size(batch: int, height: int, width: int) -> None:
     srgb, setting = pictures(batch, 3, 2 * height, 2 * width), camera(batch, True, True)
-    torch.testing.assert_close(
-        raw_numba.unprocess(srgb, setting, 1.0), unprocess(srgb, setting, 1.0), atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(cpu.unprocess(srgb, setting, 1.0), unprocess(srgb, setting, 1.0), atol=1e-4, rtol=0)
 
 
 def test_same_bits_on_any_number_of_threads(threads: None) -> None:
@@ -102,16 +96,16 @@ def test_same_bits_on_any_number_of_threads(threads: None) -> None:
     results = []
     for number in (1, 2, 3):
         torch.set_num_threads(number)
-        results.append(raw_numba.unprocess(srgb, setting, 1.0))
+        results.append(cpu.unprocess(srgb, setting, 1.0))
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
 
 
 def test_floats_beyond_the_cube_are_held_to_it_and_strides_do_not_matter() -> None:
     wild = torch.tensor([-1e30, -0.5, 0.0, 0.5, 1.0, 1.5, 1e30, float("inf")]).repeat(3)[:, None].expand(1, 3, 24, 16)
     setting = camera(1, True, False)
-    expected = raw_numba.unprocess(wild.clamp(0.0, 1.0), setting, 1.0)
-    assert torch.equal(raw_numba.unprocess(wild, setting, 1.0), expected)
-    raw_numba.unprocess(torch.full((1, 3, 4, 4), float("nan")), setting, 1.0)  # must not read outside the table
+    expected = cpu.unprocess(wild.clamp(0.0, 1.0), setting, 1.0)
+    assert torch.equal(cpu.unprocess(wild, setting, 1.0), expected)
+    cpu.unprocess(torch.full((1, 3, 4, 4), float("nan")), setting, 1.0)  # must not read outside the table
 
 
 def test_bands_in_pytorch_are_the_picture_in_one() -> None:
@@ -125,4 +119,4 @@ def test_thumbnails_are_adaptive_averages_looked_up(size: tuple[int, int]) -> No
     srgb, table = pictures(2, 3, *size), camera(1, False, False).table
     for small in ((7, 9), (5, 8), size):
         expected = look_up(table, F.adaptive_avg_pool2d(srgb / 255.0, small))[:, :3]
-        torch.testing.assert_close(raw_numba.thumbnails(srgb, table, *small), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(cpu.thumbnails(srgb, table, *small), expected, atol=1e-5, rtol=0)

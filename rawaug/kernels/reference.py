@@ -1,12 +1,20 @@
-r"""The reverse pass of a baked ISP, pixel by pixel: look-up, colour, gains, shading, mosaic, clip.
+r"""The passes in PyTorch, for any device: the definition that the compiled kernels are tested against.
+
+The reverse pass of a baked ISP, pixel by pixel: look-up, colour, gains, shading, mosaic, clip.
 
 .. math:: y_c = \min(\sum_k C_{ck} T_k(x) \, (floor_c + m \, rise_c) \, G(p) \, A(x_4),\ white), \qquad
     m = \mathrm{clip}((\bar x_3 - knee) / (1 - knee), 0, 1)^2
 
 with :math:`floor = 1 / g` and :math:`rise = \max(1 - 1 / g, 0)`, which is Brooks' ``max(m + (1 - m) / g, 1 / g)``.
-Every site computes the one colour that its mosaic keeps.
+Each site computes only the colour that its mosaic keeps.
 
-This is the pass in PyTorch, for any device; :mod:`rawaug.kernels.raw_numba` is the fast form for CPUs.
+Normal numbers by counting: number k of cell i is a function of (key, i, k) alone.
+
+.. math:: (w_0, w_1, w_2, w_3) = \mathrm{Philox4x32\text{-}10}(i; key), \qquad
+    n_{0, 1} = \sqrt{-2 \ln u(w_0)} \, (\cos, \sin)(2 \pi w_1 / 2^{32}), \quad u(w) = (w + 1/2) / 2^{32}
+
+and likewise :math:`n_{2, 3}` from :math:`w_2, w_3` (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC
+2011; Box and Muller 1958): the four normals of a Bayer cell, up to 6.7 standard deviations, in any order of the cells.
 """
 
 from __future__ import annotations
@@ -18,8 +26,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
+INCREMENTS = (0x9E3779B9, 0xBB67AE85)
+ROUNDS = 10
+_LOW = 0xFFFFFFFF
+
 BAND = 2**19
-"""Bounds the memory that a CPU takes."""
+"""Pixels that a CPU works on at a time, to bound its memory."""
 
 
 class Camera(NamedTuple):
@@ -72,10 +85,7 @@ def frame_of(place: list[int], height: int, width: int, centre: tuple[float, flo
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float, band: int = BAND) -> Tensor:
-    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``.
-
-    ``band``: pixels that a CPU works on at a time.
-    """
+    """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to packed RAW ``(B, 4, H/2, W/2)``, at most ``white``."""
     batch, _, height, width = srgb.shape
     raw = torch.empty(batch, 4, height // 2, width // 2, device=srgb.device, dtype=torch.float32)
     pictures, rows = batch, height
@@ -151,3 +161,36 @@ def _fall_off(camera: Camera, top: int, height: int, width: int) -> Tensor | Non
     )
     a, b, c = camera.shading
     return torch.exp2(-(a * y * y + (b * y + c * x) * x))[:, None]
+
+
+def words(key: int, counters: Tensor) -> Tensor:
+    """Philox4x32-10 of int64 ``counters`` ``(n,)`` below 2^32, under a key below 2^64: int64 ``(4, n)`` below 2^32.
+
+    Example:
+        >>> [hex(word) for word in words(0, torch.zeros(1, dtype=torch.int64))[:, 0].tolist()]
+        ['0x6627e8d5', '0xe169c58d', '0xbc57ac4c', '0x9b00dbd8']
+    """
+    zero = torch.zeros_like(counters)
+    a, b, c, d = counters, zero, zero, zero
+    low, high = key & _LOW, key >> 32
+    for _ in range(ROUNDS):
+        (high_a, low_a), (high_c, low_c) = _product(a, MULTIPLIERS[0]), _product(c, MULTIPLIERS[1])
+        a, b, c, d = high_c ^ b ^ low, low_c, high_a ^ d ^ high, low_a
+        low, high = (low + INCREMENTS[0]) & _LOW, (high + INCREMENTS[1]) & _LOW
+    return torch.stack([a, b, c, d])
+
+
+def normals(key: int, height: int, width: int) -> Tensor:
+    """Standard normal float32 ``(4, height, width)``: the four planes of a packed picture, cells counted row by row."""
+    w = words(key, torch.arange(height * width))
+    radius = (w[0::2].float() + 0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
+    turn = torch.where(w[1::2] < 2**31, w[1::2], w[1::2] - 2**32).double().mul_(2.0 * math.pi / 2**32)
+    drawn = torch.stack([radius * turn.cos().float(), radius * turn.sin().float()], dim=1)
+    return drawn.reshape(4, height, width)
+
+
+def _product(x: Tensor, factor: int) -> tuple[Tensor, Tensor]:
+    """High and low 32 bits of a product of 32-bit numbers: int64 has room for the halves' products alone."""
+    upper, lower = (x >> 16) * factor, (x & 0xFFFF) * factor
+    high = (upper + (lower >> 16)) >> 16
+    return high, ((upper << 16) + lower) & _LOW

@@ -1,7 +1,8 @@
-"""The pass of :mod:`rawaug.kernels.raw_torch` as one kernel: a program works on a block of Bayer cells of one picture.
+"""The passes of :mod:`rawaug.kernels.reference` as Triton kernels: a program works on a block of Bayer cells.
 
-Every pixel is read once and every site written once: 3 bytes in and 4 out a pixel. The table, 4.4 MB at 65 nodes, stays
-in the GPU's cache.
+RAW reads every pixel once and writes every site once, 3 bytes in and 4 out a pixel; the table, 4.4 MB at 65 nodes,
+stays in the GPU's cache. Triton's generator is Philox4x32-10 with the cell as its counter, so the noise is that of a
+CPU but for the rounding of logarithms.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from rawaug.kernels.raw_torch import Camera
+from rawaug.kernels.reference import Camera
 
-_BLOCK = 256
+_RAW_BLOCK = 256
+_NOISE_BLOCK = 512
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
@@ -26,7 +28,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     scale = ((entries or nodes) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)
     sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
     with torch.cuda.device_of(srgb):  # which need not be the current one
-        _cells[(triton.cdiv(h * w, _BLOCK), batch)](
+        _raw_cells[(triton.cdiv(h * w, _RAW_BLOCK), batch)](
             srgb.contiguous(),
             camera.table,
             camera.curves.contiguous(),
@@ -48,7 +50,7 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
             ENTRIES=entries,
             ATTENDS=camera.attention.numel() > 0,
             SHADES=camera.shading.numel() > 0,
-            BLOCK=_BLOCK,
+            BLOCK=_RAW_BLOCK,
             enable_fp_fusion=True,
         )
     return raw
@@ -140,7 +142,7 @@ def _site(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _cells(  # type: ignore[no-untyped-def]
+def _raw_cells(  # type: ignore[no-untyped-def]
     srgb, table, curves, attention, colour, frame, shading, raw, h, w, scale, knee, white,
     S0: tl.constexpr, S1: tl.constexpr, S2: tl.constexpr, S3: tl.constexpr,
     NODES: tl.constexpr, ENTRIES: tl.constexpr, ATTENDS: tl.constexpr, SHADES: tl.constexpr, BLOCK: tl.constexpr,
@@ -158,3 +160,74 @@ def _cells(  # type: ignore[no-untyped-def]
           S2, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
     _site(x, table, curve, attention, c, f, shading, y + 3 * size, cell, h, w, scale, knee, white,
           S3, NODES, ENTRIES, ATTENDS, SHADES)  # fmt: skip
+
+
+def shot_read(
+    clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
+) -> tuple[Tensor, Tensor]:
+    """Noisy RAW and its variance map, ``(B, 4, h, w)``; arguments of :func:`rawaug.kernels.cpu.shot_read`."""
+    clean = clean.detach().contiguous()
+    batch, _, height, width = clean.shape
+    noisy = torch.empty_like(clean)
+    variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
+    signed = torch.tensor([key - 2**64 if key >= 2**63 else key for key in keys], device=clean.device)
+    variances = levels.to(clean.device, torch.float32).contiguous()
+    grid = (triton.cdiv(height * width, _NOISE_BLOCK), batch)
+    with torch.cuda.device_of(clean):  # which need not be the current one
+        _noise_cells[grid](
+            clean,
+            variances,
+            signed,
+            noisy,
+            variance,
+            height * width,
+            white,
+            with_variance,
+            BLOCK=_NOISE_BLOCK,
+            enable_fp_fusion=True,
+        )
+    return noisy, variance
+
+
+@triton.jit
+def _sine(turn):  # type: ignore[no-untyped-def]
+    """As on the CPU: folded to a quarter turn about 0, then an odd polynomial."""
+    folded = tl.where(turn > 1073741824, 2147483647 - turn + 1, turn)
+    folded = tl.where(turn < -1073741824, -2147483647 - turn - 1, folded)
+    x = folded.to(tl.float32) * 9.313225746154785e-10
+    s = x * x
+    return x * ((((1.5167854e-4 * s - 4.6741581e-3) * s + 0.079689927) * s - 0.64596379) * s + 1.57079637)
+
+
+@triton.jit
+def _pair(u, turn):  # type: ignore[no-untyped-def]
+    """Two normals of two words (Box and Muller)."""
+    radius = tl.sqrt(-2.0 * tl.log((u.to(tl.float32) + 0.5) * 2.3283064365386963e-10))
+    turn = turn.to(tl.int32, bitcast=True)
+    return radius * _sine(turn + 1073741824), radius * _sine(turn)
+
+
+@triton.jit
+def _disturb(clean, normal, noisy, variance, at, inside, shot, read, white, MAP: tl.constexpr):  # type: ignore[no-untyped-def]
+    y = tl.load(clean + at, mask=inside, other=0.0)
+    value = tl.minimum(y + tl.sqrt(shot * tl.maximum(y, 0.0) + read) * normal, white)
+    tl.store(noisy + at, value, mask=inside)
+    if MAP:
+        tl.store(variance + at, shot * tl.maximum(value, 0.0) + read, mask=inside)
+
+
+@triton.jit
+def _noise_cells(clean, levels, keys, noisy, variance, cells, white, MAP: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    picture = tl.program_id(1)
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = cell < cells
+    shot, read = tl.load(levels + 2 * picture), tl.load(levels + 2 * picture + 1)
+    a, b, c, d = tl.randint4x(tl.load(keys + picture), cell)
+    red, green_r = _pair(a, b)
+    green_b, blue = _pair(c, d)
+    size = cells.to(tl.int64)
+    at = picture * 4 * size + cell
+    _disturb(clean, red, noisy, variance, at, inside, shot, read, white, MAP)
+    _disturb(clean, green_r, noisy, variance, at + size, inside, shot, read, white, MAP)
+    _disturb(clean, green_b, noisy, variance, at + 2 * size, inside, shot, read, white, MAP)
+    _disturb(clean, blue, noisy, variance, at + 3 * size, inside, shot, read, white, MAP)

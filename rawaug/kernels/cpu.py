@@ -1,11 +1,13 @@
-"""The reverse pass of :mod:`rawaug.kernels.raw_torch` in one pass over the picture, compiled; and thumbnails.
+"""The passes of :mod:`rawaug.kernels.reference` as loops for the CPU, compiled by Numba; and thumbnails.
 
-A row is worked on in pieces that fit the fastest cache, each step a loop of its own that the compiler turns into vector
-instructions. :func:`_interpolate` spells these out for the table, four colours of two neighbouring nodes at a time,
-which no compiler finds by itself.
+A row is worked on in pieces that fit the fastest cache, each step a loop of its own, which the compiler turns into
+vector instructions. It does not find those for the table's look-up, so :func:`_interpolate` spells them out: four
+colours of two neighbouring nodes at a time. Exponential, logarithm and sine are polynomials of least greatest error.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
@@ -16,18 +18,28 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from rawaug.kernels.compiled import compiled, over_rows, part
-from rawaug.kernels.raw_torch import Camera
+from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera
+from rawaug.kernels.runtime import compiled, over_rows, part
 
-_TILE = 256
-"""Cells that are worked on at a time."""
+_TILE = 256  # cells of RAW that are worked on at a time
+_NOISE_TILE = 512  # and of noise
 
 _ZERO, _ONE, _FAR = np.float32(0), np.float32(1), np.float32(np.inf)
-_LEAST = np.float32(-125)
-"""Exponent at which a mask counts as 0."""
+_LEAST = np.float32(-125)  # exponent at which a mask counts as 0
 
-# 2^f within 7.5e-8 on [0, 1], least greatest relative error, in falling powers.
+_M0, _M1 = (np.uint64(m) for m in MULTIPLIERS)
+_K0, _K1 = (np.uint32(k) for k in INCREMENTS)
+_32 = np.uint64(32)
+_QUARTER_TURN = np.int32(2**30)
+
+# In falling powers: 2^f within 7.5e-8 on [0, 1], relative; ln(1 + m) / m within 2.6e-8 for 1 + m between sqrt(1/2) and
+# sqrt(2); sin(pi / 2 sqrt(s)) / sqrt(s) within 6.7e-9 on [0, 1].
 _EXP2 = tuple(np.float32(c) for c in (1.8775839e-3, 8.9893471e-3, 0.055826288, 0.24015364, 0.69315308, 0.99999994))
+_LOG = tuple(
+    np.float32(c)
+    for c in (0.08960108, -0.14482562, 0.14917466, -0.16543691, 0.19958405, -0.25002947, 0.3333416, -0.49999979, 1.0)
+)
+_SINE = tuple(np.float32(c) for c in (1.5167854e-4, -4.6741581e-3, 0.079689927, -0.64596379, 1.57079637))
 
 
 def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
@@ -47,26 +59,8 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     codes, curves = (curves, None) if in_bytes and entries == 256 else (None, curves)
     knee, ceiling = np.float32(camera.knee), np.float32(white)
 
-    def run(start: int, stop: int) -> None:
-        _rows(
-            picture,
-            scale,
-            table,
-            codes,
-            curves,
-            attention,
-            colour,
-            knee,
-            frame,
-            shading,
-            sites,
-            ceiling,
-            out,
-            start,
-            stop,
-        )
-
-    over_rows(batch * height, width, run)
+    settings = (scale, table, codes, curves, attention, colour, knee, frame, shading, sites, ceiling)
+    over_rows(batch * height, width, lambda start, stop: _raw_rows(picture, *settings, out, start, stop))
     return raw
 
 
@@ -75,11 +69,11 @@ def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
     x2 = torch.empty(len(srgb), 3, height, width, dtype=torch.float32)
     picture, nodes, out = srgb.detach().contiguous().numpy(), table.contiguous().numpy(), x2.numpy()
     rows, columns = _windows(srgb.shape[2], height), _windows(srgb.shape[3], width)
-
-    def run(start: int, stop: int) -> None:
-        _small_rows(picture, rows, columns, nodes, out, start, stop)
-
-    over_rows(len(srgb) * height, srgb[0].numel() // height, run)
+    over_rows(
+        len(srgb) * height,
+        srgb[0].numel() // height,
+        lambda start, stop: _small_rows(picture, rows, columns, nodes, out, start, stop),
+    )
     return x2
 
 
@@ -237,7 +231,9 @@ def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: igno
 
 
 @compiled
-def _rows(srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop):  # type: ignore[no-untyped-def]
+def _raw_rows(
+    srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop
+):  # type: ignore[no-untyped-def]
     """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
     height, width = srgb.shape[2], raw.shape[3]
     nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)
@@ -303,3 +299,115 @@ def _small_rows(srgb, rows, columns, table, x2, start, stop):  # type: ignore[no
             red, green, blue = means[0, first:last], means[1, first:last], means[2, first:last]
             _look_up(red, green, blue, scale, table, nodes, shares, 0, found)
             x2[b, :, i, first:last] = found[0, :, : last - first]
+
+
+def shot_read(
+    clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
+) -> tuple[Tensor, Tensor]:
+    """Noisy RAW and its variance map, float32 ``(B, 4, h, w)`` on the CPU.
+
+    Args:
+        clean: float32 ``(B, 4, h, w)`` on the CPU.
+        levels: ``(B, 2)`` shot_var and read_var.
+        keys: one per picture, below 2^64.
+        white: where the noisy signal is clipped; infinity for nowhere.
+        with_variance: without it, the second result is empty.
+    """
+    noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
+    variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
+    signal, out = clean.detach().contiguous().numpy(), noisy.numpy()
+    if not noisy.numel():
+        return noisy, variance
+    var = variance.numpy() if with_variance else None  # then no code is compiled for it
+    variances = levels.detach().to("cpu", torch.float32).numpy()
+    key = np.array([(k & 0xFFFFFFFF, k >> 32) for k in keys], dtype=np.uint32)
+    ceiling = np.float32(white)
+    batch, _, height, width = clean.shape
+    over_rows(batch * height, 4 * width, lambda a, b: _noise_rows(signal, variances, key, ceiling, out, var, a, b))
+    return noisy, variance
+
+
+@part
+def _words(key, first, count, words):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        a, b, c, d = np.uint32(first + i), np.uint32(0), np.uint32(0), np.uint32(0)
+        low, high = key[0], key[1]
+        for _ in range(ROUNDS):
+            p, q = np.uint64(a) * _M0, np.uint64(c) * _M1
+            a, b = np.uint32(q >> _32) ^ b ^ low, np.uint32(q)
+            c, d = np.uint32(p >> _32) ^ d ^ high, np.uint32(p)
+            low, high = np.uint32(low + _K0), np.uint32(high + _K1)
+        words[0, i], words[1, i], words[2, i], words[3, i] = a, b, c, d
+
+
+@part
+def _log(x):  # type: ignore[no-untyped-def]
+    """Natural logarithm of a positive, normal float32: exponent, and a polynomial in the mantissa about 1."""
+    bits = np.float32(x).view(np.int32)
+    exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)  # mantissa in [1 / sqrt(2), sqrt(2))
+    m = np.int32(bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
+    p = _LOG[0]
+    for k in range(1, len(_LOG)):
+        p = p * m + _LOG[k]
+    return np.float32(exponent) * np.float32(math.log(2)) + m * p
+
+
+@part
+def _sine(turn):  # type: ignore[no-untyped-def]
+    """Sine of an angle in units of 2^-32 turns: folded to a quarter turn about 0, then an odd polynomial."""
+    folded = turn
+    if turn > _QUARTER_TURN or turn < -_QUARTER_TURN:
+        folded = np.int32(np.int32(-(2**31)) - turn)
+    x = np.float32(folded) * np.float32(2.0**-30)
+    square = x * x
+    p = _SINE[0]
+    for k in range(1, len(_SINE)):
+        p = p * square + _SINE[k]
+    return x * p
+
+
+@part
+def _normals(words, count, normals):  # type: ignore[no-untyped-def]
+    for pair in (0, 2):
+        for i in range(count):
+            u = (np.float32(words[pair, i]) + np.float32(0.5)) * np.float32(2.0**-32)
+            square = np.float32(-2) * _log(u)
+            radius = np.sqrt(square if square > np.float32(0) else np.float32(0))
+            turn = np.int32(words[pair + 1, i])
+            normals[pair, i] = radius * _sine(np.int32(turn + _QUARTER_TURN))
+            normals[pair + 1, i] = radius * _sine(turn)
+
+
+@part
+def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-untyped-def]
+    for j in range(len(signal)):
+        y = signal[j]
+        light = y if y > np.float32(0) else np.float32(0)
+        value = y + np.sqrt(shot * light + read) * normals[j]
+        noisy[j] = white if value > white else value
+
+
+@part
+def _law(noisy, shot, read, variance):  # type: ignore[no-untyped-def]
+    for j in range(len(noisy)):
+        light = noisy[j] if noisy[j] > np.float32(0) else np.float32(0)
+        variance[j] = shot * light + read
+
+
+@compiled
+def _noise_rows(clean, levels, keys, white, noisy, variance, start, stop):  # type: ignore[no-untyped-def]
+    """Rows ``start`` to ``stop`` of the batch's rows of cells, one picture's after the other's."""
+    height, width = clean.shape[2], clean.shape[3]
+    words, normals = np.empty((4, _NOISE_TILE), np.uint32), np.empty((4, _NOISE_TILE), np.float32)
+    for row in range(start, stop):
+        b, i = divmod(row, height)
+        shot, read = levels[b, 0], levels[b, 1]
+        for left in range(0, width, _NOISE_TILE):
+            count = min(_NOISE_TILE, width - left)
+            right = left + count
+            _words(keys[b], i * width + left, count, words)
+            _normals(words, count, normals)
+            for k in range(4):
+                _disturb(clean[b, k, i, left:right], normals[k], shot, read, white, noisy[b, k, i, left:right])
+                if variance is not None:
+                    _law(noisy[b, k, i, left:right], shot, read, variance[b, k, i, left:right])
