@@ -70,16 +70,18 @@ def _set_up(path: Path) -> None:
     from jsonargparse import ArgumentError
 
     from rawaug.commands.spelling import require_known_keys
-    from rawaug.experiment.kinds import KINDS, kind_of
-    from rawaug.experiment.plain_yaml import read_yaml
-    from rawaug.experiment.recipe import Recipe
+    from rawaug.experiment.kinds import settings_of
+    from rawaug.experiment.recipe import Recipe, kind_of, read_recipe, require_values
     from rawaug.training.state import first_network
 
     try:
-        kind, (parser, run) = KINDS[kind_of(path)], _run_parser(kind_of(path))
-        require_known_keys(path, read_yaml(path), run)
+        content = read_recipe(path)
+        kind = settings_of(kind_of(content, path))
+        parser, run = _run_parser(kind_of(content, path))
+        require_known_keys(path, content, run)
+        require_values(kind, content)
         settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind.settings(**{key: settings[key] for key in kind.settings.__dataclass_fields__})
+        recipe = kind(**{key: settings[key] for key in kind.__dataclass_fields__})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:

@@ -27,8 +27,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.evaluation.scores import classical_method, score_method
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.experiment.plain_yaml import read_yaml
-from rawaug.experiment.recipe import find_recipe
+from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
@@ -56,7 +55,7 @@ def settings(recipe: str | None, steps: int | None) -> tuple[DownstreamConfig, N
     """Network and loop, and the noise of the training samples, of a training recipe; None for :data:`CONFIG`'s."""
     config, noise = CONFIG, noise_model(CONFIG.noise)
     if recipe is not None:
-        found = read_yaml(find_recipe(recipe))
+        found = read_recipe(find_recipe(recipe))
         train = TrainConfig(**{**found["train"], "workers": 0})
         config = replace(CONFIG, denoiser=DenoiserConfig(**found["denoiser"]), train=train)
         noise = noise_model(found["noise"])

@@ -82,6 +82,11 @@ def _dispatch(argv: list[str]) -> int:
     if recipe is not None:
         _require_known_keys(recipe, kind, leaves["run"], helps=bool({"-h", "--help"} & set(argv)))
     parsed = _parsed(parser, argv, chosen, leaves.get(str(chosen)))
+    if chosen == "run":
+        from rawaug.experiment.kinds import settings_of
+        from rawaug.experiment.recipe import require_values
+
+        require_values(settings_of(kind), parsed.run.as_dict())
     values = vars(parser.instantiate(parsed)[parsed.command])
     values = vars(values[values["action"]]) if "action" in values else values  # a command of two words
     with quiet(values["quiet"]):
@@ -112,23 +117,23 @@ def _recipe_of(argv: list[str]) -> tuple[list[str], str, Path | None]:
         argv = ["run", *argv[2:]]
     if argv[:1] != ["run"] or len(argv) < 2 or argv[1].startswith("-"):
         return argv, "training", None
-    from rawaug.experiment.kinds import kind_of
-    from rawaug.experiment.recipe import find_recipe
+    from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
 
     recipe = find_recipe(argv[1])
-    return ["run", "--recipe", str(recipe), *argv[2:]], kind_of(recipe), recipe
+    return ["run", "--recipe", str(recipe), *argv[2:]], kind_of(read_recipe(recipe), recipe), recipe
 
 
 def _require_known_keys(recipe: Path, kind: str, run: Any, helps: bool) -> None:
     """Refuse a recipe with a key that its kind does not have; the help shows the values of the recipe."""
     from rawaug.commands.spelling import require_known_keys
-    from rawaug.experiment.kinds import kind_named
-    from rawaug.experiment.plain_yaml import read_yaml
-    from rawaug.experiment.recipe import defaults_of
+    from rawaug.experiment.kinds import settings_of
+    from rawaug.experiment.recipe import defaults_of, read_recipe, require_values
 
-    require_known_keys(recipe, read_yaml(recipe), run)
+    content = read_recipe(recipe)
+    require_known_keys(recipe, content, run)
+    require_values(settings_of(kind), content)
     if helps:
-        run.set_defaults(defaults_of(recipe, kind_named(kind).settings))
+        run.set_defaults(defaults_of(recipe, settings_of(kind)))
 
 
 def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any]]:
@@ -172,35 +177,29 @@ def _parser(kind: str, wanted: Sequence[str | None]) -> tuple[Any, dict[str, Any
 
 
 def _add_run_arguments(run: Any, kind: str) -> None:
-    from rawaug.experiment.kinds import kind_named
+    from rawaug.experiment.kinds import settings_of
 
     run.add_argument("--recipe", action="config", help="a YAML file, or the name of a shipped recipe")
-    run.add_argument("--smoke", action="store_true", help="run every stage in seconds on tiny built-in data")
-    run.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="show which data would be used and rehearse the run in seconds, without writing",
-    )
+    run.add_argument("--dry-run", action="store_true", help="try every stage once on the run's data, write nothing")
     run.add_argument("--overwrite", action="store_true", help="replace a run of this name with other settings")
-    run.add_class_arguments(kind_named(kind).settings)
+    run.add_class_arguments(settings_of(kind))
 
 
 def _run(kind: str, settings: dict[str, Any], given: set[str]) -> None:
-    from rawaug.experiment.kinds import kind_named, quickly
+    from rawaug.experiment.kinds import dry_run, settings_of
     from rawaug.experiment.plan import with_own_pairs
-    from rawaug.experiment.recipe import Recipe
+    from rawaug.experiment.recipe import Recipe, read_recipe
+    from rawaug.registry import EXPERIMENTS
 
-    experiment = kind_named(kind)
     file, _ = settings.pop("recipe"), settings.pop("quiet")
-    quick, dry, overwrite = (settings.pop(flag) for flag in ("smoke", "dry_run", "overwrite"))
-    recipe = experiment.settings(**settings)
+    dry, overwrite = (settings.pop(flag) for flag in ("dry_run", "overwrite"))
+    recipe = settings_of(kind)(**settings)
     if isinstance(recipe, Recipe) and file:
-        recipe = with_own_pairs(recipe, str(file[0]), given)
-    recipe = quickly(kind, recipe, given) if quick else recipe
+        recipe = with_own_pairs(recipe, read_recipe(str(file[0])), given)
     if dry:
-        experiment.dry_run(recipe, overwrite)
+        dry_run(kind, recipe, overwrite)
     else:
-        experiment.run(recipe, overwrite or quick)  # a smoke run is kept for nothing
+        EXPERIMENTS[kind](recipe, overwrite)
 
 
 def _one_line(error: Exception) -> str:

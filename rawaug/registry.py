@@ -117,7 +117,7 @@ class Registry(Mapping[str, Any]):
     Args:
         kind: what one of them is called in messages.
         group: of the entry points of other packages.
-        packages: whose modules register the built-in ones.
+        packages: whose modules register the built-in ones; one is imported when those before it lack a name.
 
     Example:
         >>> filters = Registry("filter", "rawaug.filters", "denoisers")
@@ -133,9 +133,9 @@ class Registry(Mapping[str, Any]):
     """
 
     def __init__(self, kind: str, group: str, *packages: str) -> None:
-        self.kind, self.group, self.packages = kind, group, packages
+        self.kind, self.group = kind, group
         self._things: dict[str, Any] = {}
-        self._complete = False
+        self._unimported = list(packages)
 
     def register(self, name: str) -> Callable[[T], T]:
         """Decorator: the class or function is found by ``name`` from now on.
@@ -154,8 +154,8 @@ class Registry(Mapping[str, Any]):
         return add
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self._things:
-            self._import_builtin()
+        while name not in self._things and self._unimported:
+            self._import_next()
         if name not in self._things:
             if name not in self._entry_points:
                 raise UnknownName(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}")
@@ -166,7 +166,8 @@ class Registry(Mapping[str, Any]):
         return name in self._things or name in set(self)
 
     def __iter__(self) -> Iterator[str]:
-        self._import_builtin()
+        while self._unimported:
+            self._import_next()
         return iter(sorted({*self._things, *self._entry_points}, key=str.casefold))
 
     def __len__(self) -> int:
@@ -191,13 +192,11 @@ class Registry(Mapping[str, Any]):
         name, settings = name_and_settings(spec)
         return self[name](**{**defaults, **checked_settings(f"{self.kind} {name}", self[name], settings, defaults)})
 
-    def _import_builtin(self) -> None:
-        if self._complete:
-            return
-        for name in self.packages:
-            for module in pkgutil.walk_packages(import_module(name).__path__, f"{name}."):
-                import_module(module.name)
-        self._complete = True
+    def _import_next(self) -> None:
+        package = self._unimported[0]
+        for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
+            import_module(module.name)
+        del self._unimported[:1]
 
     @cached_property
     def _entry_points(self) -> dict[str, Any]:

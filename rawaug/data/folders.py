@@ -146,10 +146,7 @@ class Readable(Sequence[Pair]):
         """Those that were not found to be broken so far; all of them as they were given if none was."""
         if not self.broken:
             return self.pairs
-        kept = [k for k in range(len(self.pairs)) if k not in self.broken]
-        if isinstance(self.pairs, SomePairs):  # of the same pairs
-            return SomePairs(self.pairs.pairs, [self.pairs.indices[k] for k in kept])
-        return SomePairs(self.pairs, kept)
+        return SomePairs(self.pairs, [k for k in range(len(self.pairs)) if k not in self.broken])
 
 
 def left_out(pairs: Readable, of: str) -> list[str]:

@@ -169,8 +169,6 @@ def stamps(pairs: Sequence[Pair]) -> list[str]:
 
     Path, size and modification time of files; names of a dataset's frames; samples of the content of frames in memory.
     """
-    if isinstance(pairs, SomePairs) and not isinstance(pairs.pairs, LazyPairs):
-        return [_sampled(pair) for pair in pairs]
     if isinstance(pairs, LazyPairs):
         return [pairs.stamp(index) for index in range(len(pairs))]
     return [_sampled(pair) for pair in pairs]
@@ -261,7 +259,18 @@ class SomePairs(LazyPairs):
         return self.pairs.files_of(self.indices[index]) if isinstance(self.pairs, LazyPairs) else ()
 
     def stamp(self, index: int) -> str:
-        return self.pairs.stamp(self.indices[index]) if isinstance(self.pairs, LazyPairs) else super().stamp(index)
+        return self.pairs.stamp(self.indices[index]) if isinstance(self.pairs, LazyPairs) else _sampled(self[index])
+
+
+class Middles(SomePairs):
+    """The middle ``crop x crop`` of each pair."""
+
+    def __init__(self, pairs: Sequence[Pair], crop: int) -> None:
+        super().__init__(pairs, range(len(pairs)))
+        self.crop = crop
+
+    def read(self, index: int) -> Pair:
+        return super().read(index).middle(self.crop)
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:

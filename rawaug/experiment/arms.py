@@ -117,9 +117,7 @@ def validation_samples(
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
         return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
     if frames:
-        side = recipe.data.validation_crop
-        middles = (pair.middle(side) if side else pair for pair in frames)
-        return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in middles]
+        return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in frames]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
     return [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]

@@ -26,6 +26,7 @@ from rawaug.data.pairs import Pair, Sample, SomePairs
 from rawaug.evaluation.page import write_figure_page
 from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
 from rawaug.evaluation.tables import METRICS
+from rawaug.experiment.recipe import SHORT_CROP
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
 from rawaug.kernels.runtime import find_device
@@ -75,19 +76,9 @@ class DenoiserSweep:
         if self.crop is not None and (self.crop < 32 or self.crop % 2):
             raise ValueError(f"crop is even and at least 32, or null for whole frames, got {self.crop}")
 
-
-def smoke_sweep(settings: DenoiserSweep) -> DenoiserSweep:
-    """The sweep in seconds, on the demo camera, without any trained denoiser."""
-    name = f"{settings.name}-smoke"
-    quick: dict[str, Any] = {
-        "data": ["demo:test"],
-        "count": 1,
-        "crop": 128,
-        "isos": settings.isos[:2],
-        "denoisers": [],
-        "pmrid": None,
-    }
-    return replace(settings, name=name, classical=["NonLocalMeans"], **quick)
+    def shortest(self) -> DenoiserSweep:
+        """Every method once, on a small piece of one frame."""
+        return replace(self, count=1, crop=min(self.crop or SHORT_CROP, SHORT_CROP), isos=self.isos[:1])
 
 
 @EXPERIMENTS.register("denoisers")

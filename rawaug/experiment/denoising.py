@@ -36,11 +36,9 @@ from rawaug.evaluation.scores import (
 )
 from rawaug.evaluation.tables import Row, draw, print_table
 from rawaug.experiment.arms import chosen, estimator_of, frames_of, in_pattern, training_stream, validation_samples
-from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
-from rawaug.experiment.rehearsal import rehearse
-from rawaug.experiment.run_folder import claim, run_folder
+from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import find_weights, fingerprint, one_at_a_time, replacing, sha256, write_json
 from rawaug.io.apart import reading_within
 from rawaug.isp.model import DictionaryISP
@@ -49,7 +47,7 @@ from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
-from rawaug.training.loop import train
+from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import noisy_only
 from rawaug.training.state import first_network, start_of
 
@@ -88,23 +86,6 @@ def run(
         return _Run(recipe, overwrite, given_frames).all_stages()
 
 
-def dry_run(recipe: Recipe, overwrite: bool = False) -> None:
-    """Say what a run would use of what, and try on its own data, in seconds, all that could fail late.
-
-    Args:
-        recipe: what would be run.
-        overwrite: it would replace a run of this name with other settings.
-
-    Raises:
-        OSError, ValueError: for the first thing found wrong.
-    """
-    with reading_within(recipe.data.read_seconds):
-        prepared = _Run(recipe, overwrite)
-        print("\n".join(prepared.plan.lines(recipe)))
-        rehearse(recipe, prepared.plan, prepared.classical)
-    print(f"dry run: nothing wrong found, nothing written to {prepared.folder}")
-
-
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
@@ -112,7 +93,8 @@ class _Run:
         self, recipe: Recipe, overwrite: bool = False, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})
     ) -> None:
         recipe = with_given_pairs(recipe, given)
-        require_runnable(recipe, overwrite)
+        require_free(recipe, overwrite)
+        require_trainable(recipe.device, recipe.devices, recipe.train.precision)
         self.recipe, self.data, self.overwrite = recipe, recipe.data, overwrite
         self.folder = run_folder(recipe)
         self.classical = installed_classical(recipe.classical, shown=_leads())
@@ -236,7 +218,8 @@ class _Run:
         """Plain and self-ensemble scores on the test frames."""
         place = self.folder / f"seed{seed}" / arm
         digest = sha256(place / "denoiser.safetensors")
-        settings = [] if self.recipe.views == 8 else [self.recipe.views]
+        settings: list[Any] = [] if self.recipe.views == 8 else [self.recipe.views]
+        settings += [] if self.data.test_crop is None else ["crop", self.data.test_crop]
         key = fingerprint(digest, self.data.test, stamps(self.test), *settings)
         path = place / "evaluation.json"
         known = json.loads(path.read_text()) if path.is_file() else {}

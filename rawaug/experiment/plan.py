@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, Remembered, left_out
-from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, SomePairs, names_of, selected, shared_frame
-from rawaug.experiment.plain_yaml import read_yaml
+from rawaug.data.pairs import OWN_PICTURES, Middles, Pair, PairPictures, SomePairs, names_of, selected, shared_frame
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
@@ -80,17 +78,18 @@ class Plan:
         return replace(self, pairs=found, validation=parts["validation"].kept(), test=parts["test"].kept()), lines
 
 
-def with_own_pairs(recipe: Recipe, file: str | Path, given: Collection[str]) -> Recipe:
+def with_own_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection[str]) -> Recipe:
     """A recipe whose pairs were replaced uses all of them, and validates on a part of them.
 
     What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
     of null, on RAW made from the pictures, stays.
 
     Args:
-        recipe: as read from ``file`` and the command line.
+        recipe: as its file and the command line say.
+        content: of the file.
         given: the keys of the command line, such as ``data.pairs``.
     """
-    usual = ((read_yaml(file) or {}).get("data") or {}).get("pairs", DataConfig.pairs)
+    usual = (content.get("data") or {}).get("pairs", DataConfig.pairs)
     if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
         return recipe
     reset: dict[str, Any] = {"count": None} | ({} if recipe.data.validation is None else {"validation": HELD_OUT})
@@ -139,12 +138,18 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
     return Plan(
         pairs=chosen,
-        validation=validation,
-        test=test if data.test_count is None else SomePairs(test, range(len(test))[: data.test_count]),
+        validation=some(validation, data.validation_count, data.validation_crop),
+        test=some(test, data.test_count, data.test_crop),
         pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
     )
+
+
+def some(pairs: Sequence[Pair], count: int | None, crop: int | None) -> Sequence[Pair]:
+    """The first ``count`` pairs, and the middle of each; all of them, or whole, where these are None."""
+    chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
+    return chosen if crop is None else Middles(chosen, crop)
 
 
 def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:

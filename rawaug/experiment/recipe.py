@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
-from rawaug.experiment.plain_yaml import read_yaml
 from rawaug.isp.fit import FitConfig
-from rawaug.registry import DENOISERS, ESTIMATORS, name_and_settings, nearest, require_between
-from rawaug.training.config import DenoiserConfig, TrainConfig, Weighing
+from rawaug.kernels.runtime import find_device
+from rawaug.registry import ESTIMATORS, EXPERIMENTS, name_and_settings, nearest, require_between
+from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
+SHORT_CROP = 256
+"""Of the frames of a dry run."""
 HELD_OUT = "auto"
 """``data.validation`` that is a part of ``data.pairs``."""
 _PAIRS = "pairs:"
+MOST_BYTES = 2**16
 
 
 @dataclass
@@ -38,9 +41,11 @@ class DataConfig(PairSettings):
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
             and keeps the final weights.
+        validation_count: number of pairs to use; null for all.
         validation_crop: side of the central crop used of each validation frame; null for the whole frame.
         test: test pairs; no earlier stage sees them.
         test_count: number of pairs to use; null for all.
+        test_crop: side of the central crop used of each test frame; null for the whole frame.
     """
 
     pairs: str | None = "demo:train"
@@ -51,9 +56,11 @@ class DataConfig(PairSettings):
     max_pixels: int | None = None
     read_seconds: float | None = None
     validation: str | None = "demo:validation"
+    validation_count: int | None = None
     validation_crop: int | None = None
     test: str = "demo:test"
     test_count: int | None = None
+    test_crop: int | None = None
 
     def __post_init__(self) -> None:
         if self.max_pixels is not None:
@@ -62,6 +69,17 @@ class DataConfig(PairSettings):
             require_between("data.read_seconds", self.read_seconds, 0.0, 1e6)
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
+        if not self.pictures:
+            raise ValueError("data.pictures must name a folder, demo:, or a list of these, got an empty list")
+        for key, least in {
+            "count": 1,
+            "validation_count": 1,
+            "validation_crop": 32,
+            "test_count": 1,
+            "test_crop": 32,
+        }.items():
+            if getattr(self, key) is not None:
+                require_between(f"data.{key}", getattr(self, key), least, MOST)
         if self.pictures == OWN_PICTURES and self.pairs is None:
             raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
         given = [key for key, value in self._pair_settings().items() if value is not None]
@@ -232,38 +250,86 @@ class Recipe:
         given: dict[str, Any] = {"learning_rate": own.learning_rate, "weigh": own.weigh, "steps": steps}
         return replace(self.train, **{key: value for key, value in given.items() if value is not None})
 
+    def shortest(self) -> Recipe:
+        """A run of one step an arm on the middles of a few of the same frames, in the same networks and precision."""
+        data = replace(self.data, count=2, select="first", validation_count=1, test_count=1)
+        data = replace(data, validation_crop=SHORT_CROP, test_crop=SHORT_CROP)
+        train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
+        if find_device(self.device).type == "cpu":
+            train = replace(train, batch=min(train.batch, 4 * self.devices))
+        return replace(self, data=data, isp=self.isp.smoke(), train=train, steps=None, seeds=1)
+
     @property
     def self_supervised(self) -> bool:
         """Whether noisy frames are all that may be seen."""
         return not any(arm.sees_clean for arm in self.arms.values())
 
 
-def smoke(recipe: Recipe) -> Recipe:
-    """The recipe in a few seconds: its stages and arms on the demo camera, a tiny network, a few steps, the CPU.
+def read_recipe(file: str | Path) -> dict[str, Any]:
+    """The content of a recipe's file.
 
-    No trained denoiser is read: what would continue from one starts from nothing.
+    Raises:
+        ValueError: if it is not YAML, larger than a recipe can be, or no mapping.
     """
-    name = recipe.denoiser.name
-    few = TrainConfig(steps=4, batch=4, crop=32, warmup=1, validate_every=4, checkpoint_every=2, workers=0)
-    return replace(
-        recipe,
-        name=f"{recipe.name.replace('/', '-')}-smoke",
-        data=replace(
-            DataConfig(count=1, validation_crop=64, test_count=1),
-            pairs=recipe.data.pairs and "demo:train",
-            validation=recipe.data.validation and "demo:validation",
-        ),
-        isp=recipe.isp.smoke(),
-        denoiser=DenoiserConfig(name, dict(DENOISERS[name].tiny)),
-        train=replace(few, loss=recipe.train.loss),
-        arms={label: replace(arm, denoiser=None) for label, arm in recipe.arms.items()},
-        untouched=[],
-        views=4,
-        steps=None,
-        seeds=1,
-        device="cpu",
-        devices=1,
-    )
+    import yaml
+
+    if (size := Path(file).stat().st_size) > MOST_BYTES:
+        raise ValueError(f"{file}: has {size} bytes, a recipe at most {MOST_BYTES}")
+    try:
+        text = Path(file).read_text(encoding="utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            raise ValueError("uses aliases (*name); write the values out")  # a few lines of them are billions of values
+        content = yaml.safe_load(text) or {}
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"{file}: not a recipe ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{file}: not a recipe: it must hold keys and values")
+    return content
+
+
+def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
+    """The kind of experiment that a recipe names.
+
+    Raises:
+        ValueError: if there is no such kind.
+    """
+    kind = content.get("experiment", "training")
+    if not isinstance(kind, str) or kind not in EXPERIMENTS:
+        raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(EXPERIMENTS)}")
+    return kind
+
+
+def require_values(settings: type[Any], content: Mapping[str, Any], above: str = "") -> None:
+    """Refuse null where a value belongs, by the types of a dataclass, of those in it, and of those by name in it.
+
+    Args:
+        settings: the dataclass.
+        content: its keys, or some of them, as read; keys that it lacks are left to others.
+        above: of the keys in messages.
+
+    Raises:
+        ValueError: naming the key.
+
+    Example:
+        >>> require_values(Recipe, {"train": {"ema": None}})
+        Traceback (most recent call last):
+        ValueError: train.ema must have a value, got null; leave the key out for the default
+    """
+    hints = get_type_hints(settings)
+    for key in content.keys() & hints.keys():
+        value, inside = content[key], [hints[key], *get_args(hints[key])]
+        if value is None and type(None) not in inside and hints[key] is not Any:
+            raise ValueError(f"{above}{key} must have a value, got null; leave the key out for the default")
+        part = next((hint for hint in inside if isinstance(hint, type) and is_dataclass(hint)), None)
+        if part is None or not isinstance(value, Mapping):
+            continue
+        named = value if get_origin(hints[key]) is dict else {"": value}
+        for name, one in named.items():
+            where = ".".join(filter(None, [f"{above}{key}", name]))
+            if one is None:
+                raise ValueError(f"{where} must have keys below it, got null")
+            if isinstance(one, Mapping):
+                require_values(part, one, f"{where}.")
 
 
 def shipped_recipes() -> dict[str, Path]:
@@ -294,7 +360,7 @@ def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     hints = get_type_hints(settings)
-    for key, value in (read_yaml(file) or {}).items():
+    for key, value in read_recipe(file).items():
         parts = {f"{key}.{name}": part for name, part in (value or {}).items()} if is_dataclass(hints[key]) else None
         found |= {key: value} if parts is None else parts
     return found

@@ -68,10 +68,6 @@ class Ablation:
         """A few steps on two frames."""
         return replace(self, count=2, fit=self.fit.smoke())
 
-    def smoke(self) -> Ablation:
-        """The same on the demo camera."""
-        return replace(self.shortest(), name=f"{self.name}-smoke", data="demo:validation")
-
 
 @EXPERIMENTS.register("ablation")
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:

@@ -95,10 +95,6 @@ class LearnedParts:
         few = {name: changes | {"steps": 2, "joint_steps": 0} for name, changes in self.variants.items()}
         return replace(self, frames=2, left_out=1, fit=replace(self.fit.smoke(), joint_steps=0), variants=few, seeds=1)
 
-    def smoke(self) -> LearnedParts:
-        """The same on the built-in pictures."""
-        return replace(self.shortest(), name=f"{self.name}-smoke", pictures="demo:")
-
 
 def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
     """YAML reads ``on`` and ``off`` as truth values."""

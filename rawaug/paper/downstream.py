@@ -74,12 +74,6 @@ class DownstreamConfig:
         one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)
         return replace(self, test_crop=SHORTEST_CROP, test_count=1, train=one)
 
-    def smoke(self) -> DownstreamConfig:
-        """The same with a tiny network, on the demo camera."""
-        tiny = DenoiserConfig("UNet", {"width": 4, "scales": 2})
-        quick = self.shortest()
-        return replace(quick, test=["demo:validation"], denoiser=tiny, train=replace(quick.train, crop=32))
-
 
 class DownstreamScore(NamedTuple):
     """PSNR in dB, in RAW and developed to sRGB."""

@@ -28,7 +28,6 @@ from rawaug.data.folders import Readable, each_readable
 from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
-from rawaug.experiment.early_checks import require_precision
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
@@ -52,6 +51,7 @@ from rawaug.plugin.pictures import even_sided
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
 from rawaug.training.config import weights_key
+from rawaug.training.loop import require_trainable
 
 COLUMNS = {
     "psnr_r": "PSNR_r",
@@ -166,19 +166,6 @@ class Comparison:
         downstream = self.downstream and self.downstream.shortest()
         return replace(self, **few, select="first", fit=self.fit.smoke(), downstream=downstream)
 
-    def smoke(self) -> Comparison:
-        """The same of the quick methods, on the demo camera."""
-        quick = [method for method in self.methods if method in ("dictionary", "upi", "upi-tuned")]
-        return replace(
-            self.shortest(),
-            name=f"{self.name}-smoke",
-            data="demo:validation",
-            test=self.test and "demo:test",
-            pictures="demo:",
-            methods=quick or ["dictionary"],
-            downstream=self.downstream and self.downstream.smoke(),
-        )
-
 
 @EXPERIMENTS.register("reconstruction")
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
@@ -199,7 +186,7 @@ class PreparedComparison:
     def __init__(self, settings: Comparison, overwrite: bool = False) -> None:
         require_free(settings, overwrite)
         if settings.downstream is not None:
-            require_precision(settings.downstream.train.precision)
+            require_trainable("cpu", 1, settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
         self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))

@@ -13,6 +13,7 @@ import csv
 import os
 import time
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from torch.utils.data import DataLoader
 from denoisers.network import Denoiser
 from rawaug.errors import extra
 from rawaug.files import replacing
+from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
 from rawaug.registry import LOSSES
 from rawaug.training.config import DenoiserConfig, TrainConfig
@@ -169,6 +171,28 @@ def _batches(stream: TrainingStream, start: int, config: TrainConfig, fabric: An
 def _status(row: dict[str, float], kept: int) -> str:
     scores = f"loss {row['loss']:.4f}, validation {row['psnr']:.2f} dB (kept: step {kept})"
     return f"{row['samples_per_second']:.0f} images/s, {scores}"
+
+
+def require_trainable(device: str, devices: int, precision: str) -> None:
+    """Check a training's libraries, device and precision before any work.
+
+    Raises:
+        MissingExtra: if a library of the extra ``train`` is not installed.
+        ValueError: if device or precision is unknown or absent, or the device is one GPU by number.
+    """
+    with extra("train"):
+        for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage", "PIL"):
+            import_module(name)
+        from lightning_fabric import Fabric
+    if devices < 1:
+        raise ValueError(f"devices must be at least 1, got {devices}")
+    if ":" in device:
+        raise ValueError(f"device {device!r}: give the kind, such as cuda, and choose the GPU by CUDA_VISIBLE_DEVICES")
+    find_device(device, count=devices)
+    try:
+        Fabric(accelerator="cpu", devices=1, precision=precision)
+    except (ModuleNotFoundError, ValueError) as error:
+        raise ValueError(f"train.precision: {' '.join(str(error).split())}") from None
 
 
 def launched(device: str, devices: int, precision: str) -> Any:

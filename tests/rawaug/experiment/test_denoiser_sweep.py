@@ -27,11 +27,18 @@ def test_rows_by_iso_and_an_identity_is_the_noisy_input(tmp_path: Path) -> None:
     assert (tmp_path / "denoisers" / "figure.png").stat().st_size > 10_000
 
 
-def test_its_smoke_form_ends_with_table_and_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "denoisers", "--smoke", "--out", str(tmp_path)]) == 0
+def test_the_command_ends_with_table_and_page_and_can_be_tried_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["run", "denoisers", "--count", "1", "--crop", "64", "--isos", "[400]", "--out", str(tmp_path)]
+    assert main([*command, "--dry-run", "--denoisers", "[]"]) == 0
+    assert "no problems found" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    assert main([*command, "--dry-run", "--denoisers", "[gone]"]) == 2
+    assert "gone" in capsys.readouterr().err
+    assert main([*command, "--denoisers", "[]"]) == 0
     text = capsys.readouterr().out
     assert "NonLocalMeans" in text and "ISO 400" in text
-    assert "ISO 400" in (tmp_path / "denoisers-smoke" / "report.html").read_text()
+    assert "ISO 400" in (tmp_path / "denoisers" / "report.html").read_text()
 
 
 def test_what_cannot_be_run_is_refused() -> None:

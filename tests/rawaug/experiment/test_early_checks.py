@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ import pytest
 
 from rawaug.errors import MissingExtra
 from rawaug.experiment import denoising
-from rawaug.experiment.early_checks import require_runnable
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.training.config import TrainConfig
+from rawaug.training.loop import require_trainable
 
 
 @pytest.fixture
@@ -37,31 +38,15 @@ def recipe(tmp_path: Path) -> Recipe:
 def test_it_is_found_before_any_work(
     recipe: Recipe, unread: str, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], message: str
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pywt", None)
+    monkeypatch.setitem(sys.modules, "pywt", None)
     recipe = replace(recipe, data=DataConfig(pairs=unread, validation=unread, test=unread))
     with pytest.raises((ValueError, OSError), match=message):
         denoising.run(replace(recipe, **change))
     assert not list(Path(recipe.out).iterdir())
 
 
-def test_compilation_is_tried_first(recipe: Recipe, unread: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def compiled(function: object) -> object:
-        def call(*_: object) -> None:
-            raise RuntimeError("InvalidCxxCompiler: No working C++ compiler found\nSet TORCHDYNAMO_VERBOSE=1")
-
-        return call
-
-    monkeypatch.setattr("torch.compile", compiled)
-    data = DataConfig(pairs=unread, validation=unread, test=unread)
-    said = r"train\.compile: PyTorch cannot compile here \(InvalidCxxCompiler: .* found\); install a C\+\+ compiler, or"
-    with pytest.raises(ValueError, match=said):
-        denoising.run(replace(recipe, data=data, train=TrainConfig(compile=True)))
-    assert not list(Path(recipe.out).iterdir())
-
-
-def test_a_run_that_can_go_on_passes_and_leaves_nothing(recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
-    require_runnable(replace(recipe, train=TrainConfig(precision="bf16-mixed"), classical=["NonLocalMeans"]))
-    assert not list(Path(recipe.out).iterdir())
-    monkeypatch.setitem(__import__("sys").modules, "tensorboard", None)
-    with pytest.raises(MissingExtra, match="tensorboard is not installed"):
-        require_runnable(recipe)
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    require_trainable("cpu", 1, "bf16-mixed")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingExtra, match=r"matplotlib is not installed; run: pip install 'rawaug\[train\]'"):
+        require_trainable("cpu", 1, "32-true")

@@ -137,9 +137,3 @@ def test_one_frame_leaves_none_to_fit(given: list[Pair], frame_of: FrameOf) -> N
     given.append(frame_of("a"))
     with pytest.raises(ValueError, match="data: given: has 1 frame; leave-one-out needs two or more"):
         ablate(Ablation(data="given:"))
-
-
-def test_the_smoke_form_keeps_what_is_fitted() -> None:
-    quick = Ablation(name="a", fit=FitConfig(atoms=3, shading="on"), seed=7).smoke()
-    assert (quick.name, quick.data, quick.count, quick.seed) == ("a-smoke", "demo:validation", 2, 7)
-    assert quick.fit == FitConfig(atoms=3, shading="on").smoke()

@@ -104,11 +104,3 @@ def test_scores_are_those_of_the_passes(known_camera: DictionaryISP, frame_of: F
     lamps = score(known_camera, frame_of("lamps", (1.2, 1.0, 2.6)))
     assert lamps["psnr_r"] < 32.0 < 70.0 < lamps["as_shot"]
     assert lamps["forward"] < right["forward"] - 3.0, "the forward pass is under its own choice of light"
-
-
-@pytest.mark.long
-def test_the_smoke_form_runs(tmp_path: Path) -> None:
-    quick = LearnedParts(fit=TINY, variants=VARIANTS, out=str(tmp_path)).smoke()
-    rows = weigh_parts(quick)
-    assert (quick.name, quick.seeds, list(rows)) == ("learned-smoke", 1, list(VARIANTS))
-    assert all(10.0 < row["psnr_r"][0] < 60.0 for row in rows.values())

@@ -23,9 +23,11 @@ from rawaug.paper import downstream
 from rawaug.paper.baselines import UPI
 from rawaug.paper.baselines.networks import UNetISP
 from rawaug.paper.downstream import DownstreamConfig, MadeCrops, psnr_d
+from rawaug.training.config import DenoiserConfig
 
 SILENT = noise_model((0.0, 0.0))
-TINY = replace(DownstreamConfig().smoke(), test=["given:"], test_count=None)
+TINY = DownstreamConfig(test=["given:"], denoiser=DenoiserConfig("UNet", {"width": 4, "scales": 2})).shortest()
+TINY = replace(TINY, test_count=None, train=replace(TINY.train, crop=32))
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -130,10 +132,3 @@ def test_the_piece_at_the_centre_is_scored_in_its_pattern(scores: list[list[Pair
     assert torch.equal(same.raw, small.raw) and piece.raw.shape == (1, 66, 66) and piece.srgb.shape == (3, 66, 66)
     assert piece.cfa == large.cfa
     assert torch.equal(piece.raw, large.raw[:, 14:80, 32:98]) and torch.equal(piece.srgb, large.srgb[:, 14:80, 32:98])
-
-
-def test_the_smoke_form_measures_what_the_whole_does() -> None:
-    whole = DownstreamConfig(methods=["upi"], noise="cycleisp_dnd", test=["somewhere"])
-    quick = whole.smoke()
-    assert (quick.methods, quick.noise, quick.test) == (["upi"], "cycleisp_dnd", ["demo:validation"])
-    assert quick.train.steps == 1 and quick.denoiser.settings == {"width": 4, "scales": 2}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rawaug.data.pairs import Pair
-from rawaug.experiment.kinds import kind_named
+from rawaug.experiment.kinds import dry_run
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import ablation, reconstruction
 from rawaug.paper.ablation import Ablation
@@ -41,12 +41,11 @@ def test_a_dry_run_tries_everything_once_and_writes_nothing(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    kind_named(settings.experiment).dry_run(replace(settings, out=str(tmp_path)), False)
-    assert "nothing wrong found" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    dry_run(settings.experiment, replace(settings, out=str(tmp_path)))
+    assert "no problems found" in capsys.readouterr().out and not list(tmp_path.iterdir())
 
 
 def test_a_dry_run_finds_what_the_run_would(frames: list[Pair], tmp_path: Path) -> None:
-    dry_run = kind_named("ablation").dry_run
     del frames[1:]
     with pytest.raises(ValueError, match="mine has 1 frame; leave-one-out needs two or more"):
-        dry_run(Ablation(data="mine", out=str(tmp_path)), False)
+        dry_run("ablation", Ablation(data="mine", out=str(tmp_path)))

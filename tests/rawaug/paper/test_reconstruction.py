@@ -306,15 +306,6 @@ def test_settings_that_cannot_be_are_refused() -> None:
             Comparison(**wrong)
 
 
-def test_the_smoke_form_keeps_what_is_quick() -> None:
-    whole = Comparison(name="a", methods=list(methods.FAMILIES), longer=10.0, downstream=DownstreamConfig())
-    quick = whole.smoke()
-    assert quick.methods == ["dictionary", "upi", "upi-tuned"] and quick.name == "a-smoke" and quick.longer == 0
-    assert quick.downstream is not None and quick.downstream.train.steps == 1 and quick.downstream.methods
-    assert Comparison().smoke().downstream is None
-    assert Comparison(methods=["unet"]).smoke().methods == ["dictionary"]
-
-
 class Fitting(Laboratory):
     """Fits for real without one frame; by its name, all tensors of the camera."""
 

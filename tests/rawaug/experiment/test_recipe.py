@@ -1,0 +1,160 @@
+"""Recipes: how they are read, what is refused by name, and that what their headers say is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rawaug.cli import main
+from rawaug.experiment import kinds
+from rawaug.experiment.kinds import settings_of
+from rawaug.experiment.recipe import ArmConfig, find_recipe, kind_of, read_recipe, require_values
+from rawaug.isp.fit.samples import BLOCK
+from rawaug.paper.baselines import BASELINES
+from rawaug.paper.methods import FAMILIES, ROWS
+from rawaug.paper.reconstruction import Comparison
+from rawaug.registry import EXPERIMENTS
+
+FOLDER = find_recipe("fewshot").parent
+NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
+OTHERS = {"rgb2raw": "reconstruction"}
+"""Recipes that neither train nor are named after their kind."""
+HEAD = "camera: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
+LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
+
+
+def header(name: str) -> str:
+    """The comment that a recipe opens with, a command's broken line joined."""
+    lines = find_recipe(name).read_text().splitlines()
+    head = "\n".join(lines[: next(k for k, line in enumerate(lines) if not line.startswith("#"))])
+    return re.sub(r" *\\\n# +", " ", head)
+
+
+def test_every_kind_has_settings_that_name_it() -> None:
+    assert set(EXPERIMENTS) == {"training", "reconstruction", "ablation", "learned", "denoisers"}
+    for name in ("reconstruction", "ablation", "learned", "denoisers"):
+        assert settings_of(name)().experiment == settings_of(name)().name == name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_commands_of_a_header_can_be_given(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    last = name.rpartition("/")[2]
+    kind = kind_of(read_recipe(find_recipe(name)))
+    assert kind == (last if last in EXPERIMENTS else OTHERS.get(name, "training"))
+    given: list[Any] = []
+
+    def run(settings: Any, overwrite: bool) -> None:
+        given.append(settings)
+
+    run.__annotations__ = {"settings": settings_of(kind)}
+    monkeypatch.setitem(EXPERIMENTS._things, kind, run)
+    monkeypatch.setattr(kinds, "dry_run", lambda kind, settings, overwrite: given.append(settings))
+    commands = re.findall(r"^#   rawaug (run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
+    assert len(commands) >= 3 and any("--dry-run" in command for command in commands)
+    for command in commands:
+        assert shlex.split(command)[1] == name
+        assert main(shlex.split(command)) == 0
+    assert len(given) == len(commands) and given[0].name == name
+
+
+def test_the_reconstruction_header_lists_methods_rows_and_budgets() -> None:
+    head = header("reconstruction")
+    (named,) = re.findall(r"--methods '\[(.*?)\]'", head)
+    assert set(named.split(", ")) <= set(FAMILIES) and {"dictionary", "dictionary-encoders"} < set(named.split(", "))
+    assert set(named.split(", ")) & set(BASELINES) >= {"upi", "upi-tuned", "unet", "cycleisp", "invisp"}
+    assert len(ROWS) == 3 and "fills four rows: blind" in head
+    for row in ROWS.values():
+        assert row in head
+    keys = set(Comparison.__dataclass_fields__)
+    assert set(re.findall(r"`(\w+)`", find_recipe("reconstruction").read_text())) <= keys
+
+
+def test_the_ablation_header_gives_the_block_size() -> None:
+    assert f"at {BLOCK} times lower resolution" in header("ablation")
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("experiment: reconstruktion", "unknown experiment 'reconstruktion'; use one of ablation, .*training"),
+        ("experiment: [ablation]", r"unknown experiment \['ablation'\]; use one of"),
+        ("experiment:", "unknown experiment None; use one of"),
+        ("experiment: [ablation", "not a recipe"),
+        ("just words", "it must hold keys and values"),
+        (LAUGHS, r"uses aliases \(\*name\)"),
+        ("a: &a [1, *a]", "uses aliases"),
+        ("denoiser: {settings: {width: " + "[" * 5000 + "1" + "]" * 5000 + "}}", "not a recipe"),
+        ("train: {steps: " + "9" * 5000 + "}", "Exceeds the limit"),
+        ("x: " + "y" * 2**20, "has 1048579 bytes, a recipe at most 65536"),
+    ],
+)
+def test_what_is_no_recipe_ends_in_one_line_with_its_name(content: str, reason: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=rf"mine\.yaml: {reason}|mine\.yaml: .*{reason}") as error:
+        kind_of(read_recipe(file), file)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 500
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(ValueError, match=r"mine\.yaml: not a recipe"):
+        read_recipe(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("content", ["name: x\n", ""])
+def test_a_recipe_that_names_no_kind_trains(content: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(content)
+    assert kind_of(read_recipe(tmp_path / "mine.yaml")) == "training"
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("train: {loss: null}", r"train\.loss"),
+        ("train: {ema: null}", r"train\.ema"),
+        ("train: {steps: 1e25}", r"train\.steps"),
+        ("train: null", "train"),
+        ("data: 5", "data"),
+        ("isp: [1]", "isp"),
+        ("isp: {steps: 1e25}", "steps"),
+        ("isp: {pixels: -1}", "pixels"),
+        ("seed: 1e25", "seed"),
+        ("seeds: 1000000000000", "seeds"),
+        ("denoiser: {settings: {scales: 1000000000}}", "scales"),
+        ("denoiser: {settings: {width: 1e29}}", "width"),
+        ("denoiser: {settings: null}", r"denoiser\.settings"),
+        ("data: {pairs: null, pictures: null}", r"data\.pictures"),
+        ("data: {pairs: null, pictures: []}", r"data\.pictures"),
+        ("device: null", "device"),
+        ("classical: null", "classical"),
+        ("untouched: null", "untouched"),
+        ("arms: null", "arms"),
+        ("arms: {augmented: {augmented: 1.0, estimator: null}}", "estimator"),
+        ("arms: {augmented: {augmented: null}}", r"arms\.augmented\.augmented"),
+        ("arms: {augmented: null}", r"arms\.augmented"),
+        ("experiment: reconstruction\nmethods: null", "methods"),
+    ],
+)
+def test_null_or_a_setting_that_nobody_means_is_named(
+    line: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = "".join(kept for kept in HEAD.splitlines(True) if kept.partition(":")[0] != line.partition(":")[0])
+    (tmp_path / "a.yaml").write_text(f"{line}\n" if "experiment" in line else f"{head}{line}\n")
+    assert main(["run", str(tmp_path / "a.yaml"), "--out", str(tmp_path)]) == 2
+    (text,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(named, text)
+
+
+def test_null_is_refused_by_the_types_alone() -> None:
+    for key in ("data", "isp", "train", "arms", "device", "seed", "out", "views", "noise"):
+        with pytest.raises(ValueError, match=f"^{key} must have a value, got null"):
+            require_values(settings_of("training"), {key: None})
+    require_values(settings_of("training"), {"camera": None, "steps": None, "arms": {"real": {"denoiser": None}}})
+    with pytest.raises(ValueError, match=r"^arms\.real\.denoiser\.name must have a value"):
+        require_values(settings_of("training"), {"arms": {"real": {"denoiser": {"name": None}}}})
+    require_values(settings_of("training"), {"arms": {"real": ArmConfig()}})
