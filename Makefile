@@ -11,7 +11,7 @@ PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  
 WHEEL := build/resolve/requirements.in
 LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
 
-BENCHMARKS := augment denoise explore faults folder fuzz loader networks noise shards synth
+BENCHMARKS := augment denoise explore faults folder fuzz loader networks noise synth
 
 .PHONY: demo test lint docs bench dist lock resolve clean
 

@@ -1,6 +1,6 @@
 """What the augmentation costs: million sRGB pixels a second, against other ways to the same RAW, and peak memory.
 
-    python benchmarks/augment.py [--device cpu|cuda] [--quick] [--profile] [--json FILE] [--threads N]
+    python -m benchmarks.augment [--device cpu|cuda] [--quick] [--profile] [--json FILE] [--threads N]
 
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
@@ -16,10 +16,7 @@ as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :dat
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
-import resource
 import subprocess
 import sys
 import tempfile
@@ -30,6 +27,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.measure import arguments, fastest, finish, memory_used, seconds, sized, start
 from rawaug import bayer
 from rawaug.data.demo.pairs import demo_photographs
 from rawaug.isp.model import DictionaryISP
@@ -51,11 +49,7 @@ def pictures(count: int, height: int, width: int) -> Tensor:
     photographs = [p for split in ("train", "validation", "test") for p in demo_photographs(split).values()]
     made = torch.empty(count, 3, height, width, dtype=torch.uint8)
     for k in range(count):
-        source = photographs[k % len(photographs)][None].float()
-        scale = max(1.0, height / source.shape[2] + 1e-3, width / source.shape[3] + 1e-3)
-        source = torch.nn.functional.interpolate(source, scale_factor=scale, mode="bilinear") if scale > 1 else source
-        top, left = ((n - m) // 2 for n, m in zip(source.shape[2:], (height, width), strict=True))
-        crop = source[0, :, top : top + height, left : left + width]
+        crop = sized(photographs[k % len(photographs)], height, width)
         made[k] = crop.add(torch.randn(crop.shape, generator=generator)).round().clamp(0, 255).to(torch.uint8)
     return made
 
@@ -123,20 +117,7 @@ def bandwidth(device: torch.device, megabytes: int, repeats: int) -> float:
     """GB/s of a copy from memory to memory, bytes read plus bytes written."""
     source = torch.ones(megabytes * 2**18, device=device)
     target = torch.empty_like(source)
-    best = float("inf")
-    for _ in range(repeats):
-        best = min(best, seconds(lambda: target.copy_(source), device))
-    return 2 * source.numel() * 4 / best / 1e9
-
-
-def seconds(run: Callable[[], object], device: torch.device) -> float:
-    """Of one run, until the device has finished."""
-    wait = torch.cuda.synchronize if device.type == "cuda" else (lambda: None)
-    wait()
-    start = time.perf_counter()
-    run()
-    wait()
-    return time.perf_counter() - start
+    return 2 * source.numel() * 4 / fastest({"copy": lambda: target.copy_(source)}, repeats, device)["copy"] / 1e9
 
 
 @torch.no_grad()
@@ -174,8 +155,10 @@ def profile(batch: Tensor) -> str:
 
 def child(task: str, args: argparse.Namespace, **environment: str) -> float:
     """Run this file's ``task`` in a process of its own; the number that it prints."""
-    command = [sys.executable, __file__, "--task", task, "--threads", str(args.threads), "--device", str(args.device)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | environment)
+    command = [sys.executable, "-m", "benchmarks.augment", "--task", task]
+    command += ["--threads", str(args.threads), "--device", str(args.device)]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=os.environ | environment, cwd=root)
     return float(done.stdout)
 
 
@@ -191,36 +174,10 @@ def peak_memory(device: torch.device, height: int = 3000, width: int = 4000) -> 
     return (memory_used(device) - before) / size
 
 
-def memory_used(device: torch.device) -> int:
-    """Bytes at the peak: of tensors on a GPU, of the whole process on a CPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
 def first_call(device: torch.device) -> float:
     """Seconds of a process's first augmentation."""
     augment = RawAugment.from_pretrained("universal").to(device)
     return seconds(lambda: augment(torch.zeros(1, 3, 64, 64, dtype=torch.uint8, device=device)), device)
-
-
-def machine(device: torch.device, threads: int) -> dict[str, object]:
-    """What the figures were measured on."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    known: dict[str, object] = {
-        "cpu": names[0] if names else platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": threads,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-    if device.type == "cuda":
-        query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-        driver = subprocess.run(query, check=True, capture_output=True, text=True).stdout.split()
-        known |= {"gpu": torch.cuda.get_device_name(device), "cuda": torch.version.cuda, "driver": driver[0]}
-    return known
 
 
 def show(title: str, rows: dict[str, dict[str, float]]) -> None:
@@ -233,44 +190,33 @@ def show(title: str, rows: dict[str, dict[str, float]]) -> None:
         print(line + (f"{row['counted']:10.2f}{row['moved']:10.2f}" if "moved" in row else ""))
 
 
-def arguments() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--quick", action="store_true", help="few runs, and 3 Mpix instead of 12")
-    parser.add_argument("--profile", action="store_true", help="also print where the time of small batches goes")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, help="runs of each method")
-    parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
-    return parser
-
-
 def main() -> None:
-    args = arguments().parse_args()
-    torch.set_num_threads(args.threads)
+    parser = arguments(__doc__, repeats=40, quick="few runs, and 3 Mpix instead of 12")
+    parser.add_argument("--profile", action="store_true", help="also print where the time of small batches goes")
+    parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
+    args = parser.parse_args()
     if args.task:
+        torch.set_num_threads(args.threads)
         print(peak_memory(args.device) if args.task == "memory" else first_call(args.device))
         return
-    results: dict[str, object] = {"machine": machine(args.device, args.threads)}
-    print("  ".join(f"{key} {value}" for key, value in machine(args.device, args.threads).items()))
+    figures = start(args)
     # First, for a process inherits the peak of the one that starts it.
-    results["peak memory"] = {"of input and output": child("memory", args)}
+    figures["peak memory"] = {"of input and output": child("memory", args)}
     with tempfile.TemporaryDirectory() as folder:
         first = [child("first", args, NUMBA_CACHE_DIR=folder, TRITON_CACHE_DIR=folder) for _ in range(2)]
-    results["first call"] = {"seconds": first[0], "seconds, compiled before": first[1]}
+    figures["first call"] = {"seconds": first[0], "seconds, compiled before": first[1]}
     copied = bandwidth(args.device, 64 if args.quick else 1024, 5)
-    results["bandwidth"] = {"copy, GB/s": copied}
+    figures["bandwidth"] = {"copy, GB/s": copied}
     for title in ("peak memory", "first call", "bandwidth"):
-        print(title, results[title])
+        print(title, figures[title])
     sides = (1500, 2000) if args.quick else (3000, 4000)
-    for shape, repeats in (((16, 256, 256), 5 if args.quick else 40), ((4, *sides), 2 if args.quick else 5)):
+    for shape, repeats in (((16, 256, 256), 5 if args.quick else args.repeats), ((4, *sides), 2 if args.quick else 5)):
         title, batch = "x".join(map(str, shape)), pictures(*shape).to(args.device)
-        results[title] = rows = measure(batch, args.repeats or repeats, copied)
+        figures[title] = rows = measure(batch, repeats, copied)
         show(title, rows)
         if args.profile and len(batch) == 16:
             print(profile(batch))
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    finish(figures, args)
 
 
 if __name__ == "__main__":

@@ -2,27 +2,23 @@
 
     python -m benchmarks.denoise [--device cpu|cuda] [--denoiser rawaug-small] [--megapixels 12 45] [--quick]
 
-A frame is noise, packed, on the device; its time does not depend on what is in it. The last row is ``rawaug denoise``
-of such a frame, from a DNG to a DNG. Every form runs ``--repeats`` times after one that is not counted, and the fastest
-counts.
+A frame is noise, packed, on the device; its time does not depend on what is in it. A form without figures is one that
+the GPU's memory does not hold. The last row is ``rawaug denoise`` of such a frame, from a DNG to a DNG. Every form runs
+``--repeats`` times after one that is not counted.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 import denoisers
-from benchmarks.augment import machine, memory_used
-from benchmarks.loader import fastest
+from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
 from denoisers.files import DEFAULT
 from rawaug import bayer
 from rawaug.commands.denoise import denoise_file
@@ -88,30 +84,23 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
     return {"seconds": min(runs[1:]), "Mpix/s": noisy.numel() / min(runs[1:]) / 1e6}
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+def main(argv: list[str] | None = None) -> None:
+    parser = arguments(__doc__, repeats=3, quick="one repeat of 0.25 Mpix")
     parser.add_argument("--denoiser", default=DEFAULT, help="name of a shipped denoiser, or its file")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[12.0, 45.0], help="of the mosaics")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="one repeat of 0.25 Mpix")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    args = parser.parse_args(arguments)
+    args = parser.parse_args(argv)
     if args.quick:
         args.megapixels, args.repeats = [0.25], 1
     model = denoisers.from_pretrained(args.denoiser)
     model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    figures: dict[str, Any] = {"machine": machine(args.device, torch.get_num_threads())}
-    print("  ".join(f"{key} {value}" for key, value in figures["machine"].items()))
+    figures = start(args)
     for megapixels in args.megapixels:
-        noisy = frame(megapixels, args.device)
-        figures[f"{megapixels:g} Mpix"] = rows = measure(model, noisy, args.repeats)
-        rows["rawaug denoise"] = command(noisy, args.denoiser, args.device, args.repeats)
-        print(f"{megapixels:g} Mpix")
-        for name, row in rows.items():
-            print(f"  {name:18s}", "  ".join(f"{what} {value:.4g}" for what, value in row.items()) or "out of memory")
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        noisy, title = frame(megapixels, args.device), f"{megapixels:g} Mpix"
+        figures[title] = measure(model, noisy, args.repeats)
+        figures[title]["rawaug denoise"] = command(noisy, args.denoiser, args.device, args.repeats)
+        print(title)
+        show(figures[title])
+    finish(figures, args)
 
 
 if __name__ == "__main__":

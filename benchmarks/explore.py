@@ -1,18 +1,14 @@
 """What a move of a control costs on the page of ``rawaug explore``, tab by tab, without the browser.
 
-    python benchmarks/explore.py [--size 512 768] [--repeats 5] [--quick] [--json FILE]
+    python -m benchmarks.explore [--size 512 768] [--repeats 5] [--quick] [--json FILE]
 
-A move is a new seed, or another camera; the time is that of the new pictures and of the HTML that is sent. Printed are
-processor seconds and seconds by the clock, the median of the repeats, on the threads of PyTorch that are left as they
-are.
+A move is a new seed, or another camera; the time is that of the new pictures and of the HTML that is sent: milliseconds
+of the processor and of the clock, the median of the repeats.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -20,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.measure import arguments, finish, show, start
 from rawaug.data.demo.pairs import demo_files
 from rawaug.explore.page import as_html
 from rawaug.explore.view_state import Look
@@ -38,8 +35,8 @@ def picture(folder: Path, height: int, width: int) -> Path:
     return folder / "picture.png"
 
 
-def moves(file: Path, tab: str, repeats: int) -> dict[str, list[tuple[float, float]]]:
-    """Processor and clock seconds of the moves, by kind; the first move of a kind compiles, and is left out."""
+def moves(file: Path, tab: str, repeats: int) -> dict[str, float]:
+    """Milliseconds of the moves by kind and clock; the first move of a kind compiles, and is left out."""
     view = {**VIEWS, "Denoise": denoised}[tab]
     look = Look(str(file), Drawing())
     cameras = [CAMERAS[k % len(CAMERAS)] for k in range(repeats + 1)]
@@ -47,39 +44,32 @@ def moves(file: Path, tab: str, repeats: int) -> dict[str, list[tuple[float, flo
         "seed": [replace(look, seed=k) for k in range(repeats + 1)],
         "camera": [replace(look, drawing=Drawing(camera=camera), seed=k) for k, camera in enumerate(cameras)],
     }
-    taken: dict[str, list[tuple[float, float]]] = {}
+    medians: dict[str, float] = {}
     for kind, looks in kinds.items():
+        taken: dict[str, list[float]] = {f"{kind}, processor": [], f"{kind}, clock": []}
         for one in looks:
-            processor, clock = time.process_time(), time.perf_counter()
+            before = time.process_time(), time.perf_counter()
             as_html(view(one))
-            taken.setdefault(kind, []).append((time.process_time() - processor, time.perf_counter() - clock))
-    return {kind: seconds[1:] for kind, seconds in taken.items()}
+            after = time.process_time(), time.perf_counter()
+            for clock, start_, end in zip(taken.values(), before, after, strict=True):
+                clock.append(1e3 * (end - start_))
+        medians |= {clock: statistics.median(values[1:]) for clock, values in taken.items()}
+    return medians
 
 
-def medians(pairs: list[tuple[float, float]]) -> list[float]:
-    return [statistics.median(values) for values in zip(*pairs, strict=True)]
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    parser = arguments(__doc__, repeats=5, quick="one move a tab, of a small picture")
     parser.add_argument("--size", type=int, nargs=2, default=[512, 768], help="height and width")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="one move a tab, of a small picture")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
     args = parser.parse_args()
     size, repeats = ([96, 144], 1) if args.quick else (args.size, args.repeats)
-    rows = {}
+    figures = start(args)
     with tempfile.TemporaryDirectory() as folder:
         file = picture(Path(folder), *size)
-        print(f"{size[1]} x {size[0]}, {torch.get_num_threads()} threads: processor / clock, milliseconds")
         for tab in (*VIEWS, "Denoise"):
-            rows[tab] = {kind: medians(taken) for kind, taken in moves(file, tab, repeats).items()}
-            text = "   ".join(f"{kind} {1e3 * cpu:5.0f} / {1e3 * wall:5.0f}" for kind, (cpu, wall) in rows[tab].items())
-            print(f"  {tab:12s} {text}", flush=True)
-    if args.json:
-        args.json.write_text(json.dumps({"size": size, "seconds": rows}, indent=1) + "\n", encoding="utf-8")
-    return 0
+            figures[tab] = moves(file, tab, repeats)
+            show({tab: figures[tab]}, width=12)
+    finish(figures, args)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """What a large folder of pictures with damaged files costs: its start, an epoch with workers, and their memory.
 
-    python benchmarks/folder.py [--files 20000] [--damaged 0.01] [--workers 2] [--quick] [--json FILE]
+    python -m benchmarks.folder [--files 20000] [--damaged 0.01] [--workers 2] [--quick] [--json FILE]
 
 The folder is made first, in a temporary place: small JPEGs in a hundred subfolders, of which a share is truncated,
 empty, text, or a link to nowhere. Printed are the seconds until the dataset is there and until the first batch, the

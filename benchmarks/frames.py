@@ -1,6 +1,6 @@
 """How many frames a fit needs: PSNR_r on the frames that random subsets of 1, 2, 3, 5, ... leave out.
 
-    python benchmarks/frames.py RAW_DIR [--subsets 5] [--patches 8] [--json FILE]
+    python -m benchmarks.frames RAW_DIR [--subsets 5] [--patches 8] [--json FILE]
 
 Columns: mean over subsets of the mean over left-out frames, and the range over subsets; blind, with the frames' as-shot
 white balance, with 64 RAW samples, with oracle weights.

@@ -1,7 +1,7 @@
 """What the hulls of colour, light and tone atoms hold, and whether it holds for cameras and curves not looked at.
 
-    python benchmarks/hulls.py [--photographs FOLDER] [--atoms 10] [--halves 5]
-    python benchmarks/hulls.py --figure docs/coverage.png
+    python -m benchmarks.hulls [--photographs FOLDER] [--atoms 10] [--halves 5]
+    python -m benchmarks.hulls --figure docs/coverage.png
 
 Cameras: the error is that of linear colour on photographs, between a camera's own sRGB-to-camera matrix and the nearest
 mixture of the atoms; a camera is held within 45 dB. Atoms are chosen greedily from a random half of the matrices and

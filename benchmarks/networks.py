@@ -17,7 +17,6 @@ published weights.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import time
 from collections.abc import Callable
@@ -32,9 +31,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import denoisers
 import rawaug
-from benchmarks.augment import machine, memory_used
 from benchmarks.equal_minutes import chart, references, trained
-from benchmarks.loader import fastest
+from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
 
 SIZES: dict[str, dict[str, Any]] = {
     "UNet": {"width": 16, "scales": 4},
@@ -165,7 +163,7 @@ def measure(name: str, args: argparse.Namespace, size: dict[str, Any] | None = N
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments(__doc__, repeats=5, quick="one repeat, batches of 4")
     parser.add_argument("--networks", nargs="+", choices=list(SIZES), default=list(SIZES))
     parser.add_argument("--width", type=int, help="features, in place of the table's")
     parser.add_argument("--workers", type=int, default=0, help="also make the pairs in so many workers")
@@ -179,29 +177,20 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--crop", type=int, default=128, help="side of the sRGB crops")
     parser.add_argument("--side", type=int, default=SIDE, help="of the packed picture that inference is timed on")
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--quick", action="store_true", help="one repeat, batches of 4")
     args = parser.parse_args()
-    if args.quick:
-        args.batch, args.repeats = 4, 1
-    figures: dict[str, Any] = {"machine": machine(args.device, args.threads)}
-    described = "  ".join(f"{key} {value}" for key, value in figures["machine"].items())
-    print(f"batches of {args.batch} x {args.crop} x {args.crop} ({described})")
+    args.batch, args.repeats = (4, 1) if args.quick else (args.batch, args.repeats)
+    figures = start(args)
+    print(f"batches of {args.batch} x {args.crop} x {args.crop}")
     for name in args.networks:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as own:
             figures[name] = own.submit(measure, name, args).result()
-        print(f"  {name:6s}", "  ".join(f"{what} {value:.4g}" for what, value in figures[name].items()))
+        show({name: figures[name]}, width=6)
     if args.minutes:
         figures["references"] = references(args)
-        for name, scores in figures["references"].items():
-            print(f"  {name}", "  ".join(f"{what} {value:.4g}" for what, value in scores.items()))
-    if args.minutes and args.figure:
-        chart({name: figures[name] for name in args.networks}, figures["references"], args.figure)
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n")
+        show(figures["references"])
+        if args.figure:
+            chart({name: figures[name] for name in args.networks}, figures["references"], args.figure)
+    finish(figures, args)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What each part of the universal ISP is worth: PSNR_d of denoisers trained on RAW made without it.
 
-    python benchmarks/psnr_d.py --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
+    python -m benchmarks.psnr_d --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
         [--older universal.safetensors] [--seeds 0 1 2] [--recipe RECIPE.yaml] [--steps 1200] [--out runs/psnr_d]
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml, or of the training recipe that is given,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import denoisers
-from benchmarks import augment, crops, denoise, equal_minutes, networks, shards
+from benchmarks import augment, crops, denoise, equal_minutes, measure, networks, synth
 from rawaug.data.demo.pairs import FRAME
 from rawaug.io import read_picture
 
@@ -87,16 +87,11 @@ def test_a_form_without_room_is_reported_and_not_timed(monkeypatch: pytest.Monke
     }
 
 
-def test_folders_are_compared_by_names_and_bytes(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        shards.generate(tmp_path / name, 2, 16, 24)
-    one, other = (shards.digest(tmp_path / name) for name in ("a", "b"))
-    assert one == other and one[1] > 0
-    first = tmp_path / "a/000/000000.jpg"
-    first.rename(tmp_path / "a/000/renamed.jpg")
-    assert shards.digest(tmp_path / "a")[0] != one[0]
-    (tmp_path / "b/000/000001.jpg").write_bytes(b"other")
-    assert shards.digest(tmp_path / "b")[0] != other[0]
+def test_pairs_on_disk_and_online_are_compared_with_decoding(tmp_path: Path) -> None:
+    rows = synth.costs(measure.write_pictures(tmp_path, 2, (32, 48)), ["npz"], repeats=1)
+    assert list(rows) == ["decode", "online", "npz"] and rows["decode"]["times decoding"] == 1.0
+    assert all(row["Mpix a processor second"] > 0 for row in rows.values())
+    assert read_picture(tmp_path / "000001.jpg").shape == (3, 32, 48)
 
 
 def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filters(
