@@ -251,6 +251,8 @@ LOSSES = Registry("loss", "rawaug.losses", "rawaug.training")
 """Classes whose instances compare: ``loss(denoised, target) -> scalar``."""
 BASELINES = Registry("baseline", "rawaug.baselines", "rawaug.paper.baselines")
 """Subclasses of :class:`rawaug.paper.baselines.base.BaselineISP`."""
+STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
+"""Subclasses of :class:`rawaug.isp.stages.Stage`, what an ISP is made of."""
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
 """``run(settings, overwrite)``, named by a recipe's key ``experiment``; ``settings`` is a dataclass of its keys, whose
 method ``shortest()`` gives the settings with one step of everything."""

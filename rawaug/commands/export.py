@@ -39,7 +39,6 @@ from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import find_weights, read_header, replacing
 from rawaug.io import read_raw
 from rawaug.isp.config import ISPParams
-from rawaug.isp.description import description, reverse_table, typical_setting
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.registry import COMMANDS
@@ -144,15 +143,15 @@ def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[floa
 
 
 def _write_json(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
-    table = reverse_table(isp, typical_setting(isp, white_balance), NODES)
+    table = isp.reverse_table(isp.typical_setting(white_balance), NODES)
     values = [[round(value, 7) for value in row] for row in table.tolist()]
-    content = description(isp, white_balance) | {"lut": {"size": NODES, "fastest": "red", "values": values}}
+    content = isp.description(white_balance) | {"lut": {"size": NODES, "fastest": "red", "values": values}}
     with replacing(path) as partial:
         partial.write_text(json.dumps(content) + "\n")
 
 
 def _write_cube(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
-    setting = typical_setting(isp, white_balance)
+    setting = isp.typical_setting(white_balance)
     gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
     lines = [
         f'TITLE "rawaug {path.stem}: sRGB to linear camera RGB"',
@@ -160,14 +159,14 @@ def _write_cube(isp: DictionaryISP, path: Path, white_balance: Sequence[float] |
         f"LUT_3D_SIZE {NODES}",
         "DOMAIN_MIN 0.0 0.0 0.0",
         "DOMAIN_MAX 1.0 1.0 1.0",
-        *(" ".join(f"{value:.7f}" for value in row) for row in reverse_table(isp, setting, NODES).tolist()),
+        *(" ".join(f"{value:.7f}" for value in row) for row in isp.reverse_table(setting, NODES).tolist()),
     ]
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n")
 
 
 def _write_onnx(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
-    setting = typical_setting(isp, white_balance)
+    setting = isp.typical_setting(white_balance)
     srgb = torch.rand(1, 3, 70, 90, generator=keyed_generator(0, "export"))
     inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
     with replacing(path) as partial:

@@ -10,7 +10,6 @@ import denoisers
 from denoisers.files import FOLDER
 from rawaug._version import __version__
 from rawaug.files import find_weights, read_header, sha256
-from rawaug.isp.description import description, tone_curve
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import COMMANDS
 
@@ -27,7 +26,7 @@ def run(weights: str, *, json: bool = False) -> None:
 
 
 def as_json(weights: str | Path) -> dict[str, Any]:
-    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.description.description`.
+    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.model.DictionaryISP.description`.
 
     Raises:
         FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
@@ -35,7 +34,7 @@ def as_json(weights: str | Path) -> dict[str, Any]:
     path = find_weights(weights, FOLDER)
     content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
     if read_header(path)["kind"] == "isp":
-        return content | description(DictionaryISP.from_pretrained(path))
+        return content | DictionaryISP.from_pretrained(path).description()
     model, info = denoisers.load(path)
     parameters = sum(p.numel() for p in model.parameters())
     name = {"kind": "denoiser", "name": type(model).__name__, "parameters": parameters}
@@ -83,5 +82,5 @@ def _describe_isp(path: Path) -> str:
 
 def _curve(isp: DictionaryISP) -> str:
     """A few codes of the tone curve, the mean of the channels."""
-    means = tone_curve(isp).mean(dim=1)
+    means = isp.tone_curve().mean(dim=1)
     return ", ".join(f"{code} {means[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))

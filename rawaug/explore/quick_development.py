@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.config import ISPParams
-from rawaug.isp.description import tone_curve
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.isp.tone import STEPS
@@ -62,5 +61,5 @@ class Development:
 def grey_curve(isp: DictionaryISP, setting: ISPParams) -> Tensor:
     """x2 of the 256 greys of sRGB under a setting without the leading B, ``(256,)``."""
     if isp.tone is None:
-        return tone_curve(isp).mean(dim=1)
+        return isp.tone_curve().mean(dim=1)
     return isp.tone.combine(setting.tone_weights[None])[0, ::STEPS]

@@ -1,4 +1,4 @@
-r"""Published cameras by name: sRGB to camera colour, and the white-balance gains of a light.
+r"""Published cameras by name, and the lights that pictures are taken in.
 
 A camera is a 3 x 3 matrix M from CIE XYZ to its linear RGB. Its response to a light of white point L is M L, so that
 
@@ -7,6 +7,17 @@ A camera is a 3 x 3 matrix M from CIE XYZ to its linear RGB. Its response to a l
 with S from linear sRGB to XYZ: the rows of C sum to 1, so white stays white and the gains carry all of the balance,
 as in dcraw and in Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019. The matrices are those of
 LibRaw and rawspeed, most of them Adobe's for D65; under other lights they are an approximation, as in those developers.
+
+A light is drawn at a correlated colour temperature T, uniform in the reciprocal :math:`10^6 / T` (mired), in which
+equal steps look alike. On the Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature",
+1985)
+
+.. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
+                   {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
+
+and v alike; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights lie
+a little off both: a step Duv along the normal of the locus in CIE 1960 (u, v), positive towards green. Fluorescent and
+LED lamps are those that the CIE tabulates.
 """
 
 from __future__ import annotations
@@ -16,11 +27,15 @@ from functools import cache
 from importlib import resources
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from rawaug.isp.light import D65, white_point
-from rawaug.registry import spelled
+from rawaug.registry import nearest, spelled
+
+Array = NDArray[np.float64]
+"""Lights are a few numbers a batch, on the CPU: NumPy's calls cost a fifth of PyTorch's."""
 
 SRGB_TO_XYZ = torch.tensor(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]],
@@ -109,3 +124,163 @@ def white_balance(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
     """Gains ``(..., 3)`` that make a white surface grey under a light of white point ``(..., 3)``; green is 1."""
     response = responses(xyz_to_camera, light)
     return response[..., 1:2] / response
+
+
+LAMPS: dict[str, tuple[float, float]] = {
+    "FL1": (0.31310, 0.33727), "FL2": (0.37208, 0.37529), "FL3": (0.40910, 0.39430), "FL4": (0.44018, 0.40329),
+    "FL5": (0.31379, 0.34531), "FL6": (0.37790, 0.38835), "FL7": (0.31292, 0.32933), "FL8": (0.34588, 0.35875),
+    "FL9": (0.37417, 0.37281), "FL10": (0.34609, 0.35986), "FL11": (0.38052, 0.37713), "FL12": (0.43695, 0.40441),
+    "LED-B1": (0.4560, 0.4078), "LED-B2": (0.4357, 0.4012), "LED-B3": (0.3756, 0.3723), "LED-B4": (0.3422, 0.3502),
+    "LED-B5": (0.3118, 0.3236), "LED-BH1": (0.4474, 0.4066), "LED-RGB1": (0.4557, 0.4211), "LED-V1": (0.4548, 0.4044),
+    "LED-V2": (0.3781, 0.3775),
+}  # fmt: skip
+"""Chromaticities (x, y) of the CIE's fluorescent and LED lamps, 2 degree observer: CIE 15:2018, tables T.3 and 12.
+
+LED-V1 is the chromaticity of its tabulated spectrum; the (0.4560, 0.4548) that is widely quoted is not.
+"""
+
+_LAMPS = np.array(list(LAMPS.values()))
+
+D65 = (0.31271, 0.32902)
+
+COLDEST, WARMEST = 10_000.0, 2_000.0
+"""Limits of the colour temperature, in kelvin."""
+DAYLIGHT_FROM = 4_000.0
+"""Below it the daylight locus is not defined."""
+LAMP_SHARE = 0.1
+DUV_SPREAD = 0.003
+"""Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
+
+
+class LightRange(NamedTuple):
+    """What lights are drawn from, as the arguments of :func:`sample_lights`.
+
+    Args:
+        kelvin: lowest and highest colour temperature.
+        lamps: share of electric lamps.
+        among: chromaticities ``(N, 2)`` of these lamps.
+    """
+
+    kelvin: tuple[float, float] = (WARMEST, COLDEST)
+    lamps: float = LAMP_SHARE
+    among: Array = _LAMPS
+
+
+def light_range(light: float | str | None) -> LightRange:
+    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default.
+
+    Raises:
+        ValueError: if there is no such lamp, or the temperature is outside 2,000 to 10,000 K.
+
+    Example:
+        >>> light_range(5500).kelvin
+        (5500.0, 5500.0)
+    """
+    if light is None:
+        return LightRange()
+    if isinstance(light, str):
+        if light not in LAMPS:
+            listed, near = ", ".join(LAMPS), nearest(light, LAMPS)
+            raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
+        return LightRange(lamps=1.0, among=np.array([LAMPS[light]]))
+    if not WARMEST <= light <= COLDEST:
+        raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
+    return LightRange((float(light), float(light)), lamps=0.0)
+
+
+def planckian(kelvin: Array) -> Array:
+    """Chromaticity ``(..., 2)`` of a black body at 1,000 to 15,000 K."""
+    return _xy_from_uv(_planckian_uv(kelvin)[0])
+
+
+def daylight(kelvin: Array) -> Array:
+    """Chromaticity ``(..., 2)`` of daylight at 4,000 to 25,000 K."""
+    t = (1e3 / kelvin)[..., None]
+    c0, c1, c2, c3 = _DAYLIGHT
+    both = ((c3 * t + c2) * t + c1) * t + c0
+    x = np.where(kelvin <= 7000, both[..., 0], both[..., 1])
+    return np.stack([x, (2.87 - 3.0 * x) * x - 0.275], axis=-1)
+
+
+def off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
+    """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` along the Planckian locus' normal at ``kelvin`` ``(...)``."""
+    rate = _planckian_uv(kelvin)[1]
+    normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
+    return _xy_from_uv(_uv_from_xy(xy) + (duv / np.hypot(rate[..., 0], rate[..., 1]))[..., None] * normal)
+
+
+def white_point(xy: Array | tuple[float, float]) -> Tensor:
+    """XYZ ``(..., 3)`` with Y = 1, float64, of chromaticities ``(..., 2)``.
+
+    Example:
+        >>> [round(value, 3) for value in white_point(D65).tolist()]
+        [0.95, 1.0, 1.089]
+    """
+    return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
+
+
+def sample_lights(
+    batch: int,
+    generator: torch.Generator,
+    kelvin: tuple[float, float] = (WARMEST, COLDEST),
+    lamps: float = LAMP_SHARE,
+    among: Array = _LAMPS,
+) -> Array:
+    """White points ``(batch, 3)``, XYZ with Y = 1.
+
+    Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
+    ``among`` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
+
+    Args:
+        batch: number of lights.
+        generator: on the CPU.
+        kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
+        lamps: share of fluorescent and LED lamps, in [0, 1].
+        among: chromaticities ``(N, 2)`` of the lamps that are drawn from, each as often as the others.
+
+    Raises:
+        ValueError: if a limit is outside its range.
+    """
+    if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1):
+        raise ValueError(f"kelvin must be 1000 to 15000 and lamps in [0, 1], got {kelvin} and {lamps}")
+    drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
+    duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
+    temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
+    by_day = (drawn[:, 1] < 0.5) & (temperature >= DAYLIGHT_FROM)
+    xy = np.where(by_day[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
+    lamp = among[(drawn[:, 3] * len(among)).astype(np.int64)]
+    return _white_point(off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
+
+
+def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:
+    """Krystek's (u, v) ``(..., 2)`` of a black body, and their rates of change with the temperature."""
+    t = kelvin[..., None]
+    c0, c1, c2 = _PLANCKIAN
+    value, rate = (c2 * t + c1) * t + c0, 2.0 * c2 * t + c1
+    uv = value[..., :2] / value[..., 2:]
+    return uv, (rate[..., :2] - uv * rate[..., 2:]) / value[..., 2:]
+
+
+def _white_point(xy: Array) -> Array:
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack([x / y, np.ones_like(x), (1.0 - x - y) / y], axis=-1)
+
+
+def _uv_from_xy(xy: Array) -> Array:
+    return xy * (4.0, 6.0) / (12.0 * xy[..., 1:] - 2.0 * xy[..., :1] + 3.0)
+
+
+def _xy_from_uv(uv: Array) -> Array:
+    return uv * (3.0, 2.0) / (2.0 * uv[..., :1] - 8.0 * uv[..., 1:] + 4.0)
+
+
+_PLANCKIAN = np.array(
+    [
+        [0.860117757, 0.317398726, 1.0, 1.0],
+        [1.54118254e-4, 4.22806245e-5, 8.42420235e-4, -2.89741816e-5],
+        [1.28641212e-7, 4.20481691e-8, 7.08145163e-7, 1.61456053e-7],
+    ]
+)
+"""Coefficients of 1, T and T^2: numerators of u and v, then their denominators."""
+_DAYLIGHT = np.array([[0.244063, 0.237040], [0.09911, 0.24748], [2.9678, 1.9018], [-4.6070, -2.0064]])
+"""Coefficients of the powers of 1000 / T in x: up to 7,000 K, and above."""

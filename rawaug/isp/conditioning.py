@@ -16,8 +16,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug.isp.config import ISPParams
-from rawaug.isp.dictionary import CameraDictionary, ToneDictionary, nearest_in_hull
+from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.staged import StagedISP
+from rawaug.isp.tone import ToneDictionary
 from rawaug.kernels.reference import through_curves
 
 CLIPPED = 0.98

@@ -1,9 +1,4 @@
-"""What a dictionary ISP is made of: the configuration in the header of its file.
-
-One camera setting per picture, and the result of a pass under it.
-
-ReverseISP: what every method of making RAW from sRGB can do, the dictionary ISP and the baselines alike.
-"""
+"""An ISP's configuration, the setting of a picture, the result of a pass, and what every ISP can do."""
 
 from __future__ import annotations
 
@@ -36,8 +31,8 @@ class ISPConfig:
         gain_atoms: M, triplets of gains in the dictionary.
         encoder_widths: features of the encoders' three convolutions.
         cfa: pattern of the RAW it makes.
-        stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered
-            (:func:`rawaug.isp.stages.register`); ``curve`` stands in place of ``tone gamma``.
+        stages: the stages in reverse order, of ``tone gamma colour gains shading`` and whatever else is registered in
+            :data:`rawaug.registry.STAGES`; ``curve`` stands in place of ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
         knee: where Brooks' inverse gains start to spare highlights.

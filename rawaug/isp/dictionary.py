@@ -1,37 +1,64 @@
-r"""Dictionaries of camera parameters: atoms, and augmentation in their convex hull.
+r"""Dictionaries of camera parameters: atoms, their convex hull, and settings drawn from it.
 
-``C = sum_i w_i D_ccm[i]``, ``1 / g = sum_i w_i / D_wb[i]`` and ``T = sum_i w_i D_tone[i]``, with ``w`` on the simplex
-(non-negative, sum 1).
-
-Combining colour matrices, or tone curves, equals combining the N transformed images, since both are linear in them
-(Conde et al., AAAI 2022, "Parameter Dictionaries"). For gains that holds below the highlights. There Brooks' rule takes
-the larger of two factors, gain by gain, which is not linear where the gains of the atoms lie on both sides of 1.
+``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (non-negative, sum 1).
+Combining colour matrices equals combining the N transformed images (Conde et al., AAAI 2022, "Parameter Dictionaries").
+For gains that holds below the highlights; there Brooks' rule takes the larger of two factors, gain by gain, which is
+not linear where the gains of the atoms lie on both sides of 1.
 
 Colour atoms act in the reverse direction, sRGB to camera; each row of theirs (a column in the paper, where pixels are
 row vectors) has l1 norm 1, so that with no negative entry white stays white and the gains carry all of the white
 balance. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
 
-What a colour dictionary can make: the nearest mixture of its atoms, and atoms chosen to reach many cameras.
-
-Two matrices C and C' differ on pictures of second moment :math:`S = E[x x^T]`, x in linear sRGB, by
+*The hull.* Two matrices C and C' differ on pictures of second moment :math:`S = E[x x^T]`, x in linear sRGB, by
 
 .. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 .
 
 In the coordinates :math:`C S^{1/2} / \sqrt 3` that is a squared Euclidean distance, and the best mixture the projection
 on the hull of the atoms, found by accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
+
+*Sampling.* One draw is a camera in a light, not a colour matrix and gains on their own:
+
+.. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
+    \quad (C, M) = D_\mathrm{cam} w, \quad T = \textstyle\sum_k v_k T_k
+
+with h Brooks' highlight-preserving inverse gains, w a mixture of two of the cameras that the hull was made for, a light
+L (:mod:`rawaug.isp.cameras`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest
+gain is 1, as in cameras and LibRaw, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet
+distribution of concentration 1/2, which crowds its ends: most draws are near one camera, and tone is near one curve or
+between two. Flat weights of all atoms would crowd the middle of the hull, and a few atoms at a time its corners, where
+cameras are rare.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rawaug.isp.cameras import XYZ_TO_SRGB, colour_matrix, white_balance
-from rawaug.isp.light import D65, white_point
-from rawaug.isp.tone import NODES, srgb_to_linear
+from rawaug.isp.cameras import (
+    D65,
+    XYZ_TO_SRGB,
+    Array,
+    LightRange,
+    colour_matrix,
+    sample_lights,
+    white_balance,
+    white_point,
+)
+from rawaug.isp.config import ISPParams
+
+PLAUSIBLE_GAINS = (0.4, 6.0)
+"""Red and blue gains over green that are kept; a matrix made for D65 says nothing of light that needs more."""
+EXPOSURE = (-1.0, 0.2)
+"""Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published."""
+CAMERAS_MIXED = 2
+TONES_MIXED = 3
+_ROUNDS = 100
+_ALL_LIGHTS = LightRange()
+_STEPS = 400
+_CANDIDATES = 24
 
 
 def l1_normalised(matrices: Tensor) -> Tensor:
@@ -163,46 +190,6 @@ class GainDictionary(nn.Module):
         return 1.0 / (weights @ (1.0 / self.channel_gains()))
 
 
-class ToneDictionary(nn.Module):
-    """K inverse tone curves, sRGB code to linear light, as fine tables (:mod:`rawaug.isp.tone`).
-
-    The curve of sRGB itself at first. A convex combination of monotone curves is monotone.
-
-    Attributes:
-        curves: ``(K, 1021)`` tables, not decreasing, from 0 to 1.
-        typical: ``(K,)`` weights where nothing is known of the picture.
-    """
-
-    curves: Tensor
-    typical: Tensor
-
-    def __init__(self, atoms: int) -> None:
-        super().__init__()
-        self.register_buffer("curves", srgb_to_linear(torch.linspace(0.0, 1.0, NODES)).repeat(atoms, 1))
-        self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
-
-    def combine(self, weights: Tensor) -> Tensor:
-        """Weights ``(B, K)`` to tables ``(B, 1021)``, the same bits in a batch of any size."""
-        table = weights.new_zeros(len(weights), self.curves.shape[1])
-        for weight, curve in self._weighed(weights):
-            table += weight[:, None] * curve
-        return table
-
-    def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms.
-
-        Weights of 0 are left out on a CPU, where it costs nothing to look at them, unless they are being fitted.
-        """
-        if weights.is_cuda or weights.requires_grad:
-            yield from zip(weights.unbind(1), self.curves, strict=True)
-            return
-        unused = weights == 0
-        most = weights.shape[1] - int(unused.sum(dim=1).min())
-        chosen = unused.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
-        for weight, atom in zip(weights.gather(1, chosen).unbind(1), chosen.unbind(1), strict=True):
-            yield weight, self.curves[atom]
-
-
 def project_to_simplex(weights: Tensor) -> Tensor:
     """The nearest point of the simplex, row by row: ``(B, N)`` to ``(B, N)`` (Duchi et al., ICML 2008, algorithm 1)."""
     ordered = weights.sort(dim=1, descending=True).values
@@ -244,10 +231,6 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
     chosen = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
     return chosen, squares / squares.sum(dim=1, keepdim=True)
-
-
-_STEPS = 400
-_CANDIDATES = 24
 
 
 def second_moment(linear: Tensor) -> Tensor:
@@ -312,3 +295,84 @@ def extreme_points(points: Tensor) -> Tensor:
     from scipy.spatial import ConvexHull  # slow to import, and needed by nothing else
 
     return torch.from_numpy(ConvexHull(points.numpy()).vertices).long().sort().values
+
+
+class CameraSampler:
+    """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU.
+
+    Args:
+        cameras: the atoms of colour.
+        tone_atoms: number of tone curves; 0 where the tone is learned.
+        cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
+        lights: what the light is drawn from.
+        consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
+            and gains are drawn one by one.
+
+    Raises:
+        ValueError: if fewer than one is to be mixed.
+    """
+
+    def __init__(
+        self,
+        cameras: CameraDictionary,
+        tone_atoms: int,
+        cameras_mixed: int = CAMERAS_MIXED,
+        tones_mixed: int = TONES_MIXED,
+        lights: LightRange = _ALL_LIGHTS,
+        consistent: bool = True,
+    ) -> None:
+        if min(cameras_mixed, tones_mixed) < 1:
+            raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
+        self.known, self.atoms, self.responses = (
+            tensor.detach().to("cpu", torch.float64).numpy()
+            for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
+        )
+        self.tone_atoms, self.cameras_mixed, self.tones_mixed = tone_atoms, cameras_mixed, tones_mixed
+        self.lights, self.consistent = lights, consistent
+
+    def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
+        """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light.
+
+        Raises:
+            ValueError: if no light gives a camera plausible gains.
+        """
+        weights, balance = self._cameras_in_light(batch, generator)
+        if not self.consistent:
+            _, balance = self._cameras_in_light(batch, generator)
+        matrix = (weights @ self.atoms).reshape(-1, 3, 3)
+        gains = balance / balance.min(axis=1, keepdims=True)
+        colour_weights, matrices, channel_gains = (
+            torch.from_numpy(drawn).to(device, torch.float32) for drawn in (weights, matrix, gains)
+        )
+        tones = none = channel_gains[:, :0]
+        if self.tone_atoms:
+            tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(channel_gains)
+        return ISPParams(colour_weights, none, matrices, channel_gains, tones)
+
+    def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
+        """Weights ``(B, N)`` and balances ``(B, 3)``; draws with gains beyond what is plausible are drawn again."""
+        weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
+        open_ = np.arange(batch)
+        for _ in range(_ROUNDS):
+            chosen, shares = sparse_shares(len(open_), len(self.known), self.cameras_mixed, generator)
+            drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
+            light = sample_lights(len(open_), generator, *self.lights)
+            weights[open_], balance[open_] = drawn, self.balance(drawn, light)
+            open_ = open_[~plausible(balance[open_])]
+            if not len(open_):
+                return weights, balance
+        raise ValueError(
+            f"no light of {self.lights.kelvin} K gives these cameras gains within {PLAUSIBLE_GAINS}; take other lights"
+        )
+
+    def balance(self, weights: Array, light: Array) -> Array:
+        """White balance ``(B, 3)``, green 1, of mixtures ``(B, N)`` of atoms in light of white points ``(B, 3)``."""
+        linear = light @ XYZ_TO_SRGB.numpy().T
+        response = weights @ self.responses * np.einsum("bij,bj->bi", (weights @ self.atoms).reshape(-1, 3, 3), linear)
+        return np.asarray(response[:, 1:2] / response)
+
+
+def plausible(balance: Array) -> NDArray[np.bool_]:
+    """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
+    low, high = PLAUSIBLE_GAINS
+    return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))

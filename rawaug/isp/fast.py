@@ -8,15 +8,18 @@ numbers a picture, and the mask is a function of the coordinates. Every site com
 mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
 has a table of its own.
 
-The reverse pass of an ISP with reordered stages, which cannot be baked into a table.
+The encoders' choice of a setting is made cheap as well. They look at the N images that the atoms make of one picture,
+which are linear in a few maps,
 
-Stage by stage as the ISP does it, with the calls of :class:`rawaug.isp.fast.BakedISP`; dozens of times slower.
+.. math:: D_n x_2 \quad\text{and}\quad x_3 (floor_n + m \, rise_n) = floor_n x_3 + rise_n (m x_3),
+
+and so is a convolution of them: one of 3 maps, or 6, instead of 3 N, with the same result (symbols as in
+:mod:`rawaug.kernels.reference`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 from itertools import pairwise
 from typing import cast
@@ -25,14 +28,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rawaug import bayer
 from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, node_colours
-from rawaug.isp.thumbnail_encoder import Chooser
 from rawaug.isp.tone import STEPS
-from rawaug.kernels.reference import Camera, frame_of, unprocess
+from rawaug.kernels import runtime
+from rawaug.kernels.reference import Camera, look_up, unprocess
 from rawaug.kernels.runtime import fastest, one_thread
 
 NODES = 65
@@ -62,8 +65,9 @@ class BakedISP(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         self.config = isp.config
-        if not bakeable(isp.ordered_stages):
-            raise ValueError(f"only stages in the usual order can be baked, got {' '.join(self.config.stages)}")
+        if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
+            order = " ".join(self.config.stages)
+            raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
         cube = node_colours(nodes)
         tables = Tables(cube, cube)
@@ -74,7 +78,7 @@ class BakedISP(nn.Module):
             attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
             self.register_buffer("table", _as_table(tables.x2, nodes))
             self.register_buffer("attention", attention)
-            self.chooser = Chooser(isp)
+            self.chooser = _Chooser(isp)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
@@ -95,7 +99,7 @@ class BakedISP(nn.Module):
         Raises:
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.
         """
-        require_batch(srgb, params, place)
+        _require_batch(srgb, params, place)
         return _pass(srgb, self._camera(srgb, params, place), white)
 
     @torch.no_grad()
@@ -104,7 +108,7 @@ class BakedISP(nn.Module):
 
         Three passes, one a colour. Arguments and errors are those of the call.
         """
-        require_batch(srgb, params, place)
+        _require_batch(srgb, params, place)
         camera, rgb = self._camera(srgb, params, place), []
         for colour in range(3):
             sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
@@ -114,7 +118,7 @@ class BakedISP(nn.Module):
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         batch, _, height, width = srgb.shape
         table = self.table
-        batch_params = BatchParams(
+        made = BatchParams(
             torch.eye(3).to(table).expand(batch, 3, 3),
             torch.ones(batch, 1, 3).to(table),
             table.new_zeros(batch, 6),
@@ -122,8 +126,8 @@ class BakedISP(nn.Module):
             table.new_empty(0),
         )
         for stage in self.stages:
-            batch_params = cast(Stage, stage).adjust(batch_params, params, place, (height, width))
-        matrix, floor, frame, curves, shading = batch_params
+            made = cast(Stage, stage).adjust(made, params, place, (height, width))
+        matrix, floor, frame, curves, shading = made
         if curves.numel():
             table = table[:0]
             curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
@@ -138,12 +142,7 @@ def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     return fastest("unprocess", srgb, camera, white, otherwise=lambda: unprocess(srgb, camera, white))
 
 
-def bakeable(order: Sequence[Stage]) -> bool:
-    """Whether stages stand in the usual order; any may be left out."""
-    return all(first.makes < second.makes for first, second in pairwise(order))
-
-
-def require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
+def _require_batch(srgb: Tensor, params: ISPParams, place: Tensor | None) -> None:
     """Raise ValueError unless ``srgb`` is ``(B, 3, H, W)`` with even sides and all else is for B pictures."""
     if srgb.ndim != 4 or srgb.shape[1] != 3 or srgb.shape[2] % 2 or srgb.shape[3] % 2:
         raise ValueError(f"sRGB must have shape (B, 3, H, W) with even sides, got {tuple(srgb.shape)}")
@@ -158,47 +157,63 @@ def _as_table(values: Tensor, nodes: int) -> Tensor:
     return F.pad(channels_last, (0, 4 - channels_last.shape[-1])).contiguous()
 
 
-class UnbakedISP(nn.Module):
-    """The reverse pass of an ISP as it is now; arguments, results and errors are those of ``BakedISP``."""
+class _Chooser(nn.Module):
+    """What :meth:`rawaug.isp.model.DictionaryISP.choose` does, for an ISP as it is now."""
+
+    tone_weights: Tensor
 
     def __init__(self, isp: DictionaryISP) -> None:
         super().__init__()
-        self.isp = deepcopy(isp)
+        self.knee = isp.config.knee
+        self.colour, self.gain = deepcopy(isp.colour), deepcopy(isp.gain)
+        self.register_buffer("tone_weights", isp.typical_tones().clone())
+        encoders = isp.reverse_encoders
+        with torch.no_grad():
+            self.colour_encoder = _folded(encoders.colour, [isp.colour.atoms()])
+            floor = 1.0 / isp.gain.channel_gains()
+            self.gain_encoder = _folded(
+                encoders.gain, [torch.diag_embed(floor), torch.diag_embed((1.0 - floor).clamp_min(0.0))]
+            )
 
     @torch.no_grad()
-    def choose(self, srgb: Tensor) -> ISPParams:
-        """The setting that the encoders (or their constants) choose."""
-        return self.isp.choose(srgb)
-
-    @torch.no_grad()
-    def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
-        """sRGB to clean packed RAW."""
-        return bayer.pack_rgb(self.colours(srgb, params, place, white), self.isp.cfa)
-
-    @torch.no_grad()
-    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
-        """RAW of all three colours at every site, ``(B, 3, H, W)``."""
-        require_batch(srgb, params, place)
-        x5 = self.isp.reverse_pixels(as_float(srgb), params, None if place is None else _coordinates(srgb, place))
-        return x5.clamp(max=white)
-
-
-def reverse_pass(isp: DictionaryISP) -> BakedISP | UnbakedISP:
-    """The fastest form that the ISP's stages allow.
-
-    Example:
-        >>> from rawaug.isp.config import ISPConfig
-        >>> type(reverse_pass(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))).__name__
-        'UnbakedISP'
-    """
-    return BakedISP(isp) if bakeable(isp.ordered_stages) else UnbakedISP(isp)
+    def forward(self, srgb: Tensor, table: Tensor) -> ISPParams:
+        """The setting for sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1]; ``table`` gives x2 of sRGB."""
+        images = srgb[:, None]
+        if self.colour_encoder.looks:
+            x2 = _small(srgb, table)
+            images = x2[:, None]
+        colour_weights = self.colour_encoder(images)
+        matrix = self.colour.combine(colour_weights)
+        if self.gain_encoder.looks:
+            x3 = torch.einsum("bij,bjhw->bihw", matrix, x2)
+            m = ((x3.mean(dim=1, keepdim=True) - self.knee) / (1.0 - self.knee)).clamp(0.0, 1.0).square()
+            images = torch.stack([x3, m * x3], dim=1)
+        gain_weights = self.gain_encoder(images)
+        tone_weights = self.tone_weights.expand(len(srgb), -1)
+        return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights), tone_weights)
 
 
-def _coordinates(srgb: Tensor, place: Tensor) -> Tensor:
-    """Of the pixels of turned crops in their full frames, ``(B, 2, H, W)``."""
+def _small(srgb: Tensor, table: Tensor) -> Tensor:
+    """x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
+    if srgb.dtype != torch.uint8 or srgb.device.type != "cpu" or not runtime.has_numba():
+        return look_up(table, thumbnail(as_float(srgb)))[:, :3]
+    from rawaug.kernels.cpu import thumbnails
+
     height, width = srgb.shape[-2:]
-    corners = [frame_of(p, height, width, (0.0, 0.0)) for p in place.tolist()]
-    frames = torch.tensor(corners, device=srgb.device, dtype=torch.float32)
-    start, down, right = frames.reshape(-1, 3, 2, 1, 1).unbind(1)
-    rows = torch.arange(height, device=srgb.device)[:, None]
-    return start + down * rows + right * torch.arange(width, device=srgb.device)
+    scale = THUMBNAIL / max(height, width, THUMBNAIL)
+    return thumbnails(srgb, table, max(1, round(height * scale)), max(1, round(width * scale)))
+
+
+def _folded(encoder: Encoder, maps: list[Tensor]) -> Encoder:
+    """The encoder for K maps of 3 channels; ``maps``, K times ``(N, 3, 3)``, make its N images of them."""
+    encoder = deepcopy(encoder)
+    if encoder.layers is None:
+        return encoder
+    first = encoder.layers[0]
+    assert isinstance(first, nn.Conv2d) and first.bias is not None
+    weight = first.weight.unflatten(1, (-1, 3))
+    folded = nn.Conv2d(3 * len(maps), first.out_channels, 3, stride=2, padding=1, dtype=weight.dtype)
+    folded.weight.copy_(torch.cat([torch.einsum("onixy,nij->ojxy", weight, atoms) for atoms in maps], dim=1))
+    folded.bias = first.bias
+    encoder.layers[0] = folded
+    return encoder

@@ -8,20 +8,26 @@ Source: Conde et al., "Model-Based Image Signal Processors via Learnable Diction
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.files import find_weights
+from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import conditioning, stages
-from rawaug.isp.camera_sampling import CameraSampler
-from rawaug.isp.config import ISPParams, ISPResult
-from rawaug.isp.dictionary import CameraDictionary, convex_weights
-from rawaug.isp.file import damaged, misfit, read_isp, write_isp
-from rawaug.isp.light import light_range
+from rawaug.isp.cameras import light_range
+from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
+from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
 from rawaug.isp.staged import StagedISP, thumbnail
+
+_ADVICE = "fit or copy it again"
+_INFINITE = ("colour.spread",)
+"""A width, which is infinite where the light says nothing of the colour."""
+_CODES = 256
 
 
 class DictionaryISP(StagedISP):
@@ -67,8 +73,7 @@ class DictionaryISP(StagedISP):
     def camera_sampler(self, consistent: bool = True, light: float | str | None = None) -> CameraSampler | None:
         """What draws settings where the atoms are published cameras, as these are now; else None.
 
-        ``light`` is a colour temperature in kelvin or the name of a lamp (:data:`rawaug.isp.light.LAMPS`); any light by
-        default.
+        ``light`` is a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
@@ -178,7 +183,7 @@ class DictionaryISP(StagedISP):
     ) -> ISPResult:
         """RAW mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; arguments as in :meth:`reverse`."""
         with self._float32(raw):
-            x5 = bayer.demosaic(stages.scene_referred(raw), self.cfa)
+            x5 = bayer.demosaic(_scene_referred(raw), self.cfa)
             if params is None:
                 params = self.choose_forward(self.unshaded(x5, place))
             params = conditioning.with_white_balance(self, params, white_balance, None)
@@ -204,11 +209,76 @@ class DictionaryISP(StagedISP):
         params = self.choose(x)
         return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
 
+    # -- as numbers -------------------------------------------------------------------------------------------------
+
+    def typical_setting(self, white_balance: Sequence[float] | None = None) -> ISPParams:
+        """The setting of one picture that the constants choose; of as-shot multipliers R, G, B if these are given."""
+        encoders = self.reverse_encoders
+        weights = [encoder.prior.softmax(0)[None] for encoder in (encoders.colour, encoders.gain)]
+        given = None if white_balance is None else tuple(white_balance)
+        return conditioning.with_white_balance(self, self.params_from_weights(*weights), given, None)
+
+    @torch.no_grad()
+    def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
+        """The reverse pass up to the mosaic as a table, at the centre of the lens shading.
+
+        Args:
+            setting: of one picture.
+            nodes: along each axis of the sRGB cube.
+
+        Returns:
+            Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, of the cube's nodes, red changing fastest.
+        """
+        cube = stages.node_colours(nodes)
+        shading = self.find(stages.LensShading)
+        centre = torch.zeros(2) if shading is None else shading.mask.mean
+        place = centre[None, :, None, None].expand(1, 2, *cube.shape[-2:])
+        return self.reverse_pixels(cube, setting, place)[0].flatten(1).T.contiguous()
+
+    @torch.no_grad()
+    def tone_curve(self) -> Tensor:
+        """x2, linear, of the 256 greys of sRGB, R, G, B: ``(256, 3)``. It holds tone and gamma."""
+        grey = torch.linspace(0.0, 1.0, _CODES).expand(1, 3, 1, _CODES)
+        return self.linear(grey)[0, :, 0].T.contiguous()
+
+    @torch.no_grad()
+    def description(self, white_balance: Sequence[float] | None = None) -> dict[str, Any]:
+        """What the ISP is made of, as JSON; ``setting`` is :meth:`typical_setting`, ``info`` what the fit recorded."""
+        setting, shading = self.typical_setting(white_balance), self.find(stages.LensShading)
+        info = dict(self.info)
+        return {
+            "kind": "isp",
+            "cfa": str(self.cfa),
+            "config": asdict(self.config),
+            "parameters": sum(p.numel() for p in self.parameters()),
+            "rendering": info.pop("rendering", None),
+            "colour_atoms": self.colour.atoms().tolist(),
+            "gain_atoms": self.gain.atoms().tolist(),
+            "setting": {
+                "white_balance": None if white_balance is None else list(white_balance),
+                "colour_weights": setting.colour_weights[0].tolist(),
+                "gain_weights": setting.gain_weights[0].tolist(),
+                "matrix": setting.matrix[0].tolist(),
+                "gains": setting.gains[0].tolist(),
+            },
+            "tone_curve": self.tone_curve().tolist(),
+            "shading": None
+            if shading is None
+            else {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()},
+            "noise": info.pop("noise", None),
+            "info": info,
+        }
+
     # -- files ------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write weights, configuration and ``info`` to one safetensors file, atomically."""
-        write_isp(self.config, self.info, self.state_dict(), path)
+        """Write weights, configuration and ``info`` to one safetensors file, atomically; disabled parts are not stored.
+
+        Args:
+            path: of the file.
+        """
+        header = {"format": "rawaug", "kind": "isp", "config": to_json(asdict(self.config)), "info": to_json(self.info)}
+        write_tensors(self.state_dict(), header, path)
 
     @classmethod
     def from_pretrained(cls, name: str | Path) -> DictionaryISP:
@@ -216,20 +286,49 @@ class DictionaryISP(StagedISP):
 
         Raises:
             FileNotFoundError: if there is no such file or name.
-            ValueError: if the file is not that of an ISP.
+            ValueError: if the file is not that of an ISP, or is damaged.
         """
         path = find_weights(name)
-        config, info, state = read_isp(path)
+        header, state = read_tensors(path, _ADVICE, _INFINITE)
+        if header.get("kind") != "isp":
+            raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
+            config = ISPConfig(**parse_object(header["config"]))
+            _require_sizes(config, state)
             isp = cls(config)
-        except ValueError as error:
-            raise damaged(path, error) from error
-        shapes, needed = ({key: value.shape for key, value in tensors.items()} for tensors in (state, isp.state_dict()))
-        if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
-            raise misfit(path, wrong[0])
-        isp.load_state_dict(state)
-        for name, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
-            if not atoms.isfinite().all():
-                raise damaged(path, ValueError(f"its {name} atoms are not finite"))
-        isp.info = info
+            shapes, needed = ({k: v.shape for k, v in tensors.items()} for tensors in (state, isp.state_dict()))
+            if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
+                raise ValueError(f"tensor {wrong[0]} does not fit")
+            isp.load_state_dict(state)
+            for part, atoms in (("colour", isp.colour.atoms()), ("gain", isp.gain.channel_gains())):
+                if not atoms.isfinite().all():
+                    raise ValueError(f"its {part} atoms are not finite")
+            isp.info = parse_object(header.get("info", "{}"))
+        except (LookupError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}") from error
         return isp.eval()
+
+
+def _require_sizes(config: ISPConfig, state: dict[str, Tensor]) -> None:
+    """Refuse a configuration that is not the tensors' before memory is taken for it: a damaged one may ask for any."""
+    sizes = {"colour.matrices": config.colour_atoms, "gain.log_gains": config.gain_atoms}
+    if config.cameras:
+        sizes["colour.known"] = config.cameras
+    if config.tone_atoms:
+        sizes["stages.curve.dictionary.curves"] = config.tone_atoms
+    if config.encoders:
+        for k, width in enumerate(config.encoder_widths):
+            sizes[f"reverse_encoders.colour.layers.{2 * k}.weight"] = width
+    for key, size in sizes.items():
+        if key not in state or state[key].shape[:1] != (size,):
+            raise ValueError(f"tensor {key} does not fit")
+
+
+def _scene_referred(raw: Tensor) -> Tensor:
+    """RAW as float32; ValueError unless it is a floating-point mosaic ``(B, 1, H, W)`` of finite values."""
+    if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
+        raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
+    if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):
+        raise ValueError(f"RAW must be finite, got NaN or infinity in {damaged} of {raw.numel()} values")
+    return raw.float()

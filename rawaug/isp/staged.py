@@ -1,9 +1,8 @@
-"""StagedISP: stages in order, two dictionaries, and the encoders that choose their atoms; pixels through the stages.
+"""What an ISP is made of: stages in order, two dictionaries, and the encoders that choose among their atoms.
 
-Encoders: the weights of a dictionary's atoms from the images that the atoms make of one picture.
-
-``w = softmax(b + E(I))``, ``I`` the N images stacked (Conde et al., AAAI 2022, "Parameter Dictionaries"); ``b`` is a
-learned constant, which decides alone where there is no encoder ``E``.
+An encoder gives the weights of a dictionary's atoms, ``w = softmax(b + E(I))``, from the N images ``I`` that the atoms
+make of one picture (Conde et al., AAAI 2022, "Parameter Dictionaries"); ``b`` is a learned constant, which decides
+alone where there is no network ``E``.
 """
 
 from __future__ import annotations
@@ -17,128 +16,13 @@ from torch import Tensor, nn
 
 from rawaug.bayer import CFA
 from rawaug.isp.config import ISPConfig, ISPParams, ReverseISP
-from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, ToneDictionary
-from rawaug.isp.stages import Stage, ToneCurve, stage_class
+from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary
+from rawaug.isp.stages import Stage
+from rawaug.isp.tone import ToneCurve, ToneDictionary
+from rawaug.registry import STAGES
 from rawaug.seeding import derived_seed, initialised_from
 
 S = TypeVar("S", bound=Stage)
-
-
-class StagedISP(ReverseISP):
-    """What :class:`rawaug.isp.model.DictionaryISP`, which adds the choice of a setting and the passes, is made of.
-
-    Args:
-        config: what it is made of.
-        seed: of the networks and gains that it starts with.
-    """
-
-    def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
-        super().__init__()
-        self._config = config or ISPConfig()
-        with initialised_from(seed):
-            self.colour = ColourDictionary(self.config.colour_atoms)
-            if self.config.cameras:
-                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
-            self.gain = GainDictionary(self.config.gain_atoms)
-            made = [stage_class(name)(self.config) for name in self.config.stages]
-            self.stages = nn.ModuleDict({stage.name: stage for stage in made})
-            self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
-        self.use_encoders(self.config.encoders, seed)
-
-    @property
-    def config(self) -> ISPConfig:
-        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
-        return self._config
-
-    @property
-    def cfa(self) -> CFA:
-        """The pattern of the RAW that this ISP makes."""
-        return CFA(self.config.cfa)
-
-    @property
-    def ordered_stages(self) -> list[Stage]:
-        """The stages in reverse order."""
-        return [cast(Stage, stage) for stage in self.stages.values()]
-
-    def find(self, kind: type[S]) -> S | None:
-        """The stage of this class, or None."""
-        return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
-
-    @property
-    def reverse_parameters(self) -> int:
-        """Number of parameters of the reverse pass."""
-        names = (name for name, _ in self.named_parameters())
-        reverse = [name for name in names if not name.startswith("forward_") and ".forward_" not in name]
-        return sum(self.get_parameter(name).numel() for name in reverse)
-
-    def configure(self, **changes: Any) -> None:
-        """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them.
-
-        Raises:
-            ValueError: if there is no such stage in the ISP, or a value is out of its range.
-        """
-        config = replace(self.config, **changes)
-        if absent := [name for name in config.stages if name not in self.stages]:
-            raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
-        self._config = config
-        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
-        for stage in self.ordered_stages:
-            stage.config = config
-
-    def use_encoders(self, enabled: bool, seed: int = 0) -> None:
-        """Make encoders that look at the picture, drawn from ``seed``, or remove them; existing ones stay as they are.
-
-        Without them the learned constants decide.
-        """
-        with initialised_from(derived_seed(seed, "encoders")):
-            for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
-                if not enabled:
-                    encoder.layers = None
-                elif not encoder.looks:
-                    encoder.add_layers(self.config.encoder_widths)
-        self.configure(encoders=enabled)
-
-    @property
-    def tone(self) -> ToneDictionary | None:
-        """The dictionary of tone curves; None where the curve is learned."""
-        stage = self.find(ToneCurve)
-        return stage.dictionary if stage else None
-
-    def typical_tones(self) -> Tensor:
-        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
-        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
-
-    def reverse_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
-        for stage in self.ordered_stages:
-            x = stage.reverse(x, params, place)
-            if seen is not None:
-                seen[f"x{stage.makes}"] = x
-        return x
-
-    def forward_pixels(
-        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
-    ) -> Tensor:
-        """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
-        for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, params, place)
-            if seen is not None and stage.makes > 1:
-                seen[f"x{stage.makes - 1}"] = x
-        return x
-
-    def linear(self, x: Tensor) -> Tensor:
-        """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
-        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
-            x = stage.reverse(x, None) if stage.makes <= 2 else x
-        return x
-
-    def unshaded(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """x5 to x4, what the forward encoders look at."""
-        for stage in reversed(self.ordered_stages):
-            x = stage.forward(x, None, place) if stage.makes >= 5 else x
-        return x
 
 
 THUMBNAIL = 48
@@ -146,15 +30,7 @@ THUMBNAIL = 48
 
 
 class Encoder(nn.Module):
-    """Chooses the weights of N atoms from the N images that the atoms make of one picture.
-
-    A learned constant and, where it is to look at the picture, three strided convolutions on a thumbnail, averaged, to
-    N logits; softmax.
-
-    Attributes:
-        prior: ``(N,)`` the constant, as logits.
-        layers: the convolutions, or None.
-    """
+    """A learned constant ``prior`` ``(N,)``, as logits, and convolutions if it looks at the picture."""
 
     def __init__(self, atoms: int) -> None:
         super().__init__()
@@ -205,3 +81,108 @@ def thumbnail(image: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     scale = THUMBNAIL / max(height, width, THUMBNAIL)
     return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
+
+
+class StagedISP(ReverseISP):
+    """Stages, dictionaries and encoders; :class:`rawaug.isp.model.DictionaryISP` adds the choice of a setting."""
+
+    def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
+        super().__init__()
+        self._config = config or ISPConfig()
+        with initialised_from(seed):
+            self.colour = ColourDictionary(self.config.colour_atoms)
+            if self.config.cameras:
+                self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
+            self.gain = GainDictionary(self.config.gain_atoms)
+            made = [STAGES[name](self.config) for name in self.config.stages]
+            self.stages = nn.ModuleDict({stage.name: stage for stage in made})
+            self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
+        self.use_encoders(self.config.encoders, seed)
+
+    @property
+    def config(self) -> ISPConfig:
+        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
+        return self._config
+
+    @property
+    def cfa(self) -> CFA:
+        """The pattern of the RAW that this ISP makes."""
+        return CFA(self.config.cfa)
+
+    @property
+    def ordered_stages(self) -> list[Stage]:
+        """The stages in reverse order."""
+        return [cast(Stage, stage) for stage in self.stages.values()]
+
+    def find(self, kind: type[S]) -> S | None:
+        """The stage of this class, or None."""
+        return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
+
+    @property
+    def reverse_parameters(self) -> int:
+        """Number of parameters of the reverse pass."""
+        names = (name for name, _ in self.named_parameters())
+        reverse = [name for name in names if not name.startswith("forward_") and ".forward_" not in name]
+        return sum(self.get_parameter(name).numel() for name in reverse)
+
+    def configure(self, **changes: Any) -> None:
+        """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them."""
+        config = replace(self.config, **changes)
+        if absent := [name for name in config.stages if name not in self.stages]:
+            raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
+        self._config = config
+        self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
+        for stage in self.ordered_stages:
+            stage.config = config
+
+    def use_encoders(self, enabled: bool, seed: int = 0) -> None:
+        """Make networks for the encoders, drawn from ``seed``, or remove them; existing ones stay as they are."""
+        with initialised_from(derived_seed(seed, "encoders")):
+            for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
+                if not enabled:
+                    encoder.layers = None
+                elif not encoder.looks:
+                    encoder.add_layers(self.config.encoder_widths)
+        self.configure(encoders=enabled)
+
+    @property
+    def tone(self) -> ToneDictionary | None:
+        """The dictionary of tone curves; None where the curve is learned."""
+        stage = self.find(ToneCurve)
+        return stage.dictionary if stage else None
+
+    def typical_tones(self) -> Tensor:
+        """Weights ``(K,)`` of the tone curves where nothing is known of a picture; none where the curve is learned."""
+        return self.tone.typical if self.tone else self.colour.matrices.new_zeros(0)
+
+    def reverse_pixels(
+        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """x to x5 ``(B, 3, H, W)``, the reverse pass without its mosaic; fills ``seen`` with x1 ... x5."""
+        for stage in self.ordered_stages:
+            x = stage.reverse(x, params, place)
+            if seen is not None:
+                seen[f"x{stage.makes}"] = x
+        return x
+
+    def forward_pixels(
+        self, x: Tensor, params: ISPParams, place: Tensor | None = None, seen: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """x5 ``(B, 3, H, W)`` to x, not clipped; fills ``seen`` with x4 ... x1."""
+        for stage in reversed(self.ordered_stages):
+            x = stage.forward(x, params, place)
+            if seen is not None and stage.makes > 1:
+                seen[f"x{stage.makes - 1}"] = x
+        return x
+
+    def linear(self, x: Tensor) -> Tensor:
+        """x to x2 by the stages in their usual order, without a setting: what the reverse encoders look at."""
+        for stage in sorted(self.ordered_stages, key=lambda stage: stage.makes):
+            x = stage.reverse(x, None) if stage.makes <= 2 else x
+        return x
+
+    def unshaded(self, x: Tensor, place: Tensor | None) -> Tensor:
+        """x5 to x4, what the forward encoders look at."""
+        for stage in reversed(self.ordered_stages):
+            x = stage.forward(x, None, place) if stage.makes >= 5 else x
+        return x

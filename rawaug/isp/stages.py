@@ -1,4 +1,4 @@
-r"""The stages of the ISP between sRGB and the mosaic, each with its inverse.
+r"""The stages of the ISP between sRGB and the mosaic, each with its inverse, and how each enters the baked pass.
 
 ======  ===============  ==============================================  ==============================================
 stage   name             reverse (sRGB to RAW)                           forward (RAW to sRGB)
@@ -13,43 +13,30 @@ f6      mosaic           y = one channel a site                          x5 = bi
 
 Source: Conde et al., "Model-Based Image Signal Processors via Learnable Dictionaries", AAAI 2022, eqs. 3 to 9 and
 figure 2; the highlight-safe inverse gains are eq. 4 of Brooks et al., "Unprocessing Images for Learned Raw Denoising",
-CVPR 2019. f6 is in :mod:`rawaug.bayer`. Images are ``(B, 3, H, W)``, linear from x2 on, white at 1.
+CVPR 2019. f6 is in :mod:`rawaug.bayer`; :class:`rawaug.isp.tone.ToneCurve` can replace f1 and f2. Images are
+``(B, 3, H, W)``, linear from x2 on, white at 1.
 
 Everything but f6 is pointwise, given the parameters: a set of pixels ``(B, 3, 1, P)`` is as good as a picture.
 
-What a stage of the ISP is: one image to the next in both directions, and its share of the baked pass.
-
 The baked pass (:mod:`rawaug.isp.fast`) is ``y_c = sum_k C[c, k] T_k(x) max(m + (1 - m) / g_c, 1 / g_c) G(p) A(x4)``.
-A stage that is the same for every picture goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
-on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` batch by batch (:meth:`Stage.adjust`).
+What a stage does to every picture alike goes into the tables ``T`` and ``A`` once (:meth:`Stage.bake`); what depends
+on a picture's setting or place goes into ``C``, ``1 / g`` and ``G`` for each batch (:meth:`Stage.adjust`).
 
-A new kind of stage is a class with :func:`register` above it, in a module that is imported before an ISP is made.
-
-The five stages of the paper between sRGB and the mosaic; their formulas are in :mod:`rawaug.isp.stages`.
-
-The tone stage without a network: a picture's curve is a mixture of known ones, or the one of a fitted camera.
-
-``x2 = T(x)`` with ``T = sum_k v_k T_k``, in place of the learned tone network and gamma of the paper. The way back
-looks the code up on the same curve; where the curve is flat, the lowest code is taken.
-
-A fit bends a standard's curve :math:`T_0`, whose slope it scales on each of 51 pieces of five codes:
-
-.. math:: T(s) = \int_0^s e^{l(u)} T_0'(u) \, du \Big/ \int_0^1 e^{l(u)} T_0'(u) \, du .
+A new kind of stage is a class with ``@STAGES.register(name)`` above it.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from rawaug.isp.config import HIGHLIGHT_KNEE, ISPConfig, ISPParams
-from rawaug.isp.dictionary import ToneDictionary
-from rawaug.isp.tone import NODES, STEPS, to_code, to_linear
 from rawaug.kernels.reference import frame_of
+from rawaug.registry import STAGES
 
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
@@ -63,13 +50,7 @@ def as_float(srgb: Tensor) -> Tensor:
 
 
 def display_referred(srgb: Tensor) -> Tensor:
-    """:func:`as_float` of what is seen to be a picture: uint8, or float32 in [0, 1] within half an 8-bit level.
-
-    Floats are looked at on the CPU only, elsewhere that would stall the device.
-
-    Raises:
-        ValueError: if it is not.
-    """
+    """:func:`as_float` of a picture; ValueError unless it is uint8 or float32 in [0, 1]."""
     if srgb.layout != torch.strided:
         raise ValueError(f"a picture must be a dense tensor, got {srgb.layout}; call to_dense()")
     if srgb.dtype not in (torch.uint8, torch.float32):
@@ -79,7 +60,8 @@ def display_referred(srgb: Tensor) -> Tensor:
 
 
 def require_display_range(image: Tensor) -> None:
-    """Raise ValueError if floats on the CPU leave [0, 1] by more than half an 8-bit level, or are NaN."""
+    """Raise ValueError if floats leave [0, 1] by more than half an 8-bit level, or are NaN."""
+    # Only on the CPU: elsewhere reading a value back would stall the device.
     if image.device.type != "cpu" or image.dtype == torch.uint8 or not image.numel():
         return
     low, high = (float(value) for value in torch.aminmax(image.detach()))
@@ -91,19 +73,6 @@ def require_display_range(image: Tensor) -> None:
         raise ValueError(
             f"a float picture must be in [0, 1], got {low:.4g} to {high:.4g}; scale it, and normalise after rawaug"
         )
-
-
-def scene_referred(raw: Tensor) -> Tensor:
-    """RAW ``(B, 1, H, W)`` as float32, looked at on the CPU as :func:`display_referred` does.
-
-    Raises:
-        ValueError: if it has another shape or is no floating-point RAW, or a value is not finite.
-    """
-    if raw.ndim != 4 or raw.shape[1] != 1 or not raw.is_floating_point():
-        raise ValueError(f"RAW must be a floating-point mosaic (B, 1, H, W), got {tuple(raw.shape)} {raw.dtype}")
-    if raw.device.type == "cpu" and (damaged := int((~raw.detach().isfinite()).sum())):
-        raise ValueError(f"RAW must be finite, got NaN or infinity in {damaged} of {raw.numel()} values")
-    return raw.float()
 
 
 class ToneNetwork(nn.Module):
@@ -127,10 +96,8 @@ class ToneNetwork(nn.Module):
 
     @torch.no_grad()
     def start_from(self, toe: float) -> None:
-        """Start as ``x1 = x + toe (1 - x)``: with the gamma stage that is the curve of sRGB and of BT.709.
-
-        Three hidden features pass x through (it is not negative, so ReLU lets it), and the last layer adds the rest.
-        """
+        """Start as ``x1 = x + toe (1 - x)``: with the gamma stage that is the curve of sRGB and of BT.709."""
+        # Three hidden features pass x on (it is not negative, so ReLU keeps it), and the last layer adds the rest.
         *hidden, last = (layer for layer in self.layers if isinstance(layer, nn.Conv2d))
         through = torch.eye(3)[..., None, None]
         for layer in hidden:
@@ -153,7 +120,7 @@ def gamma_compress(x: Tensor, gamma: Tensor | float) -> Tensor:
 
 
 def correct_colour(x: Tensor, matrix: Tensor) -> Tensor:
-    """f3 in either direction: ``(B, 3, H, W)`` times ``matrix`` ``(B, 3, 3)`` acting on colour columns."""
+    """f3 in either direction: ``matrix`` ``(B, 3, 3)`` acts on colour columns."""
     return torch.einsum("bij,bjhw->bihw", matrix, x)
 
 
@@ -178,12 +145,10 @@ def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
 def place_in_frame(
     height: int, width: int, offset: tuple[int, int] = (0, 0), frame: tuple[int, int] | None = None
 ) -> Tensor:
-    """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame.
-
-    The centre of the frame is 0 and half its diagonal is 1, so that a round mask is round on any aspect ratio.
+    """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame: centre 0, half the diagonal 1.
 
     Args:
-        height, width: size of the crop.
+        height, width: of the crop.
         offset: (top, left) of the crop in the frame.
         frame: (height, width) of the frame; the crop itself by default.
     """
@@ -200,9 +165,9 @@ def placed(x: Tensor, place: Tensor | None) -> Tensor:
 
 
 class GaussianMask(nn.Module):
-    r"""The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``.
+    """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``; flat at first.
 
-    Flat (1 everywhere) at first. ``p`` are the coordinates of :func:`place_in_frame`.
+    ``p`` are the coordinates of :func:`place_in_frame`.
     """
 
     def __init__(self) -> None:
@@ -234,9 +199,9 @@ class GaussianMask(nn.Module):
 
 
 class AttentionMask(nn.Module):
-    """A per-pixel gain ``A = 2 sigmoid(conv-ReLU-conv-ReLU-conv)`` in (0, 2), 1 at first.
+    """A per-pixel gain ``A = 2 sigmoid(conv-ReLU-conv-ReLU-conv)`` in (0, 2), 1 x 1 kernels.
 
-    1 x 1 kernels, 32-32-1 features as in the paper's figure; the factor 2 lets the untrained mask be the identity.
+    The factor 2, which the paper does not have, lets the untrained mask be the identity.
     """
 
     def __init__(self, width: int = 32) -> None:
@@ -268,7 +233,7 @@ class Tables(NamedTuple):
 
 
 class BatchParams(NamedTuple):
-    """What the baked pass uses of a batch's settings.
+    """What the baked pass takes from the settings of a batch.
 
     Args:
         matrix: ``(B, 3, 3)`` x2 to x3.
@@ -286,21 +251,15 @@ class BatchParams(NamedTuple):
 
 
 class Stage(nn.Module, ABC):
-    """A stage of the ISP; images are ``(B, 3, H, W)``.
+    """A stage of the ISP, which keeps ``config`` up to date; images are ``(B, 3, H, W)``.
 
-    Parameters whose names start with ``forward_`` are those of the forward pass, all others are the reverse pass's.
-
-    Args:
-        config: of the ISP.
-
-    Attributes:
-        name: in ``ISPConfig.stages`` and in files.
-        makes: k of ``x_k``, the image that the reverse pass makes: the stage's position in the usual order.
-        config: of the ISP, kept up to date by it.
+    Parameters whose names start with ``forward_`` belong to the forward pass, all others to the reverse pass.
     """
 
     name: ClassVar[str]
+    """In ``ISPConfig.stages`` and in files."""
     makes: ClassVar[int]
+    """k of ``x_k``, the image that the reverse pass makes: the stage's position in the usual order."""
 
     def __init__(self, config: ISPConfig) -> None:
         super().__init__()
@@ -324,18 +283,16 @@ class Stage(nn.Module, ABC):
     def bake(self, tables: Tables) -> Tables:
         """The tables with what this stage does to every picture alike."""
 
-    def adjust(
-        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
-    ) -> BatchParams:
-        """The batch_params with what this stage does to these pictures.
+    def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        """``batch`` with what this stage does to these pictures.
 
         Args:
-            batch_params: as the stages before set them.
+            batch: as the stages before left it.
             params: the pictures' settings.
-            place: ``(B, 4 or 5)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
+            place: ``(B, 4 to 6)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
             size: height and width of the pictures.
         """
-        return batch_params
+        return batch
 
     def describe(self) -> str:
         """The stage's parameters in one line; empty if the settings hold them all."""
@@ -348,7 +305,7 @@ class Stage(nn.Module, ABC):
         return {}
 
     def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """The reverse pass in a few numbers, from which a fit starts; nothing for what each frame has of its own."""
+        """The reverse pass in a few numbers, from which a fit starts; the identity where each frame has its own."""
         return x
 
     def start_coarse(self, gamma: float, toe: float) -> None:
@@ -366,41 +323,13 @@ class Stage(nn.Module, ABC):
         return {f"{self.name}.{key}": p for key, p in named if key.startswith("forward_") == forward}
 
 
-STAGES: dict[str, type[Stage]] = {}
-"""Name to class."""
-
-Kind = TypeVar("Kind", bound=type[Stage])
-
-
-def register(kind: Kind) -> Kind:
-    """Let ISPs be made of stages of this class.
-
-    Raises:
-        ValueError: if another class has the name.
-    """
-    if STAGES.setdefault(kind.name, kind) is not kind:
-        raise ValueError(f"stage {kind.name!r} is registered already, by {STAGES[kind.name].__qualname__}")
-    return kind
-
-
-def stage_class(name: str) -> type[Stage]:
-    """The class of the stages called ``name``.
-
-    Raises:
-        ValueError: naming the known ones.
-    """
-    if name not in STAGES:
-        raise ValueError(f"stages: {name!r} is unknown; choose of {' '.join(STAGES)}")
-    return STAGES[name]
-
-
 def node_colours(nodes: int) -> Tensor:
     """The colours ``(1, 3, N, N * N)`` at the nodes of a table, axes B, G, R."""
     axis = torch.linspace(0.0, 1.0, nodes, dtype=torch.float32)
     return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).flip(0).reshape(1, 3, nodes, nodes**2)
 
 
-@register
+@STAGES.register("tone")
 class ToneMap(Stage):
     """f1: a tone network for each direction."""
 
@@ -437,7 +366,7 @@ class ToneMap(Stage):
         self.reverse_network.start_from(float(self.toe))
 
 
-@register
+@STAGES.register("gamma")
 class Gamma(Stage):
     """f2: a power for each direction, 2.2 at first."""
 
@@ -475,7 +404,7 @@ class Gamma(Stage):
         self.forward_gamma.copy_(self.reverse_gamma)
 
 
-@register
+@STAGES.register("colour")
 class ColorCorrection(Stage):
     """f3: the picture's matrix."""
 
@@ -490,13 +419,11 @@ class ColorCorrection(Stage):
     def bake(self, tables: Tables) -> Tables:
         return tables
 
-    def adjust(
-        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
-    ) -> BatchParams:
-        return batch_params._replace(matrix=params.matrix.to(batch_params.matrix))
+    def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        return batch._replace(matrix=params.matrix.to(batch.matrix))
 
 
-@register
+@STAGES.register("gains")
 class WhiteBalance(Stage):
     """f4: the picture's gains, with Brooks' care for highlights on the way back."""
 
@@ -511,13 +438,11 @@ class WhiteBalance(Stage):
     def bake(self, tables: Tables) -> Tables:
         return tables
 
-    def adjust(
-        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
-    ) -> BatchParams:
-        return batch_params._replace(floor=1.0 / params.gains.to(batch_params.floor)[:, None])
+    def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        return batch._replace(floor=1.0 / params.gains.to(batch.floor)[:, None])
 
 
-@register
+@STAGES.register("shading")
 class LensShading(Stage):
     """f5: a Gaussian mask over the frame and, if the settings say so, an attention mask for each direction."""
 
@@ -542,17 +467,13 @@ class LensShading(Stage):
             tables if self.reverse_attention is None else tables._replace(attention=self.reverse_attention(tables.cube))
         )
 
-    def adjust(
-        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
-    ) -> BatchParams:
+    def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
-        places = [[0, 0, *size]] * len(batch_params.frame) if place is None else place.tolist()
-        frame = batch_params.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(
-            len(batch_params.frame), 6
-        )
+        places = [[0, 0, *size]] * len(batch.frame) if place is None else place.tolist()
+        frame = batch.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(len(batch.frame), 6)
         precision = self.mask.precision * (0.5 / math.log(2.0))
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
-        return batch_params._replace(frame=frame, shading=shading)
+        return batch._replace(frame=frame, shading=shading)
 
     def describe(self) -> str:
         mean, precision = self.mask.mean.tolist(), self.mask.precision.flatten().tolist()
@@ -570,84 +491,3 @@ def chosen(params: ISPParams | None) -> ISPParams:
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")
     return params
-
-
-PIECES = 51
-
-
-@register
-class ToneCurve(Stage):
-    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet.
-
-    Raises:
-        ValueError: if there are no tone atoms, or the stages contain the learned curve as well.
-    """
-
-    name, makes = "curve", 2
-
-    def __init__(self, config: ISPConfig) -> None:
-        super().__init__(config)
-        if config.tone_atoms < 1 or {"tone", "gamma"} & set(config.stages):
-            raise ValueError(
-                f"stages: 'curve' takes tone_atoms, at least 1, and replaces tone and gamma; got "
-                f"{config.tone_atoms} and {' '.join(config.stages)}"
-            )
-        self.dictionary = ToneDictionary(config.tone_atoms)
-        self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
-
-    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return to_linear(x, self._curves(len(x), params))
-
-    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return to_code(x, self._curves(len(x), params))
-
-    def bake(self, tables: Tables) -> Tables:
-        return tables._replace(x2=self.reverse(tables.x2, None))
-
-    def adjust(
-        self, batch_params: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]
-    ) -> BatchParams:
-        return batch_params._replace(curves=self.dictionary.combine(params.tone_weights.to(batch_params.matrix)))
-
-    def describe(self) -> str:
-        return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
-            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
-        )
-
-    def coarse_parameters(self) -> dict[str, Tensor]:
-        return {} if self.slopes is None else {"slopes": self.slopes}
-
-    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        return self.reverse(x, None)
-
-    @torch.no_grad()
-    def start_coarse(self, gamma: float, toe: float) -> None:
-        code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
-        curve = (code + toe * (1.0 - code)) ** gamma
-        self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
-        self.slopes = torch.zeros(self.config.tone_atoms, PIECES)
-
-    @torch.no_grad()
-    def start_forward(self) -> None:
-        """The curves are those of the reverse pass from now on."""
-        self.dictionary.curves.copy_(self._bent())
-        self.slopes = None
-
-    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
-        return {} if forward or self.slopes is None else {f"{self.name}.slopes": self.slopes}
-
-    def _bent(self) -> Tensor:
-        """The curves under the slopes of a fit."""
-        if self.slopes is None:
-            return self.dictionary.curves
-        rises = self.dictionary.curves.diff(dim=1) * self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
-        heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
-        return heights / heights[:, -1:]
-
-    def _curves(self, batch: int, params: ISPParams | None) -> Tensor:
-        """One curve a picture; the typical one where none is chosen."""
-        weights = self.dictionary.typical[None]
-        if params is not None and params.tone_weights.shape[1]:
-            weights = params.tone_weights.to(weights)
-        weights = weights.expand(batch, -1)
-        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bent()

@@ -1,32 +1,43 @@
-r"""Inverse tone curves by name: display-referred sRGB to linear camera light.
+r"""Tone without a network: inverse tone curves by name, mixtures of them, and the stage that applies them.
 
 A camera's engine takes linear light l to linear display light d = t(l), monotone, and encodes it as sRGB. The inverse
 is kept as a table over the sRGB code s,
 
-.. math:: T(s) = t^{-1}(\mathrm{EOTF}(s)), \qquad s = 0, \tfrac{1}{8 \cdot 255}, \dots, 1,
+.. math:: T(s) = t^{-1}(\mathrm{EOTF}(s)), \qquad s = 0, \tfrac{1}{4 \cdot 255}, \dots, 1,
 
-of which every eighth entry is an 8-bit code, without interpolation (EOTF: IEC 61966-2-1). A convex combination of
+of which every fourth entry is an 8-bit code, without interpolation (EOTF: IEC 61966-2-1). A convex combination of
 tables is monotone as they are. The curves t are monotone cubics (Fritsch and Carlson, 1980) through the points of
 darktable's base curves, measured against cameras' JPEGs or drawn after a maker's; besides them ``linear``, LibRaw's
 rendering, which has no curve, and ``upi``, the smoothstep and gamma 2.2 of Brooks et al. (CVPR 2019).
+
+The stage :class:`ToneCurve` is ``x2 = T(x)`` with ``T = sum_k v_k T_k``, in place of the paper's tone network and
+gamma. The forward pass looks the code up on the same curve; where the curve is flat, the lowest code is taken. A fit
+bends a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces of five codes:
+
+.. math:: T(s) = \int_0^s e^{l(u)} T_0'(u) \, du \Big/ \int_0^1 e^{l(u)} T_0'(u) \, du .
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from importlib import resources
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from rawaug.isp.config import ISPConfig, ISPParams
+from rawaug.isp.stages import BatchParams, Stage, Tables
 from rawaug.kernels.reference import through_curves
+from rawaug.registry import STAGES
 
 STEPS = 4
 """Entries of a table for each 8-bit level."""
 NODES = 255 * STEPS + 1
+PIECES = 51
+"""Pieces of a curve whose slopes a fit scales."""
 _FINE = 2**16
 
 
@@ -103,3 +114,117 @@ def _inverse(curve: Callable[[np.ndarray], np.ndarray], display: Tensor) -> Tens
     reached = reached / reached[-1]
     rising = np.concatenate([[True], np.diff(reached) > 0])
     return torch.from_numpy(np.interp(display.numpy(), reached[rising], light[rising]))
+
+
+class ToneDictionary(nn.Module):
+    """K inverse tone curves, sRGB code to linear light; at first all are the curve of sRGB itself.
+
+    Attributes:
+        curves: ``(K, 1021)`` tables, not decreasing, from 0 to 1.
+        typical: ``(K,)`` weights where nothing is known of the picture.
+    """
+
+    curves: Tensor
+    typical: Tensor
+
+    def __init__(self, atoms: int) -> None:
+        super().__init__()
+        self.register_buffer("curves", srgb_to_linear(torch.linspace(0.0, 1.0, NODES)).repeat(atoms, 1))
+        self.register_buffer("typical", torch.full((atoms,), 1.0 / atoms))
+
+    def combine(self, weights: Tensor) -> Tensor:
+        """Weights ``(B, K)`` to tables ``(B, 1021)``, the same bits in a batch of any size."""
+        table = weights.new_zeros(len(weights), self.curves.shape[1])
+        for weight, curve in self._weighed(weights):
+            table += weight[:, None] * curve
+        return table
+
+    def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms.
+
+        Weights of 0 are left out on a CPU, where it costs nothing to look at them, unless they are being fitted.
+        """
+        if weights.is_cuda or weights.requires_grad:
+            yield from zip(weights.unbind(1), self.curves, strict=True)
+            return
+        unused = weights == 0
+        most = weights.shape[1] - int(unused.sum(dim=1).min())
+        chosen = unused.to(torch.uint8).argsort(dim=1, stable=True)[:, :most]
+        for weight, atom in zip(weights.gather(1, chosen).unbind(1), chosen.unbind(1), strict=True):
+            yield weight, self.curves[atom]
+
+
+@STAGES.register("curve")
+class ToneCurve(Stage):
+    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet.
+
+    Raises:
+        ValueError: if there are no tone atoms, or the stages contain the learned curve as well.
+    """
+
+    name, makes = "curve", 2
+
+    def __init__(self, config: ISPConfig) -> None:
+        super().__init__(config)
+        if config.tone_atoms < 1 or {"tone", "gamma"} & set(config.stages):
+            raise ValueError(
+                f"stages: 'curve' takes tone_atoms, at least 1, and replaces tone and gamma; got "
+                f"{config.tone_atoms} and {' '.join(config.stages)}"
+            )
+        self.dictionary = ToneDictionary(config.tone_atoms)
+        self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
+
+    def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return to_linear(x, self._curves(len(x), params))
+
+    def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
+        return to_code(x, self._curves(len(x), params))
+
+    def bake(self, tables: Tables) -> Tables:
+        return tables._replace(x2=self.reverse(tables.x2, None))
+
+    def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
+        return batch._replace(curves=self.dictionary.combine(params.tone_weights.to(batch.matrix)))
+
+    def describe(self) -> str:
+        return f"tone curves: {self.config.tone_atoms}, at code 128 " + " ".join(
+            f"{value:.3f}" for value in self.dictionary.curves[:, 128 * STEPS].tolist()
+        )
+
+    def coarse_parameters(self) -> dict[str, Tensor]:
+        return {} if self.slopes is None else {"slopes": self.slopes}
+
+    def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
+        return self.reverse(x, None)
+
+    @torch.no_grad()
+    def start_coarse(self, gamma: float, toe: float) -> None:
+        code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
+        curve = (code + toe * (1.0 - code)) ** gamma
+        self.dictionary.curves.copy_((curve - curve[0]) / (1.0 - curve[0]))
+        self.slopes = torch.zeros(self.config.tone_atoms, PIECES)
+
+    @torch.no_grad()
+    def start_forward(self) -> None:
+        """The curves are those of the reverse pass from now on."""
+        self.dictionary.curves.copy_(self._bent())
+        self.slopes = None
+
+    def parameters_of(self, forward: bool) -> dict[str, Tensor]:
+        return {} if forward or self.slopes is None else {f"{self.name}.slopes": self.slopes}
+
+    def _bent(self) -> Tensor:
+        """The curves under the slopes of a fit."""
+        if self.slopes is None:
+            return self.dictionary.curves
+        rises = self.dictionary.curves.diff(dim=1) * self.slopes.exp().repeat_interleave((NODES - 1) // PIECES, dim=1)
+        heights = torch.nn.functional.pad(rises.cumsum(dim=1), (1, 0))
+        return heights / heights[:, -1:]
+
+    def _curves(self, batch: int, params: ISPParams | None) -> Tensor:
+        """One curve a picture; the typical one where none is chosen."""
+        weights = self.dictionary.typical[None]
+        if params is not None and params.tone_weights.shape[1]:
+            weights = params.tone_weights.to(weights)
+        weights = weights.expand(batch, -1)
+        return self.dictionary.combine(weights) if self.slopes is None else weights @ self._bent()

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rawaug.isp.camera_sampling import plausible
-from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
+from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import (
     CameraDictionary,
@@ -26,9 +25,9 @@ from rawaug.isp.dictionary import (
     extreme_points,
     greedy_atoms,
     nearest_in_hull,
+    plausible,
     psnr,
 )
-from rawaug.isp.light import sample_lights
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS, tone_names, tone_tables
 from rawaug.registry import spelled
@@ -40,7 +39,7 @@ LIGHTS = 4000
 """Draws of camera and light that the gain atoms are chosen for: of 400, the corners of the hull are too few."""
 DECIBEL = 45.0
 """A point this near to a hull is held by it."""
-STAGES = ("curve", "colour", "gains")
+TONE_AND_CAMERAS = ("curve", "colour", "gains")
 
 
 class Choice(NamedTuple):
@@ -69,7 +68,7 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
         ISPConfig(
             colour_atoms=len(colour.atoms),
             gain_atoms=len(gain.atoms),
-            stages=STAGES,
+            stages=TONE_AND_CAMERAS,
             tone_atoms=len(tone.atoms),
             cameras=len(distinct),
         )

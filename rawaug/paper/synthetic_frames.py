@@ -1,8 +1,8 @@
 r"""Frames of several published cameras in many lights: photographs as scenes before the demo camera's lens and sensor.
 
 A frame's colour is ``C = colour_matrix(M)`` and ``wb(M, L)`` of :mod:`rawaug.isp.cameras` for a camera's published
-matrix M and a light L drawn by :func:`rawaug.isp.light.sample_lights`; blur, shading, exposure, converter and rendering
-are those of :class:`rawaug.data.DemoCamera`, which shares no code with the ISPs that are fitted to its frames.
+matrix M and a light L drawn as there; blur, shading, exposure, converter and rendering are those of
+:class:`rawaug.data.DemoCamera`, which shares no code with the ISPs that are fitted to its frames.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data import DemoCamera, Pair
 from rawaug.data.demo.pairs import FRAME
-from rawaug.isp.camera_sampling import plausible
-from rawaug.isp.cameras import colour_matrix, published_cameras, white_balance
-from rawaug.isp.light import sample_lights
+from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
+from rawaug.isp.dictionary import plausible
 from rawaug.seeding import keyed_generator
 
 LIGHTS_TRIED = 32

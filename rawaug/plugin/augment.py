@@ -1,7 +1,7 @@
 r"""Online augmentation: sRGB pictures to noisy/clean RAW pairs.
 
 ``y = isp^-1(x; C, g, T)`` with the camera setting (matrix, gains, tone curve) drawn from the hulls of the dictionaries'
-atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.camera_sampling`), then
+atoms, or of an ISP of published cameras as one camera in one light (:mod:`rawaug.isp.dictionary`), then
 ``noisy ~ N(y, shot_var y + read_var)``, clipped at white, never at black (Conde et al., AAAI 2022, "Dictionary
 Augmentations").
 
@@ -24,10 +24,9 @@ from torch.utils.data import get_worker_info
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.camera_sampling import EXPOSURE
 from rawaug.isp.config import ISPParams
-from rawaug.isp.dictionary import perturb
-from rawaug.isp.fast import reverse_pass
+from rawaug.isp.dictionary import EXPOSURE, perturb
+from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.runtime import eager
@@ -64,7 +63,7 @@ class RawAugment(nn.Module):
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
             like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
         light: of an ISP of published cameras, the light that cameras are drawn in: a colour temperature in kelvin, or
-            one of :data:`rawaug.isp.light.LAMPS` by name. Any light by default.
+            one of :data:`rawaug.isp.cameras.LAMPS` by name. Any light by default.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
     Raises:
@@ -98,7 +97,7 @@ class RawAugment(nn.Module):
             isp, self.pattern = deepcopy(isp), None
             isp.configure(cfa=str(cfa))
         self.isp = frozen(isp)
-        self.baked = frozen(reverse_pass(isp))
+        self.baked = frozen(BakedISP(isp))
         self.register_load_state_dict_pre_hook(_drop_isp)
         self._draw(noise, sampling, strength, seed, exposure, light, tone)
 

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
-from rawaug.isp.stages import stage_class
-from rawaug.registry import require_between
+from rawaug.registry import STAGES, require_between
 
 MOST = 2**31
 """Of steps and pixels."""
@@ -143,5 +142,5 @@ class FitConfig:
             raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
         if self.curve_steps is not None and self.curve_steps < 0:
             raise ValueError(f"curve_steps must be at least 0, got {self.curve_steps}")
-        if not any(stage_class(name).makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
+        if not any(STAGES[name].makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")

@@ -13,7 +13,6 @@ from rawaug.bayer import pack_rgb
 from rawaug.cli import main
 from rawaug.commands.export import ReversePass, export_isp, session_of
 from rawaug.commands.info import as_json
-from rawaug.isp.description import typical_setting
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 
@@ -30,7 +29,7 @@ def centred(isp: DictionaryISP, srgb: torch.Tensor, white_balance: tuple[float, 
     mean = torch.zeros(2) if shading is None else shading.mask.mean
     place = mean[None, :, None, None].expand(1, 2, *srgb.shape[-2:])
     with torch.no_grad():
-        return isp.reverse_pixels(srgb, typical_setting(isp, white_balance), place)
+        return isp.reverse_pixels(srgb, isp.typical_setting(white_balance), place)
 
 
 def test_the_cube_interpolates_the_reverse_pass(isp: DictionaryISP, tmp_path: Path) -> None:
@@ -68,7 +67,7 @@ def test_onnx_gives_pytorch_s_numbers_at_any_size(isp: DictionaryISP, tmp_path: 
     for name in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(name, reason="pip install rawaug[export]")
     (path,) = export_isp(isp, tmp_path / "camera.onnx")
-    session, setting = session_of(path), typical_setting(isp, (1.7, 1.0, 2.1))
+    session, setting = session_of(path), isp.typical_setting((1.7, 1.0, 2.1))
     for height, width in ((64, 32), (30, 46)):
         srgb = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(0))
         inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
@@ -80,7 +79,7 @@ def test_onnx_gives_pytorch_s_numbers_at_any_size(isp: DictionaryISP, tmp_path: 
 
 def test_the_traced_pass_is_the_reverse_pass(isp: DictionaryISP) -> None:
     """What ONNX holds, without ONNX: the lens shading's coordinates among it."""
-    srgb, setting = torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0)), typical_setting(isp)
+    srgb, setting = torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0)), isp.typical_setting()
     with torch.no_grad():
         expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
         torch.testing.assert_close(

@@ -6,8 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.isp.cameras import colour_matrix, published_cameras, responses, white_balance
-from rawaug.isp.light import D65, planckian, white_point
+from rawaug.isp.cameras import (
+    D65,
+    LAMPS,
+    Array,
+    colour_matrix,
+    daylight,
+    off_locus,
+    planckian,
+    published_cameras,
+    responses,
+    sample_lights,
+    white_balance,
+    white_point,
+)
 
 
 def test_white_stays_white_and_the_gains_make_its_raw_grey() -> None:
@@ -50,3 +62,69 @@ def test_names_are_found_whatever_their_case_and_similar_ones_suggested() -> Non
     assert cameras.named(["Nikon D750", "Sony ILCE-7M3"]).shape == (2, 3, 3)
     with pytest.raises(ValueError, match=r"'Nikon D705' is not listed; similar: .*Nikon D70"):
         cameras.named(["Nikon D705"])
+
+
+def kelvin(*values: float) -> Array:
+    return np.array(values)
+
+
+def uv(xy: Array) -> Array:
+    return np.stack([4 * xy[..., 0], 6 * xy[..., 1]], -1) / (-2 * xy[..., 0] + 12 * xy[..., 1] + 3)[..., None]
+
+
+def mccamy(xy: Array) -> Array:
+    """Colour temperature of a chromaticity (McCamy 1992): independent of the loci here."""
+    n = (xy[:, 0] - 0.3320) / (xy[:, 1] - 0.1858)
+    return -449 * n**3 + 3525 * n**2 - 6823.3 * n + 5520.33
+
+
+def test_the_loci_pass_through_the_cie_illuminants() -> None:
+    np.testing.assert_allclose(planckian(kelvin(2855.5)), kelvin(0.44758, 0.40745)[None], atol=5e-4, rtol=0)
+    np.testing.assert_allclose(daylight(kelvin(6504.0)), kelvin(*D65)[None], atol=2e-4, rtol=0)
+    np.testing.assert_allclose(daylight(kelvin(5003.0)), kelvin(0.34567, 0.35850)[None], atol=2e-4, rtol=0)
+    np.testing.assert_allclose(daylight(kelvin(7504.0)), kelvin(0.29902, 0.31485)[None], atol=2e-4, rtol=0)
+
+
+def test_colour_temperature_agrees_with_mccamy() -> None:
+    t = kelvin(3000, 4000, 5000, 6500, 8000)
+    np.testing.assert_allclose(mccamy(planckian(t)), t, rtol=0.01, atol=0)
+    np.testing.assert_allclose(mccamy(daylight(t[1:])), t[1:], rtol=0.01, atol=0)
+
+
+def test_a_step_off_the_locus_has_its_length_and_is_greener_when_positive() -> None:
+    t, duv = kelvin(2500, 4000, 8000), kelvin(0.005, 0.005, 0.005)
+    on = planckian(t)
+    off = off_locus(on, t, duv)
+    np.testing.assert_allclose(np.linalg.norm(uv(off) - uv(on), axis=1), duv, rtol=1e-6, atol=0)
+    assert (off[:, 1] > on[:, 1]).all()
+    np.testing.assert_allclose(mccamy(off), t, rtol=0.03, atol=0)
+
+
+def test_tabulated_lamps_are_whites() -> None:
+    xy = kelvin(*[value for pair in LAMPS.values() for value in pair]).reshape(-1, 2)
+    t = mccamy(xy)
+    assert len(LAMPS) == 21 and t.min() > 2600 and t.max() < 6700
+    assert np.linalg.norm(uv(xy) - uv(planckian(t)), axis=1).max() < 0.012
+
+
+def test_draws_are_uniform_in_mired_within_the_limits() -> None:
+    white = sample_lights(20_000, torch.Generator().manual_seed(0), (2500.0, 8000.0), lamps=0.0)
+    xy = white[:, :2] / white.sum(axis=1, keepdims=True)
+    mired = 1e6 / mccamy(xy)
+    assert abs(np.median(mired) - 0.5 * (1e6 / 2500 + 1e6 / 8000)) < 8
+    assert (white[:, 1] == 1).all()
+
+
+def test_both_loci_and_lamps_are_drawn() -> None:
+    generator = torch.Generator().manual_seed(1)
+    at_6500 = sample_lights(4000, generator, (6500.0, 6500.0), lamps=0.0)
+    above = at_6500[:, 2] - white_point(planckian(kelvin(6500.0)))[0, 2].item()
+    below = at_6500[:, 2] - white_point(D65)[2].item()
+    assert (abs(above) < abs(below)).mean() == pytest.approx(0.5, abs=0.1)
+    warm = sample_lights(4000, generator, (2000.0, 2000.0), lamps=0.25)
+    assert (warm[:, 2] > 0.24).mean() == pytest.approx(0.25, abs=0.03)  # no 2000 K light is so blue
+
+
+def test_a_temperature_out_of_range_is_refused() -> None:
+    with pytest.raises(ValueError, match="kelvin must be 1000 to 15000"):
+        sample_lights(1, torch.Generator(), (500.0, 8000.0))

@@ -7,9 +7,9 @@ import torch
 
 from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
-from rawaug.isp.fast import BakedISP, UnbakedISP, reverse_pass
+from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import LensShading, ToneMap, place_in_frame
+from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
 from rawaug.metrics import psnr
 
@@ -41,7 +41,7 @@ def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
     isp = curved_isp(attention=attention)
     generator = torch.Generator().manual_seed(1)
     srgb = torch.randint(256, (4, 3, 48, 64), generator=generator, dtype=torch.uint8)
-    params = isp.choose(srgb)
+    params = isp.choose(srgb) if attention else isp.reverse(srgb, digital_gain=0.6).params  # some gains below 1
     unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
     assert psnr(BakedISP(isp)(srgb, params), unbaked).min().item() > 75.0
 
@@ -131,24 +131,6 @@ def test_bytes_and_floats_agree() -> None:
     torch.testing.assert_close(baked(srgb, params), baked(srgb / 255.0, params), atol=1e-6, rtol=1e-5)
 
 
-ODD_ORDER = ("gamma", "shading", "gains", "colour")
-
-
-def test_another_order_of_stages_is_not_baked() -> None:
-    isp = DictionaryISP(ISPConfig(stages=ODD_ORDER))
-    with pytest.raises(ValueError, match="usual order"):
-        BakedISP(isp)
-    assert isinstance(reverse_pass(isp), UnbakedISP)
-    assert isinstance(reverse_pass(DictionaryISP(ISPConfig(stages=["tone", "gains"]))), BakedISP)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("view", list(bayer.View))
-def test_unbaked_is_the_isp_wherever_the_crop_is(view: bayer.View) -> None:
-    isp = curved_isp(stages=ODD_ORDER)
-    frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(2))
-    crop = bayer.turn(frame[..., 6:26, 34:54], view).contiguous()
-    params = isp.choose(frame)
-    place = bayer.turn(place_in_frame(20, 20, (6, 34), (40, 60)), view)
-    expected = bayer.pack(isp.reverse(crop, params, place=place).raw, isp.cfa)
-    raw = reverse_pass(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
-    torch.testing.assert_close(raw, expected, atol=1e-6, rtol=1e-5)
+def test_stages_in_another_order_are_refused() -> None:
+    with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
+        BakedISP(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))

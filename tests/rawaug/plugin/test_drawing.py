@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.isp.cameras import published_cameras, white_balance
-from rawaug.isp.light import LAMPS, light_range, sample_lights, white_point
+from rawaug.isp.cameras import LAMPS, light_range, published_cameras, sample_lights, white_balance, white_point
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.sampling_config import Drawing
