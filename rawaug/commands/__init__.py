@@ -1,1 +1,32 @@
 """What the subcommands of ``rawaug`` do, one file a command."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cyclopts import Parameter, Token
+
+from rawaug.files import yaml_value
+
+OPTIONS = Parameter(name="*")
+"""The fields of a dataclass as options of their own."""
+
+
+def value_of(text: str) -> Any:
+    """What a word of the command line means: YAML, but ``demo:`` is a name and no mapping.
+
+    Example:
+        >>> [value_of(text) for text in ("1e-4", "null", "demo:", "{width: 4}")]
+        [0.0001, None, 'demo:', {'width': 4}]
+    """
+    value = yaml_value(text)
+    return text if isinstance(value, dict) and not text.lstrip().startswith("{") else value
+
+
+def _converted(_: Any, tokens: Sequence[Token]) -> Any:
+    return value_of(tokens[0].value)
+
+
+YAML = Parameter(converter=_converted, n_tokens=1, json_list=False)
+"""One argument of several forms: a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""

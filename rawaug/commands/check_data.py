@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from rawaug.commands import OPTIONS
 from rawaug.data import check
 from rawaug.data.pair_folder import PairSettings
-from rawaug.registry import COMMANDS
 
 
-@COMMANDS.register("data check")
-def run(path: str, *, first: int | None = None, settings: PairSettings) -> None:
-    """Identify the dataset, count items, sizes, CFAs and levels, and list damaged files.
+def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSettings, OPTIONS] | None = None) -> None:
+    """Identify a dataset, count its files and list damaged ones.
 
     Args:
         path: a folder, a RAW file, a submission to SIDD, or pairs:PATH.
@@ -19,7 +20,7 @@ def run(path: str, *, first: int | None = None, settings: PairSettings) -> None:
     Raises:
         ValueError: if a file is damaged.
     """
-    report = check(path, first, **vars(settings))
+    report = check(path, first, **vars(settings or PairSettings()))
     print(report)
     if report.broken:
         raise ValueError(f"{path}: {len(report.broken)} damaged, listed above")

@@ -16,12 +16,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 from torch import Tensor
 
 from denoisers.files import DEFAULT
 from rawaug import bayer
+from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import (
     FrameDenoiser,
     NetworkDenoiser,
@@ -39,26 +40,26 @@ from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.apart import apart
 from rawaug.io.raw import develop
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS
+from rawaug.registry import Spec
 
 _NO_NOISE = (0.0, 0.0)
 
 
-@COMMANDS.register("denoise")
 def run(
     source: str,
     out: str,
+    /,
     *,
     denoiser: str | None = None,
-    classical: str | dict[str, Any] | None = None,
-    noise: tuple[float, float] | str = "auto",
+    classical: Annotated[Spec | None, YAML] = None,
+    noise: Annotated[tuple[float, float] | str, YAML] = "auto",
     strength: float = 1.0,
     self_ensemble: bool = False,
     device: str = "auto",
     preview: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Denoise a RAW file, or a folder of them, to DNG; existing results in a folder are skipped.
+    """Denoise a RAW file, or a folder of them, to DNG.
 
     Args:
         source: a RAW file, or a folder of them.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -12,6 +12,7 @@ import denoisers
 from denoisers.files import FOLDER
 from rawaug._version import __version__
 from rawaug.bayer import CFA
+from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
@@ -37,25 +38,25 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS, ESTIMATORS, Spec
+from rawaug.registry import ESTIMATORS, Spec
 
 
-@COMMANDS.register("evaluate")
 def run(
     weights: str,
+    /,
     *,
     data: str,
     self_ensemble: bool = False,
     views: Literal[4, 8] | None = None,
-    noise: tuple[float, float] | str | dict[str, Any] | None = None,
+    noise: Annotated[NoiseSpec | None, YAML] = None,
     seed: int = 0,
-    classical: list[str | dict[str, Any]] | None = None,
+    classical: Annotated[list[Spec] | None, YAML] = None,
     device: str = "cpu",
     report: str | None = None,
     json: str | None = None,
-    settings: PairSettings,
+    settings: Annotated[PairSettings, OPTIONS] | None = None,
 ) -> None:
-    """PSNR and SSIM of an ISP or a denoiser.
+    """Measure PSNR and SSIM of a denoiser or an ISP.
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
@@ -79,7 +80,7 @@ def run(
 
     if json:
         require_writable(json)
-    more = {"first": written, **vars(settings)}
+    more = {"first": written, **vars(settings or PairSettings())}
     result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **more)
     written(result)
     if report:

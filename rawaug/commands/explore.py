@@ -8,12 +8,10 @@ from pathlib import Path
 from rawaug.data.demo.pairs import demo_files
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.explore.page import address, build, listening, server_of
-from rawaug.registry import COMMANDS
 
 
-@COMMANDS.register("explore")
-def run(pictures: str | None = None, *, host: str = "127.0.0.1", port: int = 7860) -> None:
-    """Show in a browser what pictures become as RAW: stages, noise, draws; needs rawaug[explore].
+def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 7860) -> None:
+    """Show pictures as RAW of any camera, on a page in the browser.
 
     Args:
         pictures: a picture, or a folder of them; built-in ones by default.

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +34,7 @@ import denoisers
 from denoisers.files import FOLDER, find
 from rawaug import bayer
 from rawaug.bayer import CFA, pack_rgb
+from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import find_weights, read_header, replacing
@@ -41,7 +42,6 @@ from rawaug.io import read_raw
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 TOLERANCE = 1e-4
@@ -231,11 +231,15 @@ class Exported(NamedTuple):
     seconds_torch: float
 
 
-@COMMANDS.register("export")
 def run(
-    weights: str, out: str, *, frame: str | None = None, white_balance: tuple[float, float, float] | None = None
+    weights: str,
+    out: str,
+    /,
+    *,
+    frame: str | None = None,
+    white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
 ) -> None:
-    """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX; ONNX is compared with PyTorch.
+    """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.
 
     Args:
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.

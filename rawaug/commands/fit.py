@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from torch import Tensor
 
 from rawaug.bayer import CFA, aligned
+from rawaug.commands import OPTIONS
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Readable, left_out
 from rawaug.data.pair_folder import MosaicSettings
@@ -40,7 +41,6 @@ from rawaug.noise import (
     from_dark_frames,
     plot_noise,
 )
-from rawaug.registry import COMMANDS
 
 WORST_FIT = 0.5
 """R^2 below which the points do not follow a line."""
@@ -164,19 +164,19 @@ def _aligned(frames: Sequence[Frame]) -> tuple[list[Tensor], CFA]:
 WATCHED_PATCHES = 4
 
 
-@COMMANDS.register("fit")
 def run(
     data: list[str],
+    /,
     *,
     camera_jpeg: bool = True,
     held_out: str | None = None,
     out: str,
     noise: Literal["auto", "on", "off"] = "auto",
     dark: str | None = None,
-    mosaics: MosaicSettings,
-    config: FitConfig,
+    mosaics: Annotated[MosaicSettings, OPTIONS] | None = None,
+    config: Annotated[FitConfig, OPTIONS] | None = None,
 ) -> None:
-    """Fit a dictionary ISP to RAW files, with the camera's JPEGs of the same stems if present.
+    """Fit a dictionary ISP to RAW files of a camera.
 
     Args:
         data: RAW files, folders of them, or one kind:path.
@@ -203,8 +203,8 @@ def run(
             held_out=held_out,
             noise=noise,
             dark=dark,
-            **vars(mosaics),
-            **vars(config),
+            **vars(mosaics or MosaicSettings()),
+            **vars(config or FitConfig()),
         )
         isp.info["data"] = data
         isp.save(out)

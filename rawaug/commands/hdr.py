@@ -8,29 +8,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from torch import Tensor
 
+from rawaug.commands import YAML
 from rawaug.files import require_writable
 from rawaug.io import read_picture, write_picture
 from rawaug.io.pictures import MAX_PIXELS, read_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
-from rawaug.registry import COMMANDS
 
 
-@COMMANDS.register("hdr")
 def run(
     pictures: list[str],
+    /,
     *,
     out: str,
-    ev: list[float] | None = None,
+    ev: Annotated[list[float] | None, YAML] = None,
     exposure: float = 0.0,
     isp: str = "universal",
     overwrite: bool = False,
     max_pixels: int = MAX_PIXELS,
 ) -> None:
-    """Merge exposures of a scene in RAW, or change the exposure of one picture there.
+    """Merge exposures of a scene in RAW, or change the exposure of a single picture.
 
     Args:
         pictures: sRGB pictures of one scene, aligned and of one size; or a single one.

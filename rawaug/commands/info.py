@@ -11,11 +11,9 @@ from denoisers.files import FOLDER
 from rawaug._version import __version__
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.model import DictionaryISP
-from rawaug.registry import COMMANDS
 
 
-@COMMANDS.register("info")
-def run(weights: str, *, json: bool = False) -> None:
+def run(weights: str, /, *, json: bool = False) -> None:
     """Describe a weights file.
 
     Args:

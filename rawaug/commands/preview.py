@@ -24,16 +24,15 @@ from rawaug.isp.tone import STEPS
 from rawaug.patterns import pattern
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
-from rawaug.registry import COMMANDS
 from rawaug.seeding import keyed_generator
 
 _MAXIMUM = 768
 """Largest side of a previewed picture: larger ones are cropped at the centre."""
 
 
-@COMMANDS.register("preview")
 def run(
     picture: str,
+    /,
     *,
     out: str,
     isp: str = "universal",
@@ -42,7 +41,7 @@ def run(
     cfa: str | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> None:
-    """Plot the stages and augmented RAWs of a picture, and the atoms of the dictionaries.
+    """Draw a picture at every stage of an ISP, and as augmented RAW.
 
     Args:
         picture: an sRGB picture.

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
+from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
 from rawaug.data import (
     Dnd,
@@ -27,7 +28,7 @@ from rawaug.data.sidd.blocks import BLOCKS, NoisyBlock
 from rawaug.files import require_writable
 from rawaug.noise import estimate_noise
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS
+from rawaug.registry import Spec
 
 _UNUSED = (0.0, 0.0)
 
@@ -39,17 +40,17 @@ class Block(NamedTuple):
     cfa: CFA
 
 
-@COMMANDS.register("submit")
 def run(
     benchmark: str,
     out: str,
+    /,
     *,
     denoiser: str | None = None,
-    classical: str | dict[str, Any] | None = None,
+    classical: Annotated[Spec | None, YAML] = None,
     self_ensemble: bool = False,
     device: str = "auto",
 ) -> None:
-    """Denoise the benchmark blocks of SIDD or DND and write the file to submit.
+    """Denoise the noisy blocks of a benchmark, in the form that its server takes.
 
     Args:
         benchmark: sidd:PATH with BenchmarkNoisyBlocksRaw.mat, or dnd:PATH with info.mat.

@@ -18,12 +18,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.commands import pair_shards
+from rawaug.commands import OPTIONS, pair_shards, value_of
 from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
@@ -36,26 +36,25 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
 from rawaug.plugin.sampling_config import Drawing
 from rawaug.progress import progress
-from rawaug.registry import COMMANDS
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "replay_sample", "synth"]
 
 
-@COMMANDS.register("synth")
 def run(
     pictures: str,
     out: str,
+    /,
     *,
     format: Format = "dng",
     per_image: int = 1,
-    drawing: Drawing,
+    drawing: Annotated[Drawing, OPTIONS] | None = None,
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,
     shard: str = "1/1",
     per_shard: int = PER_SHARD,
 ) -> None:
-    """Write RAW pairs made from a folder of sRGB pictures; resumable.
+    """Write noisy and clean RAW pairs made from sRGB pictures.
 
     Args:
         pictures: folder of sRGB pictures, or one picture.
@@ -70,7 +69,9 @@ def run(
         per_shard: pictures per tar file, with --format webdataset.
     """
     rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
-    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **vars(drawing)))
+    drawn = vars(drawing or Drawing())
+    noise = value_of(drawn["noise"]) if isinstance(drawn["noise"], str) else drawn["noise"]  # [shot_var, read_var]
+    print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **drawn | {"noise": noise}))
 
 
 @dataclass

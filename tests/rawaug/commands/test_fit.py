@@ -151,10 +151,10 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
     assert read_picture(tmp_path / "shots" / "a.jpg").shape == rendering.shape
     seen, scores = shoot("seen.dng", 128), []
     with_jpeg = fit(tmp_path / "x.safetensors", raw)
-    without = fit(tmp_path / "x.safetensors", raw, "--camera-jpeg", "false")
+    without = fit(tmp_path / "x.safetensors", raw, "--no-camera-jpeg")
     assert same(without, plain) and not same(with_jpeg, plain)
-    for jpeg in ("true", "false"):
-        scores.append(fit(tmp_path / "x.safetensors", seen, "--held-out", raw, "--camera-jpeg", jpeg).info["held_out"])
+    for jpeg in ("--camera-jpeg", "--no-camera-jpeg"):
+        scores.append(fit(tmp_path / "x.safetensors", seen, "--held-out", raw, jpeg).info["held_out"])
     assert scores[0] != scores[1]
     assert same(rawaug.fit(raw, False, "off", camera_jpeg=False, **SETTINGS), plain)
 
