@@ -8,10 +8,8 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
-from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 from benchmarks.commands import run_all
 
@@ -67,36 +65,21 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 def _set_up(path: Path) -> None:
     """A recipe as the command line sets it up, its networks without their memory."""
     import torch
-    from jsonargparse import ArgumentError
 
-    from rawaug.commands.spelling import require_known_keys
+    from rawaug.commands.run import with_values
     from rawaug.experiment.kinds import settings_of
-    from rawaug.experiment.recipe import Recipe, kind_of, read_recipe, require_values
+    from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
     from rawaug.training.state import first_network
 
+    content = read_recipe(path)
+    recipe = with_values(settings_of(kind_of(content, path)), content, path)
     try:
-        content = read_recipe(path)
-        kind = settings_of(kind_of(content, path))
-        parser, run = _run_parser(kind_of(content, path))
-        require_known_keys(path, content, run)
-        require_values(kind, content)
-        settings = vars(parser.instantiate(parser.parse_args(["run", "--recipe", str(path)])).run)
-        recipe = kind(**{key: settings[key] for key in kind.__dataclass_fields__})
         if isinstance(recipe, Recipe):
             with torch.device("meta"):
                 for arm in recipe.arms:
                     first_network(recipe.network_of(arm), seed=0)
-    except (ArgumentError, ValueError, FileNotFoundError) as error:  # the command line has named the file already
+    except (ValueError, FileNotFoundError) as error:  # the command line has named the file already
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-
-
-@cache
-def _run_parser(kind: str) -> tuple[Any, Any]:
-    """The parser and that of ``run``, built once: it takes longer than to read a recipe."""
-    from rawaug.cli import _parser
-
-    parser, parsers = _parser(kind, ["run"])
-    return parser, parsers["run"]
 
 
 def attempt(kind: str, path: Path) -> tuple[str, str]:

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rawaug.commands import value_of
-from rawaug.experiment.kinds import dry_run as rehearse
+from rawaug.experiment import kinds
 from rawaug.experiment.kinds import settings_of
 from rawaug.experiment.plan import with_own_pairs
 from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
@@ -62,7 +62,7 @@ def run(
     if isinstance(settings, Recipe):
         settings = with_own_pairs(settings, content, {key.replace("-", "_") for key, _ in given})
     if dry_run:
-        rehearse(kind, settings, overwrite)
+        kinds.dry_run(kind, settings, overwrite)
     else:
         EXPERIMENTS[kind](settings, overwrite)
 

@@ -1,15 +1,16 @@
-"""Recipes: one dataclass per part, every key explained; read from YAML by jsonargparse, an unknown key is an error."""
+"""Recipes: one dataclass per part, every key explained; the types decide what a value may be, see rawaug run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
+from rawaug.files import yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, name_and_settings, nearest, require_between
@@ -279,7 +280,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
         text = Path(file).read_text(encoding="utf-8")
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
             raise ValueError("uses aliases (*name); write the values out")  # a few lines of them are billions of values
-        content = yaml.safe_load(text) or {}
+        content = yaml_value(text) or {}
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not a recipe ({' '.join(str(error).split())})") from None
     if not isinstance(content, dict):
@@ -299,39 +300,6 @@ def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
     return kind
 
 
-def require_values(settings: type[Any], content: Mapping[str, Any], above: str = "") -> None:
-    """Refuse null where a value belongs, by the types of a dataclass, of those in it, and of those by name in it.
-
-    Args:
-        settings: the dataclass.
-        content: its keys, or some of them, as read; keys that it lacks are left to others.
-        above: of the keys in messages.
-
-    Raises:
-        ValueError: naming the key.
-
-    Example:
-        >>> require_values(Recipe, {"train": {"ema": None}})
-        Traceback (most recent call last):
-        ValueError: train.ema must have a value, got null; leave the key out for the default
-    """
-    hints = get_type_hints(settings)
-    for key in content.keys() & hints.keys():
-        value, inside = content[key], [hints[key], *get_args(hints[key])]
-        if value is None and type(None) not in inside and hints[key] is not Any:
-            raise ValueError(f"{above}{key} must have a value, got null; leave the key out for the default")
-        part = next((hint for hint in inside if isinstance(hint, type) and is_dataclass(hint)), None)
-        if part is None or not isinstance(value, Mapping):
-            continue
-        named = value if get_origin(hints[key]) is dict else {"": value}
-        for name, one in named.items():
-            where = ".".join(filter(None, [f"{above}{key}", name]))
-            if one is None:
-                raise ValueError(f"{where} must have keys below it, got null")
-            if isinstance(one, Mapping):
-                require_values(part, one, f"{where}.")
-
-
 def shipped_recipes() -> dict[str, Path]:
     """The recipes that travel with the package, by name."""
     shipped = Path(str(resources.files("rawaug"))) / "recipes"
@@ -349,21 +317,6 @@ def recipe_list() -> str:
 def _listed() -> list[tuple[str, Path]]:
     """Those at the top first."""
     return sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))
-
-
-def defaults_of(file: str | Path, settings: type[Any]) -> dict[str, Any]:
-    """What a recipe's file sets, by the keys of the command line such as ``data.count``; arms are one key.
-
-    Args:
-        file: whose keys are known.
-        settings: the dataclass of its kind.
-    """
-    found: dict[str, Any] = {}
-    hints = get_type_hints(settings)
-    for key, value in read_recipe(file).items():
-        parts = {f"{key}.{name}": part for name, part in (value or {}).items()} if is_dataclass(hints[key]) else None
-        found |= {key: value} if parts is None else parts
-    return found
 
 
 def find_recipe(name: str) -> Path:

@@ -112,7 +112,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("fit demo:train --out x.safetensors --learning-rat 1", "Did you mean --learning-rate?"),
         (
             "fit demo:train --out x.safetensors --pixels many",
-            'Invalid value for --pixels: unable',
+            "Invalid value for --pixels: unable",
         ),
         ("fit demo:train --out x.safetensors --tone curves", 'Invalid value "curves" for --tone'),
         ("fit demo:train", "--out"),

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from rawaug.cli import main
+from rawaug.commands.run import with_values
 from rawaug.experiment import kinds
 from rawaug.experiment.kinds import settings_of
-from rawaug.experiment.recipe import ArmConfig, find_recipe, kind_of, read_recipe, require_values
+from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
@@ -150,11 +151,12 @@ def test_null_or_a_setting_that_nobody_means_is_named(
     assert re.search(named, text)
 
 
-def test_null_is_refused_by_the_types_alone() -> None:
+def test_null_is_taken_where_the_types_have_it() -> None:
+    content = {"camera": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
+    recipe = with_values(settings_of("training"), content, "mine")
+    assert recipe.steps is None and recipe.network_of("real") == recipe.denoiser
     for key in ("data", "isp", "train", "arms", "device", "seed", "out", "views", "noise"):
-        with pytest.raises(ValueError, match=f"^{key} must have a value, got null"):
-            require_values(settings_of("training"), {key: None})
-    require_values(settings_of("training"), {"camera": None, "steps": None, "arms": {"real": {"denoiser": None}}})
-    with pytest.raises(ValueError, match=r"^arms\.real\.denoiser\.name must have a value"):
-        require_values(settings_of("training"), {"arms": {"real": {"denoiser": {"name": None}}}})
-    require_values(settings_of("training"), {"arms": {"real": ArmConfig()}})
+        with pytest.raises(ValueError, match=f"^mine: {key}: .* got None"):
+            with_values(settings_of("training"), {key: None}, "mine")
+    with pytest.raises(ValueError, match=r"^mine: arms\.real\.denoiser\.name: .* got None"):
+        with_values(settings_of("training"), {"arms": {"real": {"denoiser": {"name": None}}}}, "mine")
