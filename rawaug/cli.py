@@ -11,6 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import entry_points
 from typing import Annotated, Literal
 
@@ -54,7 +55,8 @@ data.command(
 )
 for _name, _summary in COMMANDS.items():
     app.command(f"rawaug.commands.{_name}:run", name=_name, help=_summary)
-for _point in entry_points(group="rawaug.commands"):
+_PLUGINS = entry_points(group="rawaug.commands")
+for _point in _PLUGINS:
     app.command(_point.value, name=_point.name)
 
 
@@ -87,6 +89,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     if words[:1] and words[0] in WHOLE_FRAMES:
         os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # before PyTorch first takes memory
+    if not words or words[0] in ("-h", "--help"):
+        for point in _PLUGINS:  # those alone are imported for the first lines of their docstrings
+            with suppress(ImportError, AttributeError):
+                app[point.name]
     if words[:1] == ["run"] and {"-h", "--help"} & set(words[2:]):  # of a recipe: its keys
         words = [*words[:2], "--keys"]
     try:

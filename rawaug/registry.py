@@ -1,4 +1,4 @@
-"""What one file adds: networks, filters, noise, datasets, estimators, losses, baselines and commands, by name.
+"""What one file adds: networks, filters, noise, datasets, estimators, losses and baselines, by name.
 
 A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name;
 so is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
@@ -256,8 +256,6 @@ STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
 """``run(settings, overwrite)``, named by a recipe's key ``experiment``; ``settings`` is a dataclass of its keys, whose
 method ``shortest()`` gives the settings with one step of everything."""
-COMMANDS = Registry("command", "rawaug.commands", "rawaug.commands")
-"""Functions behind ``rawaug NAME``: arguments and help are those of the signature and the docstring."""
 
 
 def spelled(name: str, known: Iterable[str]) -> str:
