@@ -12,35 +12,44 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from denoisers.classical import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
     from denoisers.cycleisp import CycleISPDenoiser
-    from denoisers.files import DENOISERS, build, from_pretrained, load, save
+    from denoisers.files import build, from_pretrained, load, save
     from denoisers.inference import SelfEnsemble, tiled
     from denoisers.network import Denoiser
     from denoisers.networks import DHDN, DnCNN, DRUNet, NAFNet, UNet
     from denoisers.pmrid import PMRID
+    from rawaug.registry import DENOISERS
 
-_MODULES = {
-    "BM3D": "denoisers.classical",
-    "DENOISERS": "denoisers.files",
-    "CycleISPDenoiser": "denoisers.cycleisp",
-    "DHDN": "denoisers.networks",
-    "DRUNet": "denoisers.networks",
-    "Denoiser": "denoisers.network",
-    "DnCNN": "denoisers.networks",
-    "NAFNet": "denoisers.networks",
-    "NonLocalMeans": "denoisers.classical",
-    "PMRID": "denoisers.pmrid",
-    "SelfEnsemble": "denoisers.inference",
-    "Stabilised": "denoisers.classical",
-    "TotalVariation": "denoisers.classical",
-    "UNet": "denoisers.networks",
-    "Wavelet": "denoisers.classical",
-    "build": "denoisers.files",
-    "from_pretrained": "denoisers.files",
-    "load": "denoisers.files",
-    "save": "denoisers.files",
-    "tiled": "denoisers.inference",
+_NAMES = {
+    "denoisers.classical": (
+        "BM3D",
+        "NonLocalMeans",
+        "Stabilised",
+        "TotalVariation",
+        "Wavelet",
+    ),
+    "denoisers.cycleisp": ("CycleISPDenoiser",),
+    "rawaug.registry": ("DENOISERS",),
+    "denoisers.files": (
+        "build",
+        "from_pretrained",
+        "load",
+        "save",
+    ),
+    "denoisers.inference": (
+        "SelfEnsemble",
+        "tiled",
+    ),
+    "denoisers.network": ("Denoiser",),
+    "denoisers.networks": (
+        "DHDN",
+        "DRUNet",
+        "DnCNN",
+        "NAFNet",
+        "UNet",
+    ),
+    "denoisers.pmrid": ("PMRID",),
 }
-"""Public name to the module that defines it."""
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "BM3D",

@@ -1,20 +1,8 @@
-r"""What classical denoisers of packed RAW have in common; each is a file of its own beside this one.
+"""Classical denoisers of packed RAW, and :class:`Stabilised`, which fits them to shot noise.
 
 Each is made for white Gaussian noise of one level, ``y = x + sigma n``, and is given ``y / sigma`` here, with
-``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal, so wrap the denoiser in
-:class:`denoisers.Stabilised` for shot noise; alone it works at the mean level.
-
-Domain: packed RAW, any scale, not clipped; the work is done on the CPU.
-
-Non-local means: the mean of pixels weighed by how alike their patches are (Buades et al., CVPR 2005).
-
-Translation-invariant wavelet shrinkage: thresholded transforms, averaged over shifts (Coifman and Donoho, 1995).
-
-Total variation: the ``x`` of least ``|x - y|^2 / 2 + w TV(x)`` (Chambolle, JMIV 2004).
-
-BM3D: alike blocks stacked and shrunk together in a 3-D transform (Dabov et al., TIP 2007).
-
-Shot noise made white, denoised, and made RAW again: ``T^-1(f(T y))`` (Makitalo and Foi, TIP 2013).
+``sigma = sqrt(mean variance)`` of the picture. RAW noise depends on the signal: wrapped in :class:`Stabilised`, the
+filter sees noise of one level everywhere; alone it works at the mean level. The work is done on the CPU.
 """
 
 from __future__ import annotations
@@ -29,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from denoisers.domains import levels_of
 from rawaug.registry import FILTERS
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
@@ -105,12 +94,11 @@ class Classical(ABC):
 
 @FILTERS.register("NonLocalMeans")
 class NonLocalMeans(Classical):
-    """Non-local means (scikit-image, fast mode): patches of 5 x 5 over all four planes, sought 6 pixels around."""
+    """Non-local means (Buades et al., CVPR 2005; scikit-image, fast mode): patches of 5 x 5, sought 6 pixels around."""
 
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
-        """See :meth:`Classical.denoise`."""
         denoise_nl_means = self.library("skimage.restoration").denoise_nl_means
         settings = {"patch_size": 5, "patch_distance": 6, "fast_mode": True, "channel_axis": -1}
         return denoise_nl_means(planes, h=0.8 * self.strength, sigma=1.0, **settings)
@@ -118,12 +106,11 @@ class NonLocalMeans(Classical):
 
 @FILTERS.register("Wavelet")
 class Wavelet(Classical):
-    """Translation-invariant Haar shrinkage (scikit-image, PyWavelets): hard threshold at 3 sigma, mean of 16 shifts."""
+    """Translation-invariant Haar shrinkage (Coifman and Donoho, 1995): hard threshold at 3 sigma, mean of 16 shifts."""
 
     needs = ("skimage", "pywt")
 
     def denoise(self, planes: Planes) -> Planes:
-        """See :meth:`Classical.denoise`."""
         denoise_wavelet = self.library("skimage.restoration").denoise_wavelet
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
@@ -146,12 +133,11 @@ class Wavelet(Classical):
 
 @FILTERS.register("TotalVariation")
 class TotalVariation(Classical):
-    """Total variation (scikit-image, Chambolle's projection), each plane by itself."""
+    """Total variation (Chambolle, JMIV 2004; scikit-image), each plane by itself."""
 
     needs = ("skimage",)
 
     def denoise(self, planes: Planes) -> Planes:
-        """See :meth:`Classical.denoise`."""
         denoise_tv_chambolle = self.library("skimage.restoration").denoise_tv_chambolle
         return denoise_tv_chambolle(planes, weight=0.4 * self.strength, channel_axis=-1)
 
@@ -162,9 +148,9 @@ _HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1
 
 @FILTERS.register("BM3D")
 class BM3D(Classical):
-    """BM3D (the ``bm3d`` wheel of its authors), blocks matched on the mean of the four planes.
+    """BM3D (Dabov et al., TIP 2007), blocks matched on the mean of the four planes.
 
-    The wheel is for non-commercial use only and therefore no requirement of this package: ``pip install bm3d``.
+    Its authors' wheel is for non-commercial use only and therefore no requirement: ``pip install 'rawaug[bm3d]'``.
     """
 
     smallest = 16
@@ -172,11 +158,6 @@ class BM3D(Classical):
     advice = "licensed for non-commercial use only; run: pip install 'rawaug[bm3d]'"
 
     def denoise(self, planes: Planes) -> Planes:
-        """See :meth:`Classical.denoise`.
-
-        Raises:
-            ImportError: if the wheel is not installed.
-        """
         bm3d = self.library("bm3d")
         # Blocks are matched on the first channel: let that be the luminance, whose noise is lowest.
         return bm3d.bm3d(planes @ _HADAMARD, sigma_psd=[self.strength] * 4) @ _HADAMARD
@@ -195,20 +176,18 @@ class Transform(Protocol):
 class Stabilised:
     """A denoiser of white noise on RAW with shot noise: ``inverse(denoiser(forward(noisy), 1))``.
 
+    Source: Makitalo and Foi, TIP 2013.
+
     Args:
         denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
         transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``: the generalised Anscombe
             transform with its exact unbiased inverse.
 
     Example:
-        >>> class Scale:
-        ...     def forward(self, y, shot_var, read_var):
-        ...         return y / read_var.sqrt().reshape(-1, 1, 1, 1)
-        ...     def inverse(self, z, shot_var, read_var):
-        ...         return z * read_var.sqrt().reshape(-1, 1, 1, 1)
         >>> from denoisers import TotalVariation
-        >>> denoiser = Stabilised(TotalVariation(), Scale())
-        >>> denoiser(torch.rand(1, 4, 16, 16), torch.full((1, 4, 16, 16), 1e-4)).shape
+        >>> from rawaug.noise import anscombe
+        >>> denoiser = Stabilised(TotalVariation(), anscombe)
+        >>> denoiser(torch.rand(1, 4, 16, 16), shot_var=1e-3, read_var=1e-5).shape
         torch.Size([1, 4, 16, 16])
     """
 
@@ -221,38 +200,34 @@ class Stabilised:
         noisy: Tensor,
         variance: Tensor | None = None,
         *,
-        shot_var: Tensor | None = None,
-        read_var: Tensor | None = None,
+        shot_var: float | Tensor | None = None,
+        read_var: float | Tensor | None = None,
     ) -> Tensor:
         """Denoise ``(B, 4, h, w)``.
 
         Args:
             noisy: packed RAW.
             variance: its map shot_var max(noisy, 0) + read_var, from which the two are derived if not given.
-            shot_var, read_var: ``(B,)``.
+            shot_var, read_var: numbers, or ``(B,)``; without shot noise nothing is transformed.
 
         Raises:
-            ValueError: if neither is given, the map is no such line, or the two are not one number a picture.
+            ValueError: if neither is given, or the map is no such line.
         """
         if shot_var is None or read_var is None:
-            shot_var, read_var = _levels(noisy, variance)
-        for name, value in (("shot_var", shot_var), ("read_var", read_var)):
-            if value.shape != noisy.shape[:1]:
-                raise ValueError(f"{name} must have shape ({len(noisy)},), one per picture, got {tuple(value.shape)}")
-        stable = self.transform.forward(noisy, shot_var, read_var)
-        return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot_var, read_var)
+            shot_var, read_var = _line(noisy, variance)
+        shot, read = (torch.as_tensor(level).to(noisy).expand(len(noisy)) for level in (shot_var, read_var))
+        if not (shot > 0).all():
+            map_ = shot.reshape(-1, 1, 1, 1) * noisy.clamp(min=0) + read.reshape(-1, 1, 1, 1)
+            return self.denoiser(noisy, map_)
+        stable = self.transform.forward(noisy, shot, read)
+        return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot, read)
 
 
-def _levels(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The line through a variance map, shot_var and read_var ``(B,)``, by least squares."""
+def _line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The levels of a map, each ``(B,)``, which must be a line in the signal."""
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
-    light, variance = noisy.clamp(min=0).double().flatten(1), variance.double().flatten(1)
-    mean, level = light.mean(1, keepdim=True), variance.mean(1, keepdim=True)
-    spread = ((light - mean) ** 2).sum(1)
-    slope = ((light - mean) * (variance - level)).sum(1) / spread.clamp(min=1e-30)
-    shot_var, read_var = slope.clamp(min=0), (level[:, 0] - slope * mean[:, 0]).clamp(min=0)
-    expected = shot_var[:, None] * light + read_var[:, None]
-    if not torch.allclose(expected, variance, rtol=1e-2, atol=1e-12):
+    shot, read = levels_of(noisy.double(), variance.double())
+    if not torch.allclose(shot * noisy.clamp(min=0) + read, variance.double(), rtol=1e-2, atol=1e-12):
         raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
-    return shot_var.to(noisy), read_var.to(noisy)
+    return shot.flatten(), read.flatten()

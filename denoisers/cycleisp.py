@@ -1,13 +1,8 @@
-r"""CycleISP's dual-attention blocks, of which its converters and its denoiser are made, and its published checkpoints.
+r"""CycleISP: the dual-attention blocks of its converters and of its denoiser, and its published checkpoints.
 
-``v + merge([f s, f c])`` with ``f = conv(prelu(conv(v)))``, ``s = sigmoid(conv([max_c f, mean_c f]))`` over space and
-``c``, a weight a channel, the sigmoid of two layers on f's mean. Source: Zamir et al., "CycleISP: Real Image
+A block is ``v + merge([f s, f c])`` with ``f = conv(prelu(conv(v)))``, ``s = sigmoid(conv([max_c f, mean_c f]))`` over
+space and ``c``, a weight a channel, the sigmoid of two layers on f's mean. Source: Zamir et al., "CycleISP: Real Image
 Restoration via Improved Data Synthesis", CVPR 2020.
-
-CycleISP's denoiser: ``denoised = noisy + T([noisy, variance])``, T four groups of eight dual-attention blocks.
-
-Domain: packed RAW and the noise variance, 64 features, attention reduced by 16; 2.84 M parameters. It keeps the
-resolution throughout. Source: Zamir et al., "CycleISP: Real Image Restoration via Improved Data Synthesis", CVPR 2020.
 """
 
 from __future__ import annotations
@@ -130,17 +125,14 @@ def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 @DENOISERS.register("CycleISPDenoiser")
 class CycleISPDenoiser(Denoiser):
-    """Zamir's denoiser for RAW; see the module's head. Any h, w >= 2.
+    """Zamir's denoiser for RAW: four groups of eight dual-attention blocks on ``[noisy, variance]``, without pooling.
+
+    Settings that are not named below are those of :class:`denoisers.Denoiser`. 2.84 M parameters as published.
 
     Args:
         width: features, a multiple of ``reduction``; 64 as published.
         groups, blocks: 4 groups of 8 blocks as published.
         reduction: of the features in channel attention.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs, as published.
-        deviation: the map is sqrt(variance); False, as published: the variance.
-        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(1, 4, 20, 30)
@@ -176,7 +168,6 @@ class CycleISPDenoiser(Denoiser):
         self.initialise(seed, last, *ends)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         trunk = self.trunk
         correction: Tensor = trunk.tail(trunk.body(trunk.head(features)))  # type: ignore[operator]
         return correction

@@ -1,15 +1,9 @@
-r"""The networks by name: ``build("UNet", width=16)``. Nothing else can be named in a file of weights or a recipe.
+"""Networks by name, and files of their weights.
 
-Files of weights: safetensors, with what is needed to build the network again as string metadata.
-
-``{"format": "rawaug", "kind": "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>,
-"info": <JSON: anything else>}``. Nothing in such a file is code; only the classes in
-:data:`rawaug.registry.DENOISERS` can be named. Format: https://huggingface.co/docs/safetensors.
-
-Denoisers that ship with the package, by name; each has a model card beside its weights.
-
-``rawaug-small`` is for CPUs: PMRID's network at its published width, trained by ``recipes/pretrain.yaml`` on sRGB
-photographs alone.
+A file is safetensors with string metadata that say how to build the network again: ``{"format": "rawaug", "kind":
+"denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
+it is code; only the classes in :data:`rawaug.registry.DENOISERS` can be named. Shipped weights have a model card beside
+them; ``rawaug-small`` is PMRID's network at its published width, trained by ``recipes/pretrain.yaml``.
 """
 
 from __future__ import annotations
@@ -25,10 +19,13 @@ from denoisers.network import Denoiser
 from rawaug.files import parse_object, read_tensors, write_tensors
 from rawaug.registry import DENOISERS
 
-__all__ = ["DENOISERS", "build"]
-
+FORMAT, KIND = "rawaug", "denoiser"
 MOST_WEIGHTS = 2**30
 """Of a network: 4 GiB. Larger ones are refused before they take memory."""
+FOLDER = Path(__file__).parent / "weights"
+"""Of the shipped weights and their cards."""
+DEFAULT = "rawaug-small"
+"""What denoises where no denoiser is named."""
 
 
 def build(name: str, **config: Any) -> Denoiser:
@@ -51,9 +48,6 @@ def build(name: str, **config: Any) -> Denoiser:
     if torch.get_default_device().type != "meta":
         network = DENOISERS.make(spec)
     return network
-
-
-FORMAT, KIND = "rawaug", "denoiser"
 
 
 def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) -> None:
@@ -129,13 +123,6 @@ def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
         return parse_object(metadata.get(key, ""))
     except ValueError as error:
         raise ValueError(f"{path}: metadata {key!r}: {error}") from None
-
-
-FOLDER = Path(__file__).parent / "weights"
-"""Of the shipped weights and their cards."""
-
-DEFAULT = "rawaug-small"
-"""What denoises where no denoiser is named."""
 
 
 def shipped() -> list[str]:

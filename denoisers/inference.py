@@ -1,26 +1,4 @@
-r"""Denoising in tiles: ``f(y)[core] = f(y[core + overlap on every side])[core]``.
-
-Domain: packed RAW of any size. The equality is exact (to rounding) where the overlap is at least the network's
-receptive radius and the tiles start at multiples of its stride, so that pooling grids fall on the same pixels as in the
-whole picture: from 17 pixels for a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with
-distance: with a trained U-Net of four scales the largest difference was 0.3 of the noise's deviation at an overlap of
-32, and 2e-6 at 64; the default is 96. Only the middle of each tile is kept; nothing is blended: that would hide an
-overlap that is too small. Along each side all tiles have the same size, the smallest that does with as many of them.
-
-Self-ensemble on a mosaic: ``mean over views v of T_v^-1 f(T_v y)``, with T_v a flip or quarter turn.
-
-Domain: packed RAW whose mosaic has a known CFA. T_v turns the *mosaic*, so that neighbours stay neighbours. Where this
-moves the pattern, one line is added on either side by reflection without repeating the edge (row -1 is row 1, which has
-its colour), so that the network meets its own pattern again; the line is cropped from the result. No colour takes
-another's place: what went in as R, Gr, Gb, B comes out there, except that a quarter turn exchanges the two greens.
-Source: Timofte et al., "Seven ways to improve example-based single image super resolution", CVPR 2016; for mosaics Liu
-et al., "Learning Raw Image Denoising with Bayer Pattern Unification and Bayer Preserving Augmentation", CVPRW 2019.
-
-R2R's average: ``mean over k of f(y + alpha m_k)``, with ``m_k`` drawn with the noise's own variance at ``f(y)``.
-
-Domain: packed RAW. A network that was trained on recorrupted frames gets the input it knows, and the average removes
-most of what the added noise costs. Source: Pang et al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
-"""
+"""Around a denoiser, called as it is: tiles, self-ensemble, and the average over recorrupted copies."""
 
 from __future__ import annotations
 
@@ -54,7 +32,13 @@ def tiled(
     overlap: int = 96,
     each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> Tensor:
-    """Denoise a picture of any size piece by piece, without gradients.
+    """Denoise a picture of any size piece by piece, without gradients: ``f(y)[core] = f(y[core + overlap])[core]``.
+
+    The equality is exact (to rounding) where the overlap is at least the network's receptive radius: from 17 pixels for
+    a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with distance: with a trained U-Net of
+    four scales the largest difference was 0.3 of the noise's deviation at an overlap of 32, and 2e-6 at 64; the default
+    is 96. Tiles start at multiples of the network's stride, so that pooling grids fall on the same pixels as in the
+    whole picture. Nothing is blended: that would hide an overlap that is too small.
 
     Peak memory is the result plus what the model needs for one ``(B, 4, tile, tile)`` piece, whatever the picture's
     size; at most ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
@@ -113,7 +97,13 @@ def from_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
 
 
 class SelfEnsemble(nn.Module):
-    """A denoiser averaged over its views of the mosaic: called as the denoiser is, ``views`` times the work.
+    """A denoiser averaged over views of the mosaic, ``mean of T^-1 f(T y)``: ``views`` times the work.
+
+    T, a flip or quarter turn, turns the *mosaic*, so that neighbours stay neighbours. Where this moves the pattern, one
+    line is added on either side by reflection without repeating the edge (row -1 is row 1, which has its colour), so
+    that the network meets its own pattern again; the line is cropped from the result. What went in as R, Gr, Gb, B
+    comes out there, except that a quarter turn exchanges the two greens. Sources: Timofte et al., CVPR 2016; for
+    mosaics Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification", CVPRW 2019.
 
     Args:
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
@@ -168,7 +158,11 @@ class SelfEnsemble(nn.Module):
 
 
 class Recorrupted(nn.Module):
-    """A denoiser averaged over several draws of extra noise: called as the denoiser is, ``draws + 1`` times the work.
+    """A denoiser averaged over draws of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
+
+    A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
+    added noise costs. ``m`` has the noise's variance at ``f(y)``: at ``y`` it would follow the noise. Source: Pang et
+    al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
 
     Args:
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.

@@ -1,4 +1,4 @@
-r"""What every network here does around its own layers: ``denoised = noisy + residual([noisy, noise map])``.
+r"""The base of every network: ``denoised = noisy + residual([noisy, noise map])``.
 
 Domain: packed RAW, float, white = 1, not clipped at black; any height and width from 2 on. A network that pools ``s``
 times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by reflection

@@ -1,40 +1,7 @@
-r"""The U-Net of UPI: ``denoised = noisy + U([noisy, variance])``.
+"""Convolutional networks from the literature, each ``denoised = noisy + residual([noisy, noise map])``.
 
-Domain: packed RAW (R, Gr, Gb, B) and its noise variance map. Five scales of three 3 x 3 convolutions with leaky ReLU
-0.2; features double at each scale, 32 to 512; max-pooling down, bilinear interpolation up, skips by concatenation, a
-last convolution to four channels. Source: Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019.
-
-DHDN, the densely connected hierarchical network: ``denoised = noisy + D([noisy, variance])``.
-
-Domain: packed RAW (the published network: sRGB, three channels). A U-Net of four levels, features C, 2C, 4C, 8C, with
-two densely connected residual (DCR) blocks a level on the way down and on the way up. Down: max-pooling and a 1 x 1
-convolution; up: a 1 x 1 convolution and pixel shuffle; skips by concatenation at every level, the lowest included.
-With C = 128 and three channels it has 168.2 M parameters and takes 1,020 GMAC for 256 x 256 pixels.
-Source: Park, Yu and Jeong, "Densely Connected Hierarchical Network for Image Denoising", CVPR Workshops 2019.
-
-DnCNN: ``denoised = noisy + R([noisy, variance])``, a plain chain of 3 x 3 convolutions that predicts the noise.
-
-Domain: packed RAW. First layer convolution + ReLU, then ``depth - 2`` times convolution + batch normalisation + ReLU,
-then a convolution. Here the chain predicts what is to be added, the paper's noise with its sign turned.
-Source: Zhang et al., "Beyond a Gaussian Denoiser: Residual Learning of Deep CNN for Image Denoising", TIP 2017.
-
-NAFNet: a U-Net without activation functions; ``denoised = noisy + N(features)``.
-
-Domain: packed RAW. A block is two residuals: layer norm, pointwise c to 2c, depthwise 3 x 3, simple gate
-:math:`a \odot b`, simplified channel attention, pointwise; and layer norm, pointwise c to 2c, simple gate, pointwise;
-each enters with a learned factor that starts at 0. Convolutions 2 x 2 of stride 2 go down, pixel shuffles go up, skips
-are added. Source: Chen et al., "Simple Baselines for Image Restoration", ECCV 2022.
-
-The channel attention averages over the whole input: a tile and the whole picture differ a little.
-
-DRUNet: a U-Net of residual blocks without biases; ``denoised = noisy + D(features)``.
-
-Domain: packed RAW. A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise
-convolution and a pixel shuffle up (the source has transposed convolutions), skips are added. Without biases a network
-that is trained at some noise levels denoises at others too. Here it sees the signal less its mean over 8 x 8 pixels,
-interpolated: light and shade are then the same problem, and bfloat16 has digits for the noise, not for the brightness.
-Sources: Zhang et al., "Plug-and-Play Image Restoration with Deep Denoiser Prior", TPAMI 2021; Mohan et al., "Robust and
-Interpretable Blind Image Denoising via Bias-Free Convolutional Neural Networks", ICLR 2020.
+All settings that they share (``channels``, ``variance_map``, ``deviation``, ``domain``) are those of
+:class:`denoisers.Denoiser`; ``seed`` is that of the initial weights. Any height and width from 2 on.
 """
 
 from __future__ import annotations
@@ -65,16 +32,14 @@ def _block(inputs: int, features: int) -> nn.Sequential:
 
 @DENOISERS.register("UNet")
 class UNet(Denoiser):
-    """UPI's U-Net; see the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
+    """UPI's U-Net (Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019).
+
+    Five scales of three 3 x 3 convolutions with leaky ReLU 0.2; features double at each scale, 32 to 512; max-pooling
+    down, bilinear interpolation up, skips by concatenation. As published, ``deviation=False``.
 
     Args:
         width: features of the first scale; the last has ``width * 2**(scales - 1)``.
         scales: of the pyramid; sides are padded to multiples of ``2**(scales - 1)``.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs.
-        deviation: the map is sqrt(variance), of the size of the errors to remove; False: the variance, as published.
-        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -106,7 +71,6 @@ class UNet(Denoiser):
         self.initialise(seed, self.last)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
         skips = []
         for k, block in enumerate(self.encoder):
             features = block(F.max_pool2d(features, 2) if k else features)
@@ -132,7 +96,6 @@ class DCRBlock(nn.Module):
         self.activation = nn.PReLU()
 
     def forward(self, features: Tensor) -> Tensor:
-        """``(B, C, h, w)`` to the same shape."""
         dense = torch.cat([features, self.first(features)], dim=1)
         dense = torch.cat([dense, self.second(dense)], dim=1)
         return features + self.activation(self.third(dense))
@@ -148,15 +111,15 @@ def _pointwise(inputs: int, outputs: int) -> nn.Sequential:
 
 @DENOISERS.register("DHDN")
 class DHDN(Denoiser):
-    """Park's DHDN; see the module's head. Any h, w >= 2: padded by reflection to multiples of 8 inside.
+    """The densely connected hierarchical network (Park, Yu and Jeong, CVPR Workshops 2019).
+
+    A U-Net of four levels, features C, 2C, 4C, 8C, with two densely connected residual blocks a level on the way down
+    and on the way up. Down: max-pooling and a 1 x 1 convolution; up: a 1 x 1 convolution and pixel shuffle; skips by
+    concatenation at every level, the lowest included. With C = 128 and three channels it has 168.2 M parameters and
+    takes 1,020 GMAC for 256 x 256 pixels; it is blind (``variance_map=False``).
 
     Args:
         width: features of the first level, even. 16 (2.6 M parameters) suits a CPU; 128 is the published width.
-        channels: 4 for packed RAW, 3 in the paper.
-        variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
-        deviation: the map is sqrt(variance); False: the variance.
-        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(1, 4, 20, 30)
@@ -191,7 +154,6 @@ class DHDN(Denoiser):
         self.initialise(seed, self.last, *ends)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
         features = self.first(features)
         skips = []
         for level, down in zip(self.encoder, self.down, strict=False):
@@ -211,17 +173,15 @@ def _layer(width: int, batch_norm: bool) -> list[nn.Module]:
 
 @DENOISERS.register("DnCNN")
 class DnCNN(Denoiser):
-    """Zhang's DnCNN; see the module's head. Any h, w >= 2; nothing is padded but the convolutions' zeros.
+    """A chain of 3 x 3 convolutions that predicts the noise (Zhang et al., "Beyond a Gaussian Denoiser", TIP 2017).
+
+    Convolution and ReLU, then ``depth - 2`` times convolution, batch normalisation and ReLU, then a convolution.
+    Nothing is padded but the convolutions' zeros. The paper's network is blind: ``variance_map=False``.
 
     Args:
         width: features.
         depth: convolutions; 17 in the paper for one noise level, 20 for a range of them.
         batch_norm: as published. Denoise in eval mode: in train mode a picture's result depends on its batch.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs (the paper's network is blind: False).
-        deviation: the map is sqrt(variance); False: the variance.
-        domain: linear (as published), ksigma or anscombe; see :mod:`denoisers.domains`.
-        seed: of the initial weights.
 
     Example:
         >>> import torch
@@ -255,7 +215,6 @@ class DnCNN(Denoiser):
         self.initialise(seed, last)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)`` to the correction ``(B, channels, h, w)``."""
         return self.layers(features)
 
 
@@ -268,7 +227,6 @@ class ChannelNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Of any shape ``(B, width, h, w)``."""
         normed = F.layer_norm(x.permute(0, 2, 3, 1), self.weight.shape, self.weight, self.bias, 1e-6)
         return normed.permute(0, 3, 1, 2)
 
@@ -280,7 +238,7 @@ def gate(x: Tensor) -> Tensor:
 
 
 class Block(nn.Module):
-    """NAFNet's block; see the module's head."""
+    """NAFNet's block."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -292,7 +250,6 @@ class Block(nn.Module):
         self.gamma = nn.Parameter(torch.zeros(1, width, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Of any shape ``(B, width, h, w)``."""
         y = gate(self.conv2(self.conv1(self.norm1(x))))
         x = x + self.beta * self.conv3(y * self.attention(y.mean((2, 3), keepdim=True)))
         return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
@@ -300,18 +257,18 @@ class Block(nn.Module):
 
 @DENOISERS.register("NAFNet")
 class NAFNet(Denoiser):
-    """See the module's head. Any h, w >= 2: padded by reflection inside.
+    r"""A U-Net without activation functions (Chen et al., "Simple Baselines for Image Restoration", ECCV 2022).
+
+    A block is two residuals: layer norm, pointwise c to 2c, depthwise 3 x 3, simple gate :math:`a \odot b`, simplified
+    channel attention, pointwise; and layer norm, pointwise c to 2c, simple gate, pointwise; each enters with a learned
+    factor that starts at 0. Convolutions 2 x 2 of stride 2 go down, pixel shuffles go up, skips are added. The channel
+    attention averages over the whole input: a tile and the whole picture differ a little.
 
     Args:
         width: features of the first scale, doubled at each further one; 32 and 64 are published.
         encoder: blocks of each scale going down; their number is that of the scales above the middle.
         middle: blocks of the middle.
         decoder: blocks of each scale going up, as many as ``encoder``.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs.
-        deviation: the map is sqrt(variance).
-        domain: linear, ksigma or anscombe.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -351,7 +308,6 @@ class NAFNet(Denoiser):
         self.initialise(seed, self.ending, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
         x, skips = self.intro(features), []
         for blocks, down in zip(self.encoder, self.downs, strict=True):
             x = blocks(x)
@@ -376,24 +332,24 @@ class ResidualBlock(nn.Module):
         self.conv1, self.conv2 = conv(width, width, bias=False), conv(width, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Of any shape ``(B, width, h, w)``."""
         return x + self.conv2(self.conv1(x).relu_())
 
 
 @DENOISERS.register("DRUNet")
 class DRUNet(Denoiser):
-    """See the module's head. Any h, w >= 2: padded by reflection inside.
+    """A U-Net of residual blocks without biases (Zhang et al., "Plug-and-Play Image Restoration", TPAMI 2021).
+
+    A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise convolution and a pixel
+    shuffle up (the source has transposed convolutions), skips are added. Without biases a network that is trained at
+    some noise levels denoises at others too (Mohan et al., ICLR 2020). Here it sees the signal less its mean over
+    8 x 8 pixels, interpolated: light and shade are then the same problem, and bfloat16 has digits for the noise, not
+    for the brightness.
 
     Args:
         width: features of the first scale, doubled at each further one; 64 is published.
         scales: of the pyramid; 4 is published.
         blocks: of each scale, going down and going up; 4 is published.
         limits: feed how near black and white the transformed signal is; not in the domain linear.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs.
-        deviation: the map is sqrt(variance).
-        domain: linear, ksigma or anscombe; see :mod:`denoisers.domains`.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -433,7 +389,6 @@ class DRUNet(Denoiser):
         self.initialise(seed, self.tail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
         signal, maps = features[:, : self.channels], features[:, self.channels :]
         mean = F.interpolate(F.avg_pool2d(signal, MEAN_OVER), scale_factor=MEAN_OVER, mode="bilinear")
         x, skips = self.head(torch.cat([signal - mean, maps], dim=1)), []

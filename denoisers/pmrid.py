@@ -1,13 +1,7 @@
-r"""PMRID: a U-Net of separable convolutions for phones; ``z + P(z)`` in the k-sigma domain.
-
-Domain: packed RAW. Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at
-half the size of the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed
-convolution 2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
-
-ReLUs and sums work in place: on a CPU fresh memory costs more than they do.
+"""PMRID: a U-Net of separable convolutions for phones, made for the k-sigma domain.
 
 Source: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020. The modules are named as in the
-published weights.
+published weights. ReLUs and sums work in place: on a CPU fresh memory costs more than they do.
 """
 
 from __future__ import annotations
@@ -35,7 +29,6 @@ class Separable(nn.Module):
         self.pointwise = conv(inputs, outputs, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.pointwise(self.depthwise(x))
         return y
 
@@ -50,7 +43,6 @@ class EncoderBlock(nn.Module):
         self.proj = Separable(inputs, outputs, 3, stride) if stride > 1 or inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, inputs, h, w)`` to ``(B, outputs, h / stride, w / stride)``."""
         y: Tensor = self.conv2(self.conv1(x).relu_())
         return y.add_(self.proj(x)).relu_()
 
@@ -64,7 +56,6 @@ class Residual(nn.Module):
         self.conv1 = Separable(width, width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Of any shape ``(B, width, h, w)``."""
         y: Tensor = self.conv1(self.conv0(x).relu_())
         return y.add_(x)
 
@@ -81,22 +72,21 @@ class DecoderStage(nn.Module):
         self.proj_conv = Separable(skip, outputs, 3)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        """``(B, inputs, h, w)`` and ``(B, skip, 2h, 2w)`` to ``(B, outputs, 2h, 2w)``."""
         y: Tensor = self.upsample(self.decode_conv(x))
         return y.add_(self.proj_conv(skip).relu_())
 
 
 @DENOISERS.register("PMRID")
 class PMRID(Denoiser):
-    """See the module's head. Any h, w >= 2: padded by reflection to multiples of 16 inside.
+    """PMRID. Settings that are not named below are those of :class:`denoisers.Denoiser`.
+
+    Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at half the size of
+    the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed convolution
+    2 x 2 and a skip; 1.03 M parameters and 3.7 GMAC a mosaic megapixel at the published width.
 
     Args:
         width: features of the first convolution; the encoder has 4, 8, 16 and 32 times as many.
-        channels: 4 for packed RAW.
-        variance_map: take the noise map as ``channels`` more inputs.
-        deviation: the map is sqrt(variance).
         domain: linear, ksigma (as published) or anscombe.
-        seed: of the initial weights.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -134,7 +124,6 @@ class PMRID(Denoiser):
         self.initialise(seed, last, gain=RESIDUAL_GAIN)
 
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of 16, to the correction ``(B, channels, h, w)``."""
         x = self.conv0(features).relu_()
         skips = []
         for k in range(1, 5):

@@ -252,11 +252,7 @@ class ClassicalDenoiser:
         return bayer.unpack(denoised, frame.cfa)[0].clamp(max=1.0)
 
     def _tile(self, noisy: Tensor, _: Tensor | None, levels: tuple[float, float]) -> Tensor:
-        if levels[0] == 0:  # no shot noise: white already
-            denoised: Tensor = self.filter(noisy, torch.tensor(levels[1]))
-            return denoised
-        shot_var, read_var = (torch.tensor([level]) for level in levels)
-        return Stabilised(self.filter, anscombe)(noisy, shot_var=shot_var, read_var=read_var)
+        return Stabilised(self.filter, anscombe)(noisy, shot_var=levels[0], read_var=levels[1])
 
 
 def frame_denoiser(

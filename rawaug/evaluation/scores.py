@@ -193,11 +193,10 @@ def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
 
     def method(pair: Pair, sample: Sample) -> Tensor:
         levels = frozen_levels(pair, noise, seed)
-        if levels is None or not levels[0] > 0:
+        if levels is None:
             denoised: Tensor = denoiser(sample.noisy, sample.variance)
             return denoised
-        shot_var, read_var = (torch.tensor([level]) for level in levels)
-        return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=shot_var, read_var=read_var)
+        return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=levels[0], read_var=levels[1])
 
     return method
 

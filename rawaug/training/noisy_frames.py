@@ -49,8 +49,8 @@ def first_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) ->
     """
     if not shot_var > 0:
         return noisy
-    levels = {"shot_var": torch.tensor([shot_var]), "read_var": torch.tensor([read_var])}
-    denoised = Stabilised(NonLocalMeans(), anscombe)(bayer.pack(noisy[None], cfa), **levels)
+    packed = bayer.pack(noisy[None], cfa)
+    denoised = Stabilised(NonLocalMeans(), anscombe)(packed, shot_var=shot_var, read_var=read_var)
     return bayer.unpack(denoised, cfa)[0]
 
 
