@@ -56,7 +56,7 @@ DECODERS = {
 BY_COMMANDS, COMMANDS_COST = 8, 6
 """Of so many files one is read by the commands as well, and then has so many times the seconds."""
 
-IMPORTED = ["rawaug.experiment.kinds", "rawaug.commands.fit", "rawaug.plugin.dataset", "lightning_fabric"]
+IMPORTED = ["rawaug.experiment.kinds", "rawaug.training.camera", "rawaug.plugin.dataset", "lightning_fabric"]
 """What the readers and commands need, in whole."""
 OUTCOMES = ("read", "refused", "crashed", "fault", "hung", "memory")
 FORBIDDEN = OUTCOMES[3:]

@@ -12,13 +12,13 @@ from rawaug._version import __version__
 
 if TYPE_CHECKING:
     from rawaug.bayer import CFA
-    from rawaug.commands.fit import fit
     from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
     from rawaug.isp.model import DictionaryISP
     from rawaug.plugin.augment import RawAugment
     from rawaug.plugin.dataset import RawPairs, RawPairStream
     from rawaug.plugin.loader import WrappedLoader, wrap
     from rawaug.plugin.params import AugmentParams, RawPair, load_params, save_params
+    from rawaug.training.camera import fit
 
 _MODULES = {
     "CFA": "rawaug.bayer",
@@ -32,7 +32,7 @@ _MODULES = {
     "RawPairStream": "rawaug.plugin.dataset",
     "RawPairs": "rawaug.plugin.dataset",
     "WrappedLoader": "rawaug.plugin.loader",
-    "fit": "rawaug.commands.fit",
+    "fit": "rawaug.training.camera",
     "load_params": "rawaug.plugin.params",
     "save_params": "rawaug.plugin.params",
     "wrap": "rawaug.plugin.loader",

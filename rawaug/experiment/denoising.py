@@ -18,7 +18,6 @@ import denoisers
 from denoisers.files import find
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
-from rawaug.commands.fit import fit
 from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.errors import extra
@@ -46,6 +45,7 @@ from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.registry import EXPERIMENTS
+from rawaug.training.camera import fit
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import noisy_only

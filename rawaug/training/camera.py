@@ -1,0 +1,305 @@
+"""``rawaug.fit``: files, folders or pairs in, a camera with its noise law out.
+
+The noise is measured on the frames that are fitted, those of each ISO together, by photon transfer, and on dark frames
+if they are given: on the captured noisy mosaic of a pair where it has one, else on the RAW file itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Literal, NamedTuple
+
+from torch import Tensor
+
+from rawaug.bayer import CFA, aligned
+from rawaug.data import RawFolder, open_pairs
+from rawaug.data.folders import Readable, left_out
+from rawaug.data.pairs import Pair, shared_frame
+from rawaug.evaluation.psnr_r import psnr_r
+from rawaug.io import read_raw
+from rawaug.io.apart import apart
+from rawaug.isp.fit import FitConfig, fit_isp
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import (
+    IsoLevel,
+    MeasuredLevels,
+    NoiseEstimate,
+    estimate_noise,
+    from_dark_frames,
+    plot_noise,
+)
+
+WATCHED_PATCHES = 4
+"""Of each held-out frame, scored while the fit goes on."""
+WORST_FIT = 0.5
+"""R^2 below which the points do not follow a line."""
+MOST_FRAMES = 32
+"""Largest number of frames measured, since all are in memory."""
+_UNKNOWN = "unknown"
+
+
+class MeasuredFrame(NamedTuple):
+    """A mosaic, its pattern, and the camera and ISO that the file names."""
+
+    mosaic: Tensor
+    cfa: CFA
+    camera: str
+    iso: float | None
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """What was measured.
+
+    Attributes:
+        law: the levels over ISO.
+        estimates: the line and points of each ISO; None is the ISO of files without one.
+    """
+
+    law: MeasuredLevels
+    estimates: dict[float | None, NoiseEstimate]
+
+
+def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
+    """(shot_var, read_var) of one camera at each ISO of its files, with the measured points.
+
+    Args:
+        pairs: frames of one camera; at most :data:`MOST_FRAMES` are used, evenly spaced. Of
+            :class:`rawaug.data.folders.Readable` those that cannot be read are left out.
+        dark: folder of dark frames of the same ISO values to measure the read variance.
+
+    Raises:
+        ValueError: if the frames are of several cameras or only some have an ISO, an ISO has too few flat regions or
+            follows no line, or the dark frames lack an ISO or are clipped at black.
+    """
+    by_iso = _by_iso(_frames(pairs))
+    dark_by_iso = None if dark is None else _by_iso(_frames(RawFolder(dark)))
+    estimates = {iso: _measured(iso, frames, dark_by_iso) for iso, frames in by_iso.items()}
+    camera = next((f.camera for frames in by_iso.values() for f in frames if f.camera != _UNKNOWN), _UNKNOWN)
+    levels = [IsoLevel(iso, e.shot_var, e.read_var, round(e.r2, 4), len(by_iso[iso])) for iso, e in estimates.items()]
+    return CameraNoise(MeasuredLevels(levels, camera), estimates)
+
+
+def _measured(
+    iso: float | None, frames: Sequence[MeasuredFrame], dark: dict[float | None, list[MeasuredFrame]] | None
+) -> NoiseEstimate:
+    """The line of the frames of one ISO."""
+    where = "" if iso is None else f" at ISO {iso:g}"
+    read_var = None
+    if dark is not None:
+        matching = dark.get(iso) or dark.get(None)
+        if matching is None:
+            raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
+        read_var = from_dark_frames(*_aligned(matching)).read_var
+    try:
+        estimate = estimate_noise(*_aligned(frames), read_var=read_var)
+    except ValueError as error:
+        raise ValueError(f"noise{where}: {error}") from None
+    if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
+        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {_advice(iso)}")
+    return estimate
+
+
+def _advice(iso: float | None) -> str:
+    return "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
+
+
+def _by_iso(frames: Sequence[MeasuredFrame]) -> dict[float | None, list[MeasuredFrame]]:
+    """The frames by ISO, ascending; those of two cameras do not share a law."""
+    cameras = dict.fromkeys(frame.camera for frame in frames if frame.camera != _UNKNOWN)
+    if len(cameras) > 1:
+        counted = ", ".join(f"{name} ({sum(f.camera == name for f in frames)})" for name in cameras)
+        raise ValueError(
+            f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each camera separately"
+        )
+    by_iso: dict[float | None, list[MeasuredFrame]] = defaultdict(list)
+    for frame in frames:
+        by_iso[frame.iso].append(frame)
+    if None in by_iso and len(by_iso) > 1:
+        raise ValueError(
+            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; omit them, or measure them separately"
+        )
+    return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
+
+
+def _frames(pairs: Sequence[Pair]) -> list[MeasuredFrame]:
+    """Frames spread over ``pairs``; of :class:`Readable` ones those that can be read. RAW files are not developed."""
+    last = len(pairs) - 1
+    spread = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
+    indices = range(len(pairs)) if last < MOST_FRAMES else spread
+    if not isinstance(pairs, Readable):
+        return [_frame(pairs, index) for index in indices]
+    found = (pairs.attempt(index, partial(_frame, pairs.pairs)) for index in indices)
+    frames = [frame for frame in found if frame is not None]
+    if pairs.broken and not frames:
+        raise ValueError(f"noise: none of {len(indices)} frames can be read; {pairs.reasons()[0]}")
+    return frames
+
+
+def _frame(pairs: Sequence[Pair], index: int) -> MeasuredFrame:
+    if isinstance(pairs, RawFolder):
+        frame = apart(read_raw, pairs.files[index])
+        return MeasuredFrame(frame.mosaic, frame.cfa, frame.camera, frame.iso)
+    pair = pairs[index]
+    return MeasuredFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, pair.camera, pair.iso)
+
+
+def _aligned(frames: Sequence[MeasuredFrame]) -> tuple[list[Tensor], CFA]:
+    """The mosaics, brought to the pattern of the first."""
+    cfa = frames[0].cfa
+    return [aligned(frame.mosaic, frame.cfa, cfa) for frame in frames], cfa
+
+
+def fit(
+    source: str | Path | Sequence[str | Path] | Sequence[Pair],
+    progress: bool = True,
+    noise: Literal["auto", "on", "off"] = "auto",
+    dark: str | Path | None = None,
+    noise_figure: str | Path | None = None,
+    camera_jpeg: bool = True,
+    held_out: str | Path | Sequence[Pair] | None = None,
+    state: str | Path | None = None,
+    cfa: str | None = None,
+    black: float | Sequence[float] | None = None,
+    white: float | None = None,
+    **settings: Any,
+) -> DictionaryISP:
+    """Fit an ISP to your own camera.
+
+    Args:
+        source: a RAW file, a folder of them, a list of files and folders, ``kind:path`` of a known dataset, or pairs.
+        progress: show progress bars.
+        noise: "on" also measures the camera's noise levels, for ``RawAugment(isp, noise="camera")``; "auto"
+            continues without them where they cannot be measured; the reason is in ``isp.info["noise_not_measured"]``.
+        dark: folder of dark frames to measure the read variance.
+        noise_figure: where to draw the measured points and the line.
+        camera_jpeg: use the camera's JPEG of the same stem as the sRGB; False always uses LibRaw's rendering.
+        held_out: frames to leave out of the fit; their PSNR_r is shown in the progress bar and stored in
+            ``isp.info["held_out"]``.
+        state: file with the state of the fit, to resume it; removed at the end.
+        cfa, black, white: of the files of ``pairs:PATH`` that do not state them, see :class:`rawaug.data.PairFolder`.
+        settings: of :class:`rawaug.isp.fit.FitConfig`.
+
+    Frames that cannot be read, of those fitted and those held out, are left out; ``isp.info["unreadable"]`` has a line
+    for each.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing, none can be read as a Bayer RAW file, or a held-out frame
+            is also fitted.
+
+    Example:
+        >>> isp = fit("demo:train", steps=2, pixels=512, progress=False)
+        >>> isp.info["frames"][0]
+        'train_00_astronaut'
+    """
+    if noise not in ("auto", "on", "off"):
+        raise ValueError(f"noise must be auto, on or off, got {noise!r}")
+    start = time.perf_counter()
+    mosaics = {key: value for key, value in (("cfa", cfa), ("black", black), ("white", white)) if value is not None}
+    pairs = _pairs(source, camera_jpeg, mosaics)
+    watch = None
+    if held_out is not None:
+        own = mosaics if str(held_out).startswith("pairs:") else {}
+        watch = _Watch(_unseen(_pairs(held_out, camera_jpeg, own), pairs))
+    frames = Readable(pairs)
+    estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
+    isp = fit_isp(frames, FitConfig(**settings), progress, state, watch)
+    if watch is not None:
+        watch(isp)
+        isp.info["held_out"] = watch.scores
+    if lines := [*left_out(frames, "the fit"), *left_out(watch.pairs if watch else Readable([]), "held-out frames")]:
+        isp.info["unreadable"] = lines
+    if isinstance(estimate, str):
+        isp.info["noise_not_measured"] = estimate
+    elif estimate is not None:
+        isp.info["noise"] = estimate.law.spec()
+        if noise_figure is not None:
+            _plot(estimate, noise_figure)
+    isp.info["rendering"] = rendering_of(pairs, len(isp.info["frames"]), isp.info["registered"])
+    isp.info["seconds"] = round(time.perf_counter() - start, 2)
+    return isp
+
+
+def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
+    """Where the measured points are drawn: ``path``, with the ISO in its name where there are several."""
+    path = Path(path)
+    if len(law.levels) == 1:
+        return [path]
+    return [path.with_name(f"{path.stem}-iso{level.iso:g}{path.suffix}") for level in law.levels]
+
+
+def _plot(noise: CameraNoise, path: str | Path) -> None:
+    for file, (iso, estimate) in zip(noise_figures(path, noise.law), noise.estimates.items(), strict=True):
+        plot_noise(estimate, file, title=noise.law.camera if iso is None else f"{noise.law.camera}, ISO {iso:g}")
+
+
+def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
+    """The levels, or why they could not be measured."""
+    if noise == "off":
+        return None
+    try:
+        return measure_camera_noise(pairs, dark)
+    except ValueError as error:
+        if noise == "on":
+            raise
+        return str(error)
+
+
+def rendering_of(pairs: Sequence[Pair], frames: int, registered: int) -> str:
+    """What rendering the fit was to, whose tone curve and colours the ISP undoes; registered pairs are no JPEGs."""
+    own = "LibRaw" if isinstance(pairs, RawFolder) else "sRGB of the pairs"
+    counts = {own: registered, "JPEG of the camera": frames - registered}
+    return ", ".join(f"{name} ({count} of {frames})" for name, count in counts.items() if count)
+
+
+class _Watch:
+    """PSNR_r of held-out frames, on a few patches of each."""
+
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = Readable(pairs)
+        self.scores: list[dict[str, float]] = []
+
+    def __call__(self, isp: DictionaryISP) -> str:
+        scores = [[psnr_r(isp, pair, known, WATCHED_PATCHES) for known in (False, True)] for pair in self.pairs]
+        blind, given = (fmean(of_frames) for of_frames in zip(*scores, strict=True))
+        self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
+        return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
+
+
+def _unseen(held_out: Sequence[Pair], fitted: Sequence[Pair]) -> Sequence[Pair]:
+    """``held_out``, unless a frame of it is also fitted."""
+    if (seen := shared_frame(held_out, fitted)) is not None:
+        raise ValueError(f"held-out: {seen} is also fitted; hold out other frames")
+    return held_out
+
+
+def _pairs(
+    source: str | Path | Sequence[str | Path] | Sequence[Pair], camera_jpeg: bool, mosaics: Mapping[str, Any]
+) -> Sequence[Pair]:
+    if isinstance(source, (str, Path)):
+        source = [source]
+    if not hasattr(source, "__getitem__") or not len(source):
+        raise ValueError("nothing to fit; give one or more files, folders or pairs")
+    if isinstance(source[0], Pair):
+        if mosaics:
+            raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
+        return source  # type: ignore[return-value]
+    if not isinstance(source[0], (str, Path)):
+        raise ValueError(
+            f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
+        )
+    opened = [open_pairs(str(item), split="train", as_clean=False, **mosaics) for item in source]
+    if len(opened) == 1 and not isinstance(opened[0], RawFolder):
+        return opened[0]
+    files: list[Path] = []
+    for item, pairs in zip(source, opened, strict=True):
+        if not isinstance(pairs, RawFolder):
+            raise ValueError(f"{item}: a kind:path dataset cannot be combined with other files; give it alone")
+        files += pairs.files
+    return RawFolder(files, camera_jpeg=camera_jpeg)
