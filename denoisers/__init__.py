@@ -19,37 +19,17 @@ if TYPE_CHECKING:
     from denoisers.pmrid import PMRID
     from rawaug.registry import DENOISERS
 
-_NAMES = {
-    "denoisers.classical": (
-        "BM3D",
-        "NonLocalMeans",
-        "Stabilised",
-        "TotalVariation",
-        "Wavelet",
-    ),
-    "denoisers.cycleisp": ("CycleISPDenoiser",),
-    "rawaug.registry": ("DENOISERS",),
-    "denoisers.files": (
-        "build",
-        "from_pretrained",
-        "load",
-        "save",
-    ),
-    "denoisers.inference": (
-        "SelfEnsemble",
-        "tiled",
-    ),
-    "denoisers.network": ("Denoiser",),
-    "denoisers.networks": (
-        "DHDN",
-        "DRUNet",
-        "DnCNN",
-        "NAFNet",
-        "UNet",
-    ),
-    "denoisers.pmrid": ("PMRID",),
+_MODULES = {
+    "denoisers.classical": "BM3D NonLocalMeans Stabilised TotalVariation Wavelet",
+    "denoisers.cycleisp": "CycleISPDenoiser",
+    "denoisers.files": "build from_pretrained load save",
+    "denoisers.inference": "SelfEnsemble tiled",
+    "denoisers.network": "Denoiser",
+    "denoisers.networks": "DHDN DRUNet DnCNN NAFNet UNet",
+    "denoisers.pmrid": "PMRID",
+    "rawaug.registry": "DENOISERS",
 }
-_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+"""Modules, and the public names that each defines."""
 
 __all__ = [
     "BM3D",
@@ -76,10 +56,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-    return value
+    for module, names in _MODULES.items():
+        if name in names.split():
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
