@@ -38,7 +38,7 @@ from rawaug.experiment.arms import chosen, estimator_of, frames_of, in_pattern, 
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.run_folder import claim, require_free, run_folder
-from rawaug.files import find_weights, fingerprint, one_at_a_time, replacing, sha256, write_json
+from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
 from rawaug.io.apart import reading_within
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
@@ -185,13 +185,11 @@ class _Run:
             if info.get("key") == key:
                 print(f"already trained: {path}")
                 return model
-        if _leads():
-            _discard_other_checkpoint(place, key)
         stream = training_stream(recipe, recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed)
         validation = validation_samples(recipe, self.frames["validation"], self.pictures, isp, noise)
         label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
         where, choose = (recipe.device, recipe.devices), bool(self.validation)
-        model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose)
+        model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose, key)
         if not _leads():
             return model
         levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
@@ -313,14 +311,3 @@ def _leads() -> bool:
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
-
-
-def _discard_other_checkpoint(place: Path, key: str) -> None:
-    """A checkpoint of other settings cannot be gone on from."""
-    place.mkdir(parents=True, exist_ok=True)
-    stamp = place / "key.txt"
-    if not stamp.is_file() or stamp.read_text() != key:
-        for file in ("last.pt", "log.csv"):
-            (place / file).unlink(missing_ok=True)
-        with replacing(stamp) as partial:  # a kill must not leave half a key: the checkpoint would be discarded
-            partial.write_text(key)

@@ -126,6 +126,11 @@ def drawn_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor
     return drawn
 
 
+def shot_read_variance(signal: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
+    """``shot_var max(signal, 0) + read_var``, of the signal's shape."""
+    return read_var + shot_var * signal.clamp_min(0.0)
+
+
 class ShotReadModel(NoiseModel):
     """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
 

@@ -10,11 +10,10 @@ r2r                ``y + a m``               ``y - m / a``         E[x | input],
 neighbor2neighbor  one pixel of each cell    its neighbour         E[neighbour | input]: biased where neighbours differ
 =================  ========================  ====================  =====================================================
 
-``m`` is drawn with the noise's own variance at x, ``shot_var x + read_var``. Of pictures x is known; of real frames
-there is a first estimate (:mod:`rawaug.training.noisy_frames`), and what that errs by is left as a bias, most of it
-at edges. What the sensor clipped at black (as SIDD's published frames are) or at white is lost to every estimator.
-
-Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, that of l1 their median.
+``m`` is drawn with the noise's own variance at x, ``shot_var x + read_var``. For pictures x is known; for real frames
+it is estimated (:func:`rawaug.training.noisy_frames.signal_estimate`), and the error of that estimate remains as a
+bias, mostly at edges. What the sensor clipped at black (as in SIDD's published frames) or at white is lost to every
+estimator. Targets are noisy, so the loss has to be l2: its minimum is the mean of the targets, that of l1 their median.
 
 Domain: packed RAW, black 0, white 1. Inputs are clipped at white as frames are, targets are not.
 Sources: Conde et al., AAAI 2022, "Unsupervised experiments" (noisier); Moran et al., "Noisier2Noise", CVPR 2020 (its
@@ -35,46 +34,43 @@ from torch import Tensor, nn
 from denoisers.inference import Recorrupted
 from denoisers.network import Denoiser
 from rawaug.data.pairs import Sample
+from rawaug.noise.models import shot_read_variance
 from rawaug.registry import ESTIMATORS
 from rawaug.training.criteria import Criterion
 
 
 @ESTIMATORS.register("supervised")
 class Supervised:
-    """Clean targets: samples come ready, ``loss = criterion(model(noisy, variance), clean)``.
+    """Clean targets: ``loss = criterion(model(noisy, variance), clean)``. Base of all estimators.
 
-    ``sees_clean`` says whether it needs clean frames: in a recipe such estimators and others do not mix. ``revision``
-    counts the changes of what it makes of the same frames: weights of another one are trained anew.
+    Attributes:
+        sees_clean: whether it needs clean frames; a recipe cannot mix estimators that do with others.
+        revision: increased whenever it makes other samples of the same frames, so that old weights are trained anew.
     """
 
     sees_clean: ClassVar[bool] = True
     revision: ClassVar[int] = 0
 
     def loss(self, model: Any, sample: Any, criterion: Criterion, progress: float = 1.0) -> Tensor:
-        """Of a batch, a scalar; ``progress`` is the share of the training that is over."""
+        """The loss of a batch, a scalar; ``progress`` is the share of the training that is over."""
         return criterion(model(sample.noisy, sample.variance), sample.clean)
 
     def corrected(self, model: Denoiser) -> Denoiser:
-        """The denoiser to use in place of the trained one; itself, or a new network."""
+        """The denoiser to use in place of the trained network: itself, or a new one."""
         return model
 
     def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """What to call at a test in place of ``run(noisy, variance)``; itself, or something around it."""
+        """What to call at a test in place of ``run(noisy, variance)``: itself, or something around it."""
         return run
-
-
-def variance_of(noisy: Tensor, shot_var: float, read_var: float) -> Tensor:
-    """``read_var + shot_var max(y, 0)``: the noise map of a frame, as in every test; its shape."""
-    return read_var + shot_var * noisy.clamp_min(0.0)
 
 
 class NoisyCrop(NamedTuple):
     """What is known of one scene.
 
     Args:
-        shots: packed noisy crops of it ``(K, 4, h, w)``.
-        signal: it without noise ``(4, h, w)``, known or estimated: the noise's variance is that at ``signal``. For an
-            estimator whose ``adds_noise`` is False it is not estimated, and the first shot stands in its place.
+        shots: packed noisy crops ``(K, 4, h, w)`` of it.
+        signal: the scene without noise ``(4, h, w)``, known or estimated; the first shot for an estimator whose
+            ``adds_noise`` is False.
         shot_var, read_var: the levels of the noise.
     """
 
@@ -83,26 +79,31 @@ class NoisyCrop(NamedTuple):
     shot_var: float
     read_var: float
 
+    def variance(self, signal: Tensor) -> Tensor:
+        """Of the noise at ``signal``, its shape."""
+        return shot_read_variance(signal, self.shot_var, self.read_var)
+
     @property
     def deviation(self) -> Tensor:
         """Standard deviation of the noise of a shot, ``(4, h, w)``."""
-        return variance_of(self.signal, self.shot_var, self.read_var).sqrt()
+        return self.variance(self.signal).sqrt()
 
 
 class SelfSupervised(Supervised, ABC):
     """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
 
-    ``shots`` is how many noisy frames of one scene it needs; ``adds_noise`` says that it uses a crop's ``signal``,
-    which of a real frame has to be estimated.
+    Attributes:
+        shots: how many noisy frames of one scene it needs.
+        adds_noise: whether it uses a crop's ``signal``, which has to be estimated for a real frame.
     """
 
-    shots = 1
+    shots: ClassVar[int] = 1
     adds_noise: ClassVar[bool] = False
     sees_clean = False
-    revision = 1  # weights are chosen on r2r pairs, whatever the estimator
+    revision = 1  # since weights are chosen on r2r pairs
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
-        """All that is random, for a packed crop of ``shape`` (4, h, w): white noise of variance 1."""
+        """All that is random for a packed crop of ``shape`` (4, h, w); by default white noise of variance 1."""
         return torch.randn(shape, generator=generator)
 
     @abstractmethod
@@ -110,21 +111,24 @@ class SelfSupervised(Supervised, ABC):
         """The training sample of a crop with at least ``shots`` shots; pure."""
 
 
-def recorrupted(crop: NoisyCrop, alpha: float, drawn: Tensor) -> tuple[Tensor, Tensor]:
-    """``y + alpha m``, clipped at white, and the variance map of all its noise."""
-    noisier = (crop.shots[0] + alpha * crop.deviation * drawn).clamp(max=1.0)
-    return noisier, (1.0 + alpha**2) * variance_of(noisier, crop.shot_var, crop.read_var)
+class _AddsNoise(SelfSupervised):
+    """Estimators whose input is ``y + alpha m``."""
 
+    adds_noise = True
 
-def positive(alpha: float) -> float:
-    """``alpha``, or an error."""
-    if not alpha > 0:
-        raise ValueError(f"alpha must be positive, got {alpha}")
-    return alpha
+    def __init__(self, alpha: float) -> None:
+        if not alpha > 0:
+            raise ValueError(f"alpha must be positive, got {alpha}")
+        self.alpha = alpha
+
+    def recorrupted(self, crop: NoisyCrop, drawn: Tensor) -> tuple[Tensor, Tensor]:
+        """``y + alpha m`` clipped at white, and the variance map of all its noise."""
+        noisier = (crop.shots[0] + self.alpha * crop.deviation * drawn).clamp(max=1.0)
+        return noisier, (1.0 + self.alpha**2) * crop.variance(noisier)
 
 
 @ESTIMATORS.register("noisier")
-class Noisier(SelfSupervised):
+class Noisier(_AddsNoise):
     """Input made noisier, the noisy frame as target.
 
     Args:
@@ -133,18 +137,15 @@ class Noisier(SelfSupervised):
             is ``z + (1 + 1/alpha^2) R(z)``: its last convolution times a constant.
     """
 
-    adds_noise = True
-
     def __init__(self, alpha: float = 1.0, correct: bool = False) -> None:
-        self.alpha, self.correct = positive(alpha), correct
+        super().__init__(alpha)
+        self.correct = correct
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
-        """See :meth:`SelfSupervised.apply`."""
-        noisier, variance = recorrupted(crop, self.alpha, drawn)
+        noisier, variance = self.recorrupted(crop, drawn)
         return Sample(noisier, crop.shots[0], variance)
 
     def corrected(self, model: Denoiser) -> Denoiser:
-        """See :meth:`Supervised.corrected`."""
         if not self.correct:
             return model
         model = copy.deepcopy(model)
@@ -153,6 +154,30 @@ class Noisier(SelfSupervised):
             for parameter in last.parameters():
                 parameter.mul_(1.0 + self.alpha**-2)
         return model
+
+
+@ESTIMATORS.register("r2r")
+class R2R(_AddsNoise):
+    """Recorrupted twice, with noise that cancels in the covariance: ``(y + a m, y - m / a)``.
+
+    Args:
+        alpha: small: the input is little noisier than the frame, the target much; 1: both have twice the variance.
+        average: at a test, denoise the frame to know its noise, then denoise this many recorrupted copies of it and
+            average them, as published; 0 denoises the frame itself.
+    """
+
+    def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
+        super().__init__(alpha)
+        if average < 0:
+            raise ValueError(f"average must be at least 0, got {average}")
+        self.average = average
+
+    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
+        noisier, variance = self.recorrupted(crop, drawn)
+        return Sample(noisier, crop.shots[0] - crop.deviation * drawn / self.alpha, variance)
+
+    def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        return Recorrupted(run, self.alpha, self.average) if self.average else run
 
 
 @ESTIMATORS.register("noise2noise")
@@ -166,36 +191,8 @@ class Noise2Noise(SelfSupervised):
         return torch.randint(2, (), generator=generator)
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
-        """See :meth:`SelfSupervised.apply`."""
         noisy, target = crop.shots[drawn], crop.shots[1 - drawn]
-        return Sample(noisy, target, variance_of(noisy, crop.shot_var, crop.read_var))
-
-
-@ESTIMATORS.register("r2r")
-class R2R(SelfSupervised):
-    """Recorrupted twice, with noise that cancels in the covariance: ``(y + a m, y - m / a)``.
-
-    Args:
-        alpha: small: the input is little noisier than the frame, the target much; 1: both have twice the variance.
-        average: at a test, denoise this many recorrupted copies of a frame and average them, as published, and
-            denoise it once before to know its noise; 0 denoises the frame itself.
-    """
-
-    adds_noise = True
-
-    def __init__(self, alpha: float = 0.5, average: int = 0) -> None:
-        if average < 0:
-            raise ValueError(f"average must be at least 0, got {average}")
-        self.alpha, self.average = positive(alpha), average
-
-    def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
-        """See :meth:`SelfSupervised.apply`."""
-        noisier, variance = recorrupted(crop, self.alpha, drawn)
-        return Sample(noisier, crop.shots[0] - crop.deviation * drawn / self.alpha, variance)
-
-    def at_test(self, run: Callable[..., Tensor]) -> Callable[..., Tensor]:
-        """See :meth:`Supervised.at_test`."""
-        return Recorrupted(run, self.alpha, self.average) if self.average else run
+        return Sample(noisy, target, crop.variance(noisy))
 
 
 class NeighborSample(NamedTuple):
@@ -224,8 +221,8 @@ class Neighbor2Neighbor(SelfSupervised):
     untrained network takes noise for that difference, so the term comes in as training goes on.
 
     Args:
-        gamma: its weight at the end; it grows in proportion to the steps. Published: 2 for synthetic noise, 16 for the
-            RAW of SIDD; the larger it is, the smoother the result.
+        gamma: weight of the second term at the end; it grows in proportion to the steps. Published: 2 for synthetic
+            noise, 16 for the RAW of SIDD; the larger it is, the smoother the result.
     """
 
     def __init__(self, gamma: float = 2.0) -> None:
@@ -238,12 +235,9 @@ class Neighbor2Neighbor(SelfSupervised):
         return torch.randint(len(NEIGHBOURS), (1, shape[-2] // 2, shape[-1] // 2), generator=generator)
 
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> NeighborSample:
-        """See :meth:`SelfSupervised.apply`."""
-        noisy = crop.shots[0]
-        return NeighborSample(noisy, variance_of(noisy, crop.shot_var, crop.read_var), drawn)
+        return NeighborSample(crop.shots[0], crop.variance(crop.shots[0]), drawn)
 
     def loss(self, model: Any, sample: NeighborSample, criterion: Criterion, progress: float = 1.0) -> Tensor:
-        """See :meth:`Supervised.loss`."""
         (first, second), (variance, _) = (neighbours(x, sample.choice) for x in (sample.noisy, sample.variance))
         with torch.no_grad():
             denoised_first, denoised_second = neighbours(model(sample.noisy, sample.variance), sample.choice)

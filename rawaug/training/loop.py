@@ -1,6 +1,4 @@
-"""What a training writes while it runs: ``log.csv``, and curves and crops for TensorBoard.
-
-The training loop: one denoiser, one stream of samples, one page.
+"""The training loop: one denoiser, one stream of samples; and what it logs, to ``log.csv`` and for TensorBoard.
 
 ``theta <- Adam(grad loss(net(noisy, variance; theta), target))`` with a warm-up, a cosine and a running average of the
 weights. Lightning Fabric places model and data: the same code on a CPU, one GPU, or the processes of several nodes, as
@@ -63,14 +61,11 @@ class Journal:
 
     def log(self, step: int, **values: float) -> None:
         """One row in the CSV file and one point in each TensorBoard curve."""
-        head = ["step", *values]
-        known = self.path.read_text().splitlines() if self.path.is_file() else []
-        if known and known[0] != ",".join(head):  # begun by a version with other columns
-            write_rows(self.path, head, list(csv.DictReader(known)))
+        begun = self.path.is_file() and self.path.stat().st_size
         with self.path.open("a", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
-            if not known:
-                rows.writerow(head)
+            if not begun:
+                rows.writerow(["step", *values])
             rows.writerow([step, *(f"{value:.6g}" for value in values.values())])
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
@@ -87,14 +82,6 @@ class Journal:
         self.writer.close()
 
 
-def write_rows(path: Path, head: Sequence[str], rows: Sequence[dict[str, str]]) -> None:
-    """A CSV file with the columns ``head``; what a row lacks is empty, what ``head`` lacks is left out."""
-    with replacing(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, head, restval="", extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def train(
     stream: TrainingStream,
     validation: Sequence[Watched],
@@ -107,6 +94,7 @@ def train(
     label: str = "train",
     estimator: Supervised | None = None,
     choose: bool = True,
+    key: str = "",
 ) -> Denoiser:
     """Train a denoiser, resuming from the last checkpoint in ``folder``, if any.
 
@@ -120,19 +108,20 @@ def train(
         label: heads the progress bar.
         estimator: makes the loss of a batch, and of the trained network the denoiser; by default supervised.
         choose: keep the averaged weights of the best validation; if not, those of the end.
+        key: what the weights depend on; a checkpoint that was saved with another one is written over.
 
     Returns:
         The network with the weights that are kept, in eval mode, on the CPU.
 
     Raises:
-        ValueError: if no validation score was a number: the training has diverged.
+        ValueError: if the checkpoint is damaged, or no validation score was a number: the training has diverged.
     """
     estimator = estimator or Supervised()
     norm: Criterion = LOSSES.make(config.loss)
     fabric = launched(device, devices, config.precision)
     folder.mkdir(parents=True, exist_ok=True)
     state = TrainingState(first_network(network, seed), config)
-    state.load(folder / "last.pt")
+    state.load(folder / "last.pt", key)
     start, model = state.step, state.place(fabric)
     loader = _batches(stream, start, config, fabric)
     journal = Journal(folder, start) if fabric.is_global_zero else None
@@ -155,7 +144,7 @@ def train(
                 journal.show(step, config.steps, estimator.corrected(state.averaged), validation)
             bar.set_postfix_str(_status(row, state.best["step"]), refresh=False)
         if saves and journal is not None:
-            state.save(folder / "last.pt")
+            state.save(folder / "last.pt", key)
     if journal is not None:
         journal.close()
     return estimator.corrected(state.kept(label)).eval()
@@ -196,10 +185,7 @@ def require_trainable(device: str, devices: int, precision: str) -> None:
 
 
 def launched(device: str, devices: int, precision: str) -> Any:
-    """Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself.
-
-    All have met here when it returns, so that none looks for a checkpoint before the first has put away an old one.
-    """
+    """Fabric in the processes that torchrun or ``fabric run`` started, or in those that it starts itself."""
     with extra("train"):
         from lightning_fabric import Fabric
 
@@ -210,5 +196,4 @@ def launched(device: str, devices: int, precision: str) -> Any:
     fabric: Any = Fabric(accelerator=device, devices=devices, num_nodes=nodes, precision=precision)
     if os.environ.get("LT_CLI_USED") != "1":  # ``fabric run`` has launched it
         fabric.launch()
-    fabric.barrier()
     return fabric

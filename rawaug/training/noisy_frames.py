@@ -1,20 +1,14 @@
-r"""A first estimate of a noisy frame's clean signal: how strong is the noise at each pixel?
-
-    x0 = NonLocalMeans(y)        var(n) = shot_var x + read_var ~ shot_var x0 + read_var
-
-Estimators put noise ``m`` of the noise's own variance on top of a frame. Taken at the noisy signal ``y`` itself, that
-variance is right on average, but it is large where the noise happens to be positive: ``m`` then depends on the noise,
-which their derivation excludes. At ``shot_var`` 0.008, ``read_var`` 3e-4, a signal of 0.02 and alpha 0.5, the mean of
-r2r's target departs from the clean signal by 0.34 standard deviations of the noise (root mean square over six classes
-of the input), though input and target are uncorrelated; taken at the clean signal, by none. On frames of the demo
-camera with these levels, the part of r2r's target that the noise of its input explains is 0.28 (edges) to 0.32 (flat
-areas) standard deviations with ``y``, 0.11 and 0.06 with x0.
-
-Frames of which only a noisy RAW is known, real ones and those made once and for all from sRGB pictures.
+r"""Frames of which only a noisy RAW is known: real ones, and those made once and for all from sRGB pictures.
 
 Noise that is drawn anew whenever a picture comes up is averaged out over the epochs: the network would in effect be
 shown clean RAW. So the camera setting and the noise of a picture are keyed by (seed, index) for good; only crops, turns
 and what an estimator adds change from step to step.
+
+Estimators put noise of the noise's own variance, ``shot_var x + read_var``, on top of a frame. Taken at the noisy
+signal y in place of x, that variance is right on average, but large where the noise happens to be positive: what is
+added then depends on the noise, which their derivation excludes. So the signal of a real frame is estimated first, by
+non-local means. (At ``shot_var`` 0.008 and ``read_var`` 3e-4 on the demo camera's frames, the noise of r2r's input
+explains 0.3 standard deviations of its target with y, 0.06 in flat areas and 0.11 at edges with the estimate.)
 """
 
 from __future__ import annotations
@@ -41,8 +35,8 @@ from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
 from rawaug.training.stream import turned_crop
 
 
-def first_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
-    """Of a mosaic ``(1, H, W)``, its shape; without shot noise the frame itself, whose variance needs no signal.
+def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
+    """The signal of a mosaic ``(1, H, W)``; the mosaic itself without shot noise, where the variance needs no signal.
 
     Raises:
         ImportError: if scikit-image is not installed.
@@ -79,10 +73,10 @@ class NoisyFrame:
 
     @cached_property
     def signal(self) -> Tensor:
-        """The scene without noise ``(1, H, W)``; of a real frame an estimate, half a second a megapixel at first."""
+        """The scene without noise ``(1, H, W)``; for a real frame an estimate (half a second a megapixel)."""
         if self.clean is not None:
             return self.clean
-        return first_estimate(self.shots[:1], self.shot_var, self.read_var, self.cfa)
+        return signal_estimate(self.shots[:1], self.shot_var, self.read_var, self.cfa)
 
 
 def noisy_only(pair: Pair) -> Pair:
@@ -207,11 +201,10 @@ def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Samp
     constant: the weights that score best are the best, as far as the estimate of the signal is right, though the
     decibels are lower than against a clean frame.
     """
-    samples = []
+    samples, estimator = [], R2R()
     for frame in frames:
         images = torch.cat([frame.shots[:1], frame.signal])
         packed = bayer.pack(aligned(images, frame.cfa, cfa)[:, None], cfa)
-        estimator = R2R()
         drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
         sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
         samples.append(Sample(*(x[None] for x in sample)))

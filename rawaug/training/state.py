@@ -1,6 +1,4 @@
-"""Where a training starts: at weights drawn from the seed, or at those of a trained denoiser.
-
-What a training changes, step by step, and the checkpoint that it resumes from.
+"""What a training changes step by step: where it starts, its running average, and the checkpoint that it resumes from.
 
 ``theta <- Adam(gradient of the loss)``, then ``average <- d average + (1 - d) theta``; the learning rate warms up and
 falls.
@@ -105,20 +103,31 @@ class TrainingState:
     def _parts(self) -> dict[str, Any]:
         return {"net": self.net, "average": self.average, "optimiser": self.optimiser, "schedule": self.schedule}
 
-    def load(self, path: Path) -> None:
-        """Go on from the checkpoint at ``path``, if there is one."""
+    def load(self, path: Path, key: str) -> None:
+        """Resume from the checkpoint at ``path``, if there is one that was saved with the same ``key``.
+
+        Raises:
+            ValueError: if it is damaged.
+        """
         if not path.is_file():
             return
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        for key, part in self._parts.items():
-            part.load_state_dict(state[key])
-        self.step, self.best, self.losses = int(state["step"]), state["best"], state.get("losses", self.losses)
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            if state.get("key") != key:
+                return
+            for name, part in self._parts.items():
+                part.load_state_dict(state[name])
+            self.step, self.best, self.losses = int(state["step"]), state["best"], state["losses"]
+        except Exception as error:  # the unpickler raises nearly anything
+            reason = " ".join(str(error).split())[:120]
+            raise ValueError(f"{path}: damaged ({reason}); delete it to train this arm from its first step") from error
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, key: str) -> None:
         """Write a checkpoint, whole or not at all: a kill or a full disk leaves the one before."""
-        state = {key: part.state_dict() for key, part in self._parts.items()}
+        state = {name: part.state_dict() for name, part in self._parts.items()}
+        state |= {"key": key, "step": self.step, "best": self.best, "losses": self.losses.cpu()}
         content = io.BytesIO()  # PyTorch's own writer does not say that a disk is full
-        torch.save({**state, "step": self.step, "best": self.best, "losses": self.losses.cpu()}, content)
+        torch.save(state, content)
         with replacing(path) as partial:
             partial.write_bytes(content.getbuffer())
 

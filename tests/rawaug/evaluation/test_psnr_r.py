@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import pytest
 import torch
 
 from rawaug.data import demo_pairs
-from rawaug.evaluation.psnr_r import mosaic_of, psnr_r
+from rawaug.evaluation.psnr_r import block_psnr, mosaic_of, psnr_r
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 
@@ -23,3 +24,10 @@ def test_strips_give_the_whole_mosaic() -> None:
         torch.testing.assert_close(mosaic_of(isp, tall, whole.params), whole.raw.clamp(0.0, 1.0))
     assert psnr_r(isp, tall) > 5.0
     assert abs(psnr_r(isp, tall, patches=10**6) - psnr_r(isp, tall)) < 1e-3
+
+
+def test_a_clipped_block_is_left_out() -> None:
+    raw, clipped = torch.full((3, 4, 4), 0.5), torch.zeros(4, 4, dtype=torch.bool)
+    made = raw + 0.01
+    made[:, 1, 2], clipped[1, 2] = 0.0, True
+    assert block_psnr(made, raw, clipped) == pytest.approx(40.0, abs=1e-3)

@@ -72,6 +72,13 @@ def test_mixed_is_the_mean_of_both_in_units_of_the_noise() -> None:
     assert weighed(L1(), "mixed", SAMPLE)(level(0.5), level(0.4)).item() == pytest.approx(expected, rel=1e-3)
 
 
+def test_mixed_takes_each_picture_in_units_of_its_own_noise() -> None:
+    variance = SAMPLE.variance * torch.tensor([1.0, 100.0]).reshape(2, 1, 1, 1)
+    sample, a, b = Sample(NOISY, NOISY, variance), level(0.5), level(0.4)
+    alone = [weighed(L1(), "mixed", Sample(*(x[k : k + 1] for x in sample)))(a[:1], b[:1]).item() for k in (0, 1)]
+    assert weighed(L1(), "mixed", sample)(a, b).item() == pytest.approx(sum(alone) / 2, rel=1e-4)
+
+
 def test_shadows_count_more_the_more_is_stabilised() -> None:
     """An error in the shadow over the same one in the light."""
 

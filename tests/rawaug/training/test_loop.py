@@ -6,6 +6,7 @@ import multiprocessing
 import socket
 from dataclasses import replace
 from itertools import pairwise
+from math import factorial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import Supervised
 from rawaug.training.loop import Journal
-from rawaug.training.state import learning_rate_factor
+from rawaug.training.state import TrainingState, first_network, learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
 from rawaug.training.validation import Watched, validate
 
@@ -54,28 +55,80 @@ def test_it_learns_to_denoise(tmp_path: Path) -> None:
     assert (tmp_path / "log.csv").read_text().splitlines()[0] == "step,loss,psnr,learning_rate,samples_per_second"
 
 
+class Killed(Exception):
+    pass
+
+
+class Dying(Supervised):
+    """Kills its training as a step begins."""
+
+    def __init__(self, step: int) -> None:
+        self.left = step
+
+    def loss(self, *arguments: Any) -> torch.Tensor:
+        self.left -= 1
+        if not self.left:
+            raise Killed
+        return super().loss(*arguments)
+
+
 def test_a_resumed_run_ends_bit_for_bit_as_an_unbroken_one(
     stream: TrainingStream, validation: list[Watched], tmp_path: Path
 ) -> None:
     whole = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "whole", device="cpu")
-
-    class Killed(Exception):
-        pass
-
-    class Dying(Supervised):
-        steps = 0
-
-        def loss(self, *arguments: Any) -> torch.Tensor:
-            self.steps += 1
-            if self.steps == 8:  # after the checkpoint of step 5
-                raise Killed
-            return super().loss(*arguments)
-
-    with pytest.raises(Killed):
-        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu", estimator=Dying())
+    with pytest.raises(Killed):  # after the checkpoint of step 5
+        loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu", estimator=Dying(8))
     resumed = loop.train(stream, validation, NETWORK, CONFIG, tmp_path / "cut", device="cpu")
     for a, b in zip(whole.state_dict().values(), resumed.state_dict().values(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_the_best_weights_survive_a_kill_after_which_scores_fall(
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores, seen = iter([30.0, 40.0, 20.0, 10.0]), []
+
+    def scored(net: torch.nn.Module, *_: object) -> dict[str, float]:
+        seen.append({key: value.clone() for key, value in net.state_dict().items()})
+        return {"psnr": next(scores)}
+
+    monkeypatch.setattr(loop, "validate", scored)
+    config = replace(CONFIG, steps=8, validate_every=2, checkpoint_every=4)
+    with pytest.raises(Killed):
+        loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu", estimator=Dying(5))
+    kept = loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu").state_dict()
+    assert all(torch.equal(kept[key], value) for key, value in seen[1].items())
+
+
+def test_a_checkpoint_of_other_settings_is_not_resumed_and_a_damaged_one_is_named(
+    stream: TrainingStream, validation: list[Watched], tmp_path: Path
+) -> None:
+    config = replace(CONFIG, steps=5, validate_every=5)
+    first, again, other = (
+        loop.train(stream, validation, NETWORK, config, tmp_path, seed, "cpu", key=key)
+        for seed, key in ((0, "a"), (9, "a"), (9, "b"))
+    )
+    weights = [next(iter(net.state_dict().values())) for net in (first, again, other)]
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+    whole = (tmp_path / "last.pt").read_bytes()
+    for damaged in (b"", b"junk", whole[:2000], whole[: len(whole) // 2]):
+        (tmp_path / "last.pt").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"last\.pt: damaged \(.*\); delete it to train this arm from its first"):
+            loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu", key="b")
+
+
+@pytest.mark.parametrize("steps", [1, 10, 100])
+def test_the_average_warms_up(steps: int) -> None:
+    """Of weights that jump from 0 to 1, ``prod (1 + n) / (10 + n)`` of the 0 is left."""
+    net = first_network(NETWORK, seed=0)
+    state = TrainingState(net, replace(CONFIG, ema=0.999))
+    for count, value in ((1, 0.0), (steps, 1.0)):
+        for weights in net.parameters():
+            torch.nn.init.constant_(weights, value)
+        for _ in range(count):
+            state.average.update_parameters(net)
+    left = next(state.averaged.parameters()).flatten()[0].sub(1).abs().item()
+    assert left == pytest.approx(factorial(10) * factorial(steps + 1) / factorial(steps + 10), abs=1e-6)
 
 
 def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
@@ -171,16 +224,6 @@ def test_the_rate_warms_up_and_falls() -> None:
     assert factors[0] == 0.5 and factors[2] == 1.0
     assert factors[-1] == pytest.approx(0.01)
     assert all(a >= b for a, b in pairwise(factors[2:]))
-
-
-def test_a_log_that_was_begun_with_other_columns_goes_on(tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text("step,loss,psnr\n1,0.5,30\n2,0.4,31\n3,0.3,3")
-    journal = Journal(tmp_path, 2)
-    journal.log(3, loss=0.25, psnr=32.0, psnr_srgb=25.0)
-    journal.log(4, loss=0.25, psnr=33.0, psnr_srgb=26.0)
-    journal.close()
-    rows = (tmp_path / "log.csv").read_text().splitlines()
-    assert rows == ["step,loss,psnr,psnr_srgb", "1,0.5,30,", "2,0.4,31,", "3,0.25,32,25", "4,0.25,33,26"]
 
 
 def test_tensorboard_has_the_rate_and_crops_of_this_run_alone(tmp_path: Path, validation: list[Watched]) -> None:

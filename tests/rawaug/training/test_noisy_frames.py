@@ -18,6 +18,7 @@ from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
+from rawaug.noise.models import shot_read_variance
 from rawaug.plugin.augment import RawAugment
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import (
@@ -27,10 +28,17 @@ from rawaug.training.estimators import (
     Noisier,
     NoisyCrop,
     SelfSupervised,
-    variance_of,
 )
 from rawaug.training.loop import train
-from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, NoisyFrame, held_out, noisy_frame, noisy_only
+from rawaug.training.noisy_frames import (
+    FrozenPictures,
+    NoisyCrops,
+    NoisyFrame,
+    held_out,
+    noisy_frame,
+    noisy_only,
+    signal_estimate,
+)
 from rawaug.training.stream import TrainingStream
 from rawaug.training.validation import Watched, validate
 
@@ -156,7 +164,7 @@ def test_the_signal_is_cut_and_turned_with_the_shots(cfa: CFA) -> None:
 def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: RawAugment) -> None:
     frame = FrozenPictures(pictures, augment, seed=3)[0]
     below_white = frame.signal < 0.6
-    deviation = variance_of(frame.signal, frame.shot_var, frame.read_var).sqrt()
+    deviation = shot_read_variance(frame.signal, frame.shot_var, frame.read_var).sqrt()
     noise = ((frame.shots - frame.signal) / deviation)[below_white]
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.03) and float(noise.var()) == pytest.approx(1.0, rel=0.05)
 
@@ -176,7 +184,7 @@ def test_real_frames_are_estimated_once_and_only_for_estimators_that_add_noise(m
         estimated.append(1)
         return noisy
 
-    monkeypatch.setattr("rawaug.training.noisy_frames.first_estimate", counted)
+    monkeypatch.setattr("rawaug.training.noisy_frames.signal_estimate", counted)
     frame = NoisyFrame("real", torch.rand(1, 40, 48), 1e-3, 1e-5, CFA.RGGB)
     NoisyCrops([frame], Neighbor2Neighbor(), 16, CFA.RGGB).draw(torch.Generator())
     assert not estimated
@@ -232,5 +240,46 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     frames = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
     net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)
     packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
-    sample = Watched(unseen, packed, variance_of(unseen, 0.01, 1e-3))
+    sample = Watched(unseen, packed, shot_read_variance(unseen, 0.01, 1e-3))
     assert validate(net, [sample], torch.device("cpu"))["psnr"] > float(psnr(unseen, packed)) + 1.0
+
+
+def test_r2rs_target_hardly_depends_on_the_noise_of_its_input() -> None:
+    """What of the target a cubic in the input's noise explains, in standard deviations of the noise."""
+    pair = demo_pairs("validation", count=1)[0]
+    deviation = (8e-3 * pair.raw + 3e-4).sqrt()
+    noisy = pair.raw + deviation * torch.randn(pair.raw.shape, generator=torch.Generator().manual_seed(0))
+    clean, shot, sd = (bayer.pack(mosaic[None], pair.cfa)[0] for mosaic in (pair.raw, noisy, deviation))
+
+    def explained(signal: torch.Tensor) -> float:
+        crop = NoisyCrop(shot[None], bayer.pack(signal[None], pair.cfa)[0], 8e-3, 3e-4)
+        estimator = R2R()
+        sample = estimator.apply(crop, estimator.sample(shot.shape, torch.Generator().manual_seed(1)))
+        noise, error = (((x - clean) / sd).flatten().double() for x in (sample.noisy, sample.clean))
+        powers = noise[:, None] ** torch.arange(4)
+        return float((powers @ torch.linalg.lstsq(powers, error[:, None]).solution).square().mean().sqrt())
+
+    assert explained(pair.raw) < 0.05, "the true signal"
+    assert explained(signal_estimate(noisy, 8e-3, 3e-4, pair.cfa)) < 0.1
+    assert explained(noisy) > 0.2, "the noisy signal"
+
+
+def test_it_is_nearer_to_the_scene_than_the_frame_and_of_its_shape() -> None:
+    pair = demo_pairs("validation", count=1)[0]
+    assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
+    estimate = signal_estimate(pair.noisy, pair.shot_var, pair.read_var, pair.cfa)
+    assert estimate.shape == pair.noisy.shape
+    before, after = ((x - pair.raw).square().mean() for x in (pair.noisy, estimate))
+    assert after < 0.7 * before
+
+
+def test_noise_without_shots_needs_no_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy = torch.rand(1, 8, 8)
+    monkeypatch.delattr("rawaug.training.noisy_frames.NonLocalMeans")
+    assert signal_estimate(noisy, 0.0, 3e-4, demo_pairs("train", count=1)[0].cfa) is noisy
+
+
+def test_it_is_finite_where_shot_noise_is_far_below_read_noise() -> None:
+    dark = 1e-2 * torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0))
+    assert signal_estimate(dark, 1e-6, 1e-4, CFA.RGGB).isfinite().all()
+    assert signal_estimate(torch.zeros(1, 256, 256), 1e-6, 1e-4, CFA.RGGB).isfinite().all()
