@@ -6,7 +6,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint const
 
 # pip evaluates environment markers for the Python that runs it, whatever --python-version says; uv does not.
 COMPILE := MACOSX_DEPLOYMENT_TARGET=14.0 $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary :all:
-PYTHONS := 3.10 3.11 3.12 3.13
+PYTHONS := 3.11 3.12 3.13
 PLATFORMS := x86_64-manylinux_2_28 aarch64-apple-darwin x86_64-pc-windows-msvc  # CUDA, CPU, CPU
 WHEEL := build/resolve/requirements.in
 LOCKED := \# Exact versions by Python version and platform, written by make lock. CUDA packages are pinned by torch itself.
@@ -38,7 +38,7 @@ dist: | $(BIN)/python  ## the wheel and the source archive of a release
 	$(BIN)/python -m build
 
 lock: $(WHEEL)  ## constraints.txt anew, for every Python version and platform at once; pins that still hold stay
-	$(COMPILE) --universal --python-version 3.10 --fork-strategy requires-python --output-file constraints.txt $<
+	$(COMPILE) --universal --python-version 3.11 --fork-strategy requires-python --output-file constraints.txt $<
 	sed -i.old -E '/^(rawaug|nvidia-|cuda-)/d; 1i $(LOCKED)' constraints.txt && rm constraints.txt.old
 
 resolve: $(WHEEL)  ## what pip would install by constraints.txt, looked up on the index and not installed

@@ -14,7 +14,7 @@ splits in ``sample(...) -> params`` and a pure ``apply(raw, params)``.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from enum import Enum, IntEnum
+from enum import IntEnum, StrEnum
 from typing import Any
 
 import torch
@@ -38,16 +38,13 @@ class View(IntEnum):
     ANTITRANSPOSE = 7
 
 
-class CFA(str, Enum):
+class CFA(StrEnum):
     """The 2 x 2 colour filter array, read row by row from the top left: ``CFA("RGGB")`` is R G / G B."""
 
     RGGB = "RGGB"
     BGGR = "BGGR"
     GRBG = "GRBG"
     GBRG = "GBRG"
-
-    def __str__(self) -> str:
-        return self.value
 
     @classmethod
     def _missing_(cls, value: object) -> CFA:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -71,6 +72,10 @@ def run(
         report: write an HTML page with a denoiser's scores and crops to this file.
         json: write the result as JSON to this file.
         settings: of pairs:PATH.
+
+    Raises:
+        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
+            is for denoisers and the file is an ISP's, no frame can be read, or a result is not finite.
     """
 
     def written(result: dict[str, Any]) -> None:
@@ -101,26 +106,12 @@ def evaluate(
     first: Callable[[dict[str, Any]], None] | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Evaluate a file of weights; the result is the JSON object that ``rawaug evaluate --json`` writes.
+    """The JSON object that ``rawaug evaluate --json`` writes; arguments as in :func:`run`.
 
     Args:
-        weights: an ISP's or a denoiser's; the file says which.
-        data: a folder of clean RAW files, ``kind:path``, or a sequence of pairs.
-        self_ensemble: average a denoiser over eight views; the scores without it are under ``plain``.
-        noise: name or (shot_var, read_var) for frames without a noisy capture; by default what the denoiser was trained
-            with.
-        seed: seed of that noise.
-        classical: classical denoisers to score beside it on the same noise, see :data:`rawaug.registry.FILTERS`.
-        device: where the denoiser runs.
-        report: HTML file to write: scores and pictures of a denoiser.
-        views: of the self-ensemble, 4 or 8; given alone it asks for one.
+        data: as in the command, or pairs.
         first: called with the result without self-ensemble and classical denoisers where these are still to come.
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
-
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
-            is for denoisers and the file is an ISP's, or no frame can be read. Some that cannot are named under
-            ``broken``.
     """
     require_classical(classical)
     where = find_device(device)
@@ -138,7 +129,7 @@ def evaluate(
             )
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
-        result = summary([Score(pair.name, psnr_r(isp, pair)) for pair in frames])
+        result = summary([_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames])
     else:
         scoring = _Scoring(weights, pairs, noise, seed, where)
         result = scoring.plain()
@@ -195,4 +186,11 @@ class _Scoring:
 
     def _summary(self, views: int, label: str) -> dict[str, Any]:
         scored = score_method(self.method(views), self.pairs, self.levels, self.cfa, self.seed, label)
-        return summary([score for score, *_ in scored])
+        return summary([_finite(score) for score, *_ in scored])
+
+
+def _finite(score: Score) -> Score:
+    """The score, unless what was compared is not finite: weights of which the first frame shows that are of no use."""
+    if math.isnan(score.psnr):
+        raise ValueError(f"{score.name}: the result is not finite; the weights are damaged")
+    return score

@@ -5,7 +5,6 @@ The formulas are in :mod:`rawaug.isp.exposures`. Source: the HDR application of 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +17,9 @@ from rawaug.io import read_picture, write_picture
 from rawaug.io.pictures import MAX_PIXELS, read_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
+from rawaug.registry import require_between
+
+MOST_STOPS = 30.0
 
 
 def run(
@@ -41,6 +43,10 @@ def run(
         isp: ISP file of the camera, or the name of a shipped ISP.
         overwrite: replace the output file if it exists.
         max_pixels: a larger picture is refused before it is decoded.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or damaged.
+        ValueError: if pictures differ in size, or an exposure is missing, the same as another, or beyond 30 stops.
     """
     target = Path(out)
     require_writable(target)
@@ -59,15 +65,10 @@ def hdr(
     isp: str | Path = "universal",
     max_pixels: int = MAX_PIXELS,
 ) -> Tensor:
-    """The merged picture ``(3, H, W)`` in [0, 1]; arguments as in :func:`run`.
-
-    Raises:
-        FileNotFoundError, OSError: if a file is missing or damaged.
-        ValueError: if pictures differ in size, or an exposure is missing, not finite or the same as another.
-    """
+    """The merged picture ``(3, H, W)`` in [0, 1]; arguments and errors as in :func:`run`."""
     stops = exposures(pictures, ev)
-    if not all(map(math.isfinite, [*stops, exposure])):
-        raise ValueError(f"exposures must be finite, got {stops} and {exposure}")
+    for value in (*stops, exposure):
+        require_between("an exposure", value, -MOST_STOPS, MOST_STOPS)
     camera = DictionaryISP.from_pretrained(isp)
     merged = merge_exposures(camera, [srgb[None] for srgb in _read(pictures, max_pixels)], stops)
     return render_exposure(camera, merged.image, merged.params, exposure)[0]

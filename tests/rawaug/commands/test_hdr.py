@@ -66,7 +66,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         ([first, second], None, r"b\.jpg: its EXIF has no exposure time or f-number or ISO; give .* with --ev$"),
         ([first, wide], None, r"wide\.jpg: is 8 x 16, but .*a\.jpg is 8 x 12; align and crop"),
         ([first, second], [0.0], r"--ev: one exposure for each picture is needed, got 1 for 2$"),
-        ([first, second], [0.0, math.inf], r"exposures must be finite"),
+        ([first, second], [0.0, math.inf], r"an exposure must be a number from -30.0 to 30.0, got inf"),
         ([first, second], [1.0, 1.0], r"exposures must differ"),
     ):
         with pytest.raises(ValueError, match=message) as error:
@@ -74,3 +74,5 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
     with pytest.raises(FileNotFoundError, match=r"none\.jpg: no such picture file"):
         hdr([str(tmp_path / "none.jpg"), first])
+    with pytest.raises(ValueError, match=r"an exposure must be a number from -30.0 to 30.0, got 5000.0"):
+        hdr([first], exposure=5000.0)
