@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from denoisers.domains import levels_of
+from rawaug.bayer import noise_variance
 from rawaug.registry import FILTERS
 
 Planes = np.ndarray[Any, np.dtype[np.float32]]
@@ -217,8 +218,8 @@ class Stabilised:
             shot_var, read_var = _line(noisy, variance)
         shot, read = (torch.as_tensor(level).to(noisy).expand(len(noisy)) for level in (shot_var, read_var))
         if not (shot > 0).all():
-            map_ = shot.reshape(-1, 1, 1, 1) * noisy.clamp(min=0) + read.reshape(-1, 1, 1, 1)
-            return self.denoiser(noisy, map_)
+            levels = (level.reshape(-1, 1, 1, 1) for level in (shot, read))
+            return self.denoiser(noisy, noise_variance(noisy, *levels))
         stable = self.transform.forward(noisy, shot, read)
         return self.transform.inverse(self.denoiser(stable, torch.ones_like(stable)), shot, read)
 
@@ -228,6 +229,6 @@ def _line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
     shot, read = levels_of(noisy.double(), variance.double())
-    if not torch.allclose(shot * noisy.clamp(min=0) + read, variance.double(), rtol=1e-2, atol=1e-12):
+    if not torch.allclose(noise_variance(noisy, shot, read), variance.double(), rtol=1e-2, atol=1e-12):
         raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
     return shot.flatten(), read.flatten()

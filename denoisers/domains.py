@@ -27,6 +27,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from rawaug.bayer import noise_variance
+
 _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
@@ -79,7 +81,7 @@ class Domain(ABC):
 
     def relative_deviation(self, y: Tensor, variance: Tensor, shot: Tensor, read: Tensor) -> Tensor:
         """The noise's deviation over what the transform takes it for: below 1 where shot_var is below its bound."""
-        expected = self.bounded(shot, read) * y.clamp_min(0.0) + read
+        expected = noise_variance(y, self.bounded(shot, read), read)
         return (variance / expected.clamp_min(1e-20)).sqrt().clamp_max(1.0)
 
     @abstractmethod

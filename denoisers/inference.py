@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from denoisers.domains import levels_of
 from rawaug import bayer
+from rawaug.bayer import noise_variance
 
 
 def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
@@ -187,12 +188,12 @@ class Recorrupted(nn.Module):
         """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
         shot_var, read_var = levels_of(noisy, variance)
         signal = self.model(noisy, variance)
-        deviation = self.alpha * (shot_var * signal.clamp_min(0.0) + read_var).sqrt()
+        deviation = self.alpha * noise_variance(signal, shot_var, read_var).sqrt()
         generator = torch.Generator().manual_seed(self.seed)
         total = torch.zeros_like(noisy)
         for _ in range(self.draws):
             drawn = torch.randn(noisy.shape, generator=generator).to(noisy)
             noisier = (noisy + deviation * drawn).clamp(max=1.0)
-            noise_map = (1.0 + self.alpha**2) * (shot_var * noisier.clamp_min(0.0) + read_var)
+            noise_map = (1.0 + self.alpha**2) * noise_variance(noisier, shot_var, read_var)
             total += self.model(noisier, noise_map)
         return total / self.draws

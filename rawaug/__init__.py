@@ -8,61 +8,44 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from rawaug._version import __version__
-
 if TYPE_CHECKING:
-    from rawaug.bayer import CFA
-    from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
-    from rawaug.isp.model import DictionaryISP
-    from rawaug.plugin.augment import RawAugment
-    from rawaug.plugin.dataset import RawPairs, RawPairStream
-    from rawaug.plugin.loader import WrappedLoader, wrap
-    from rawaug.plugin.params import AugmentParams, RawPair, load_params, save_params
-    from rawaug.training.camera import fit
+    from rawaug.bayer import CFA as CFA
+    from rawaug.isp.config import ISPConfig as ISPConfig
+    from rawaug.isp.config import ISPParams as ISPParams
+    from rawaug.isp.config import ISPResult as ISPResult
+    from rawaug.isp.model import DictionaryISP as DictionaryISP
+    from rawaug.plugin.augment import RawAugment as RawAugment
+    from rawaug.plugin.dataset import RawPairs as RawPairs
+    from rawaug.plugin.dataset import RawPairStream as RawPairStream
+    from rawaug.plugin.loader import WrappedLoader as WrappedLoader
+    from rawaug.plugin.loader import wrap as wrap
+    from rawaug.plugin.params import AugmentParams as AugmentParams
+    from rawaug.plugin.params import RawPair as RawPair
+    from rawaug.plugin.params import load_params as load_params
+    from rawaug.plugin.params import save_params as save_params
+    from rawaug.training.camera import fit as fit
 
-_MODULES = {
-    "CFA": "rawaug.bayer",
-    "AugmentParams": "rawaug.plugin.params",
-    "DictionaryISP": "rawaug.isp.model",
-    "ISPConfig": "rawaug.isp.config",
-    "ISPParams": "rawaug.isp.config",
-    "ISPResult": "rawaug.isp.config",
-    "RawAugment": "rawaug.plugin.augment",
-    "RawPair": "rawaug.plugin.params",
-    "RawPairStream": "rawaug.plugin.dataset",
-    "RawPairs": "rawaug.plugin.dataset",
-    "WrappedLoader": "rawaug.plugin.loader",
-    "fit": "rawaug.training.camera",
-    "load_params": "rawaug.plugin.params",
-    "save_params": "rawaug.plugin.params",
-    "wrap": "rawaug.plugin.loader",
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "rawaug.bayer": ("CFA",),
+    "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
+    "rawaug.isp.model": ("DictionaryISP",),
+    "rawaug.plugin.augment": ("RawAugment",),
+    "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
+    "rawaug.plugin.loader": ("WrappedLoader", "wrap"),
+    "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
+    "rawaug.training.camera": ("fit",),
 }
-"""Public name to the module that defines it."""
+_MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 
-__all__ = [
-    "CFA",
-    "AugmentParams",
-    "DictionaryISP",
-    "ISPConfig",
-    "ISPParams",
-    "ISPResult",
-    "RawAugment",
-    "RawPair",
-    "RawPairStream",
-    "RawPairs",
-    "WrappedLoader",
-    "__version__",
-    "fit",
-    "load_params",
-    "save_params",
-    "wrap",
-]
+__all__ = [*_MODULE_OF, "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
     return value
 
 

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.errors import MissingExtra, printable, shortage, without_traceback
 from rawaug.progress import quiet as without_progress
 

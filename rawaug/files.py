@@ -1,14 +1,7 @@
-"""Files: written whole or not at all, hashed, and safetensors whose errors fit one line.
+"""Files: written whole or not at all, one run at a time in a folder, hashed; safetensors and JSON checked as read.
 
-Weights, parameters and states are safetensors (https://huggingface.co/docs/safetensors) with texts in their header;
-``format`` is ``rawaug`` and ``kind`` says what is in the file. What others made is data, checked as it is read: numbers
-must be finite, in tensors and in JSON.
-
-One run at a time in a folder: a lock file with its owner, whom the second run names when it is refused.
-
-The lock is POSIX's on the open file (``fcntl.lockf``), which the kernel releases when its process ends, however it
-ends: the file that a killed run leaves behind is taken over. It holds on NFS, between machines, and children of the
-process do not inherit it. Where there is no ``fcntl`` (Windows) nothing is locked.
+Weights, parameters and states are safetensors (https://huggingface.co/docs/safetensors) with text in their header:
+``format`` is ``rawaug`` and ``kind`` says what the file holds. Numbers in files must be finite.
 """
 
 from __future__ import annotations
@@ -19,22 +12,21 @@ import json
 import math
 import os
 import re
-import socket
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from functools import wraps
-from itertools import count
 from pathlib import Path
-from typing import IO, Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+P = ParamSpec("P")
+R = TypeVar("R")
+
+LOCK = "rawaug.lock"
+"""Name of the lock file in an output folder."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The folder of the shipped ISPs."""
@@ -65,10 +57,12 @@ def yaml_value(text: str) -> Any:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to, which takes its place when the block ends without an error.
+    """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an error.
 
-    The file has the rights that the user's umask gives. It is locked while the block runs: another process that writes
-    the same ``path`` takes another name, and what a killed process left is written over, and so removed.
+    Two writers of one file take turns. What a killed process left is removed by the next.
+
+    Raises:
+        OSError: naming ``path``, if it cannot be written.
 
     Example:
         >>> import tempfile
@@ -78,59 +72,81 @@ def replacing(path: str | Path) -> Iterator[Path]:
         ...     [file.name for file in Path(folder, "new").iterdir()]
         ['a.txt']
     """
+    from filelock import FileLock
+
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _claimed(path) as partial:
-        try:
-            yield partial
-            partial.replace(path)
-        except OSError as error:
-            if (named := _named(error, path, partial)) is not error:
-                raise named from error
+    key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may be as long as a name can be
+    partial, lock = path.with_name(f".{key}.partial"), path.with_name(f".{key}.lock")
+    try:
+        with FileLock(lock):
+            try:
+                partial.unlink(missing_ok=True)
+                yield partial
+                partial.replace(path)
+            finally:
+                partial.unlink(missing_ok=True)
+                lock.unlink(missing_ok=True)
+    except OSError as error:
+        if "requested and" in str(error):  # NumPy's error on a full disk
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+        if error.errno is None or error.filename not in (None, str(partial), partial, str(lock)):
             raise
-        finally:
-            partial.unlink(missing_ok=True)
-
-
-def _named(error: OSError, path: Path, partial: Path) -> OSError:
-    """The error with the name of the file that was to be written: a full disk is reported without it."""
-    if "requested and" in str(error):  # NumPy's, of a write that was cut short
-        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    if error.errno is None or error.filename not in (None, str(partial), partial):
-        return error
-    return OSError(error.errno, error.strerror, str(path))
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 @contextmanager
-def _claimed(path: Path) -> Iterator[Path]:
-    """An empty file beside ``path`` that no other process writes to."""
-    key = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]  # the name itself may be as long as a name can be
-    if fcntl is None:
-        yield path.with_name(f".{key}.{os.getpid()}.partial")
-        return
-    for number in count():
-        partial = path.with_name(f".{key}.{number}.partial")
-        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            if _lock(descriptor, partial):
-                os.ftruncate(descriptor, 0)
-                yield partial
-                return
-        finally:
-            os.close(descriptor)  # which unlocks
+def locked(file: Path) -> Iterator[None]:
+    """Hold the lock ``file``. Its folder is made, and removed again if it stays empty.
 
+    Raises:
+        ValueError: if another run holds it.
+        OSError: if it cannot be written, or the folder was removed during the run.
 
-def _lock(descriptor: int, partial: Path) -> bool:
-    """Whether the file is ours now; not if another process has it, or had it and has put it in its place since."""
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder, LOCK)):
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['rawaug.lock']
+    """
+    from filelock import FileLock, Timeout
+
+    folder = file.absolute().parent
+    made = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(file, timeout=0)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(descriptor), partial.stat())
-    except (BlockingIOError, FileNotFoundError):
-        return False
+        lock.acquire()
+    except Timeout:
+        raise ValueError(f"{folder}: in use by another run ({file.name}); wait for it, or choose another") from None
+    try:
+        yield
+        if not file.exists():
+            raise OSError(f"{folder}: was removed or replaced during this run; run the same command again")
+    finally:
+        file.unlink(missing_ok=True)  # while it is locked: whoever waits for this file tries again
+        lock.release()
+        if made and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator: hold the lock of the folder that ``folder(*arguments)`` names; no lock for None."""
+
+    def decorator(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            place = folder(*args, **kwargs)
+            with nullcontext() if place is None else locked(place / LOCK):
+                return function(*args, **kwargs)
+
+        return call
+
+    return decorator
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """JSON, which has no infinity and no NaN: they become null."""
+    """JSON; infinity and NaN, which JSON does not have, become null."""
     return json.dumps(_finite(value), indent=indent, allow_nan=False)
 
 
@@ -143,10 +159,10 @@ def _finite(value: Any) -> Any:
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """A JSON object from a file that others may have made.
+    """A JSON object from a file of others.
 
     Raises:
-        ValueError: in one line, if it is something else, too deeply nested, or has a number that is not finite.
+        ValueError: if it is something else, too deeply nested, or has a number that is not finite.
     """
 
     def refuse(number: str) -> float:
@@ -167,14 +183,10 @@ def parse_object(text: str) -> dict[str, Any]:
 
 
 def require_writable(path: str | Path, folder: bool = False) -> None:
-    """Refuse, before any work, a file or folder that could not be written at the end; nothing is left on the disk.
-
-    Args:
-        path: of the file, which need not exist, nor its folders.
-        folder: ``path`` is that of a folder.
+    """Refuse, before any work, a file (or ``folder``) that could not be written at the end.
 
     Raises:
-        OSError: in one line, with what is in the way.
+        OSError: with what is in the way.
 
     Example:
         >>> require_writable("/dev/null/report.html")
@@ -194,14 +206,14 @@ def require_writable(path: str | Path, folder: bool = False) -> None:
 
 
 def write_json(value: Any, path: str | Path) -> None:
-    """Write JSON, whole or not at all, making its folder."""
+    """Write JSON, whole or not at all."""
     text = to_json(value, indent=1)
     with replacing(path) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
 
 
 def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path: str | Path) -> None:
-    """Write safetensors, whole or not at all, making their folder; equal content makes equal files."""
+    """Write safetensors, whole or not at all; equal content makes equal files."""
     from safetensors.torch import save
 
     content = save({name: tensor.contiguous() for name, tensor in tensors.items()}, dict(header))
@@ -301,103 +313,3 @@ def fingerprint(*settings: Any) -> str:
         False
     """
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]
-
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-NAME = "rawaug.files"
-"""Of the lock file in a folder."""
-
-_held: set[tuple[Path, int]] = set()
-"""By process: within one, POSIX's locks do not exclude each other, and a child inherits this set."""
-
-
-@contextmanager
-def locked(file: Path) -> Iterator[None]:
-    """Hold the lock ``file``, whose folder is made, and is removed if it is still empty.
-
-    Raises:
-        ValueError: if another run holds it, named by process and machine.
-        OSError: if it cannot be written, or was gone at the end: the folder was removed or replaced meanwhile.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder, NAME)):
-        ...     [path.name for path in Path(folder).iterdir()]
-        ['rawaug.files']
-    """
-    if fcntl is None:
-        yield
-        return
-    file = file.absolute()
-    made = not file.parent.exists()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    own = (file, os.getpid())
-    if own in _held:
-        raise ValueError(_refusal(file, "this process"))
-    with _acquired(file) as handle:
-        _held.add(own)
-        try:
-            yield
-            if not _is_at(file, handle):
-                raise OSError(f"{file.parent}: was removed or replaced during this run; run the same command again")
-        finally:
-            _held.discard(own)
-            if _is_at(file, handle):
-                file.unlink()
-            if made and file.parent.is_dir() and not any(file.parent.iterdir()):
-                file.parent.rmdir()
-
-
-def one_at_a_time(folder: Callable[..., Path | None]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator: hold the lock of the folder that the arguments name during a call; of None none."""
-
-    def decorator(function: Callable[P, R]) -> Callable[P, R]:
-        @wraps(function)
-        def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            place = folder(*args, **kwargs)
-            with nullcontext() if place is None else locked(place / NAME):
-                return function(*args, **kwargs)
-
-        return call
-
-    return decorator
-
-
-def _acquired(file: Path) -> IO[str]:
-    """The locked file, open; its owner is in it."""
-    while True:
-        handle = file.open("a+")
-        try:
-            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):
-            handle.seek(0)
-            owner = handle.read().strip() or "another run"
-            handle.close()
-            raise ValueError(_refusal(file, owner)) from None
-        except BaseException:
-            handle.close()
-            raise
-        if _is_at(file, handle):  # not the file that its last owner has just removed
-            handle.truncate(0)
-            handle.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            handle.flush()
-            return handle
-        handle.close()
-
-
-def _is_at(file: Path, handle: IO[str]) -> bool:
-    try:
-        return os.path.samestat(file.stat(), os.fstat(handle.fileno()))
-    except FileNotFoundError:
-        return False
-
-
-def _refusal(file: Path, owner: str) -> str:
-    return f"{file.parent}: in use by {owner} ({file.name}); wait for it, or choose another output"

@@ -11,7 +11,7 @@ import torch
 
 import denoisers
 from denoisers.files import FOLDER
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.bayer import CFA
 from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs

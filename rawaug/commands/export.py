@@ -304,7 +304,7 @@ def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
     top, left = (max(0, side - SIDE) // 4 * 2 for side in (height, width))
     packed = bayer.pack(raw.mosaic[None, :, top : top + SIDE, left : left + SIDE], raw.cfa).contiguous()
     shot_var, read_var = raw.noise_profile or (1e-3, 1e-5)
-    return packed, shot_var * packed.clamp_min(0.0) + read_var
+    return packed, bayer.noise_variance(packed, shot_var, read_var)
 
 
 def _fastest(call: Callable[[], Any], repeats: int = 3) -> float:

@@ -221,7 +221,7 @@ def denoise_mosaic(
     rows, columns = frame.cfa.shift_to(cfa)
     packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
     shot_var, read_var = levels
-    variance = packed.clamp(min=0).mul_(shot_var).add_(read_var)
+    variance = bayer.noise_variance(packed, shot_var, read_var)
     denoised = denoise(model, Sample(packed, packed, variance), cfa, 8 if self_ensemble else 1)
     mosaic = bayer.unpack(denoised, cfa)[0]
     return mosaic[..., rows : rows + height, columns : columns + width].clamp(max=1.0)

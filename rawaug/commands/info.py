@@ -8,7 +8,7 @@ from typing import Any
 
 import denoisers
 from denoisers.files import FOLDER
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.model import DictionaryISP
 

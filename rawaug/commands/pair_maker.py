@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
 from rawaug.io.apart import apart

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.bayer import pattern
 from rawaug.errors import extra
 from rawaug.files import require_writable
 from rawaug.io import encode_srgb, read_picture
@@ -21,7 +22,6 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, place_in_frame
 from rawaug.isp.tone import STEPS
-from rawaug.patterns import pattern
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
 from rawaug.seeding import keyed_generator

@@ -30,7 +30,7 @@ from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.errors import printable
 from rawaug.evaluation.tables import print_rows
-from rawaug.files import NAME, find_weights, locked, sha256
+from rawaug.files import LOCK, find_weights, locked, sha256
 from rawaug.io.apart import prepare
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
@@ -138,7 +138,7 @@ def synth(
     if format == "dng" and cfa not in CFA.__members__:
         raise ValueError(f"format dng holds Bayer mosaics, not {cfa}; use npz, tiff or webdataset")
     result = Synthesis(out)
-    with locked(out / (NAME if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
+    with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
         if format == "webdataset":
             shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
             fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)

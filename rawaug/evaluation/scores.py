@@ -65,7 +65,7 @@ def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
     clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
     if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
         noisy = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa)
-        return Sample(noisy, clean, pair.read_var + pair.shot_var * noisy.clamp_min(0.0))
+        return Sample(noisy, clean, bayer.noise_variance(noisy, pair.shot_var, pair.read_var))
     params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
     noisy = noise.apply(clean, params)
     return Sample(noisy, clean, noise.variance(noisy, params))

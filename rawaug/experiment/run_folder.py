@@ -1,4 +1,4 @@
-"""The folder of a run: ``OUT/NAME``, which holds one run alone.
+"""The folder of a run: ``OUT/LOCK``, which holds one run alone.
 
 ``run.json`` holds the settings of the run. The same settings resume it; others are refused, but for those that change
 neither weights nor scores.
@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rawaug.files import NAME, require_writable, write_json
+from rawaug.files import LOCK, require_writable, write_json
 from rawaug.training.config import SAME_WEIGHTS
 
 STAMP = "run.json"
@@ -91,7 +91,7 @@ def _as_json(settings: Any) -> dict[str, Any]:
 
 def _filled(folder: Path) -> bool:
     """Whether there is more than what a run has as it begins, or left when it was killed there."""
-    return any(file.name != NAME and file.suffix != ".partial" for file in folder.iterdir())
+    return any(file.name != LOCK and file.suffix != ".partial" for file in folder.iterdir())
 
 
 def _flat(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, extra, printable
 from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
 from rawaug.explore.views import VIEWS, Panel, denoised
 from rawaug.files import shipped_isps
 from rawaug.isp.cameras import LAMPS, published_cameras
-from rawaug.patterns import PATTERNS
 from rawaug.plugin.sampling_config import Drawing
 
 STYLE = """

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from denoisers.files import DEFAULT, find, load
 from denoisers.network import Denoiser
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, pattern
 from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.explore import figures
@@ -27,7 +27,6 @@ from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
 from rawaug.metrics import psnr
-from rawaug.patterns import pattern
 from rawaug.plugin.pictures import even_sided
 from rawaug.plugin.sampling_config import draw_key
 

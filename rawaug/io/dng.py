@@ -26,7 +26,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.files import replacing

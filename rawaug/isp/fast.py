@@ -34,9 +34,9 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, node_colours
 from rawaug.isp.tone import STEPS
-from rawaug.kernels import runtime
+from rawaug.kernels import fastest, runtime
 from rawaug.kernels.reference import Camera, look_up, unprocess
-from rawaug.kernels.runtime import fastest, one_thread
+from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""

@@ -1,1 +1,55 @@
-"""The same pass for a CPU (Numba) and a GPU (Triton), beside plain PyTorch."""
+"""Passes over pixels, each with one result in up to three forms, among which :func:`fastest` chooses.
+
+They are in PyTorch (:mod:`rawaug.kernels.reference`), as loops for the CPU (:mod:`rawaug.kernels.cpu`), and as Triton
+kernels for CUDA (:mod:`rawaug.kernels.gpu`). PyTorch runs where Numba or Triton is missing, is switched off
+(``NUMBA_DISABLE_JIT=1``), or fails to compile. With ``TRITON_INTERPRET=1`` Triton's kernels run step by step on CPU
+tensors, for tests.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from rawaug.kernels import runtime
+
+R = TypeVar("R")
+
+_failed: list[str] = []
+"""Names of the errors that Triton's kernels have raised; after one they are not tried again."""
+
+
+def triton_usable(image: Tensor) -> bool:
+    """Whether to try a Triton kernel on ``image``."""
+    return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
+
+
+def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
+    """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
+    if triton_usable(image):
+        return kernel_or(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
+    if image.device.type == "cpu" and runtime.has_numba():
+        result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
+        return result
+    return otherwise()
+
+
+def kernel_or(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
+    """The result of ``kernel``, or of ``otherwise`` after a warning if it fails."""
+    try:
+        return kernel()
+    except torch.OutOfMemoryError:  # says nothing about the kernel
+        raise
+    except Exception as error:  # whatever a compiler, its driver or its cache may raise
+        _failed.append(type(error).__name__)
+        reason = (str(error).splitlines() or [""])[-1]
+        warnings.warn(
+            f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
+        )
+        return otherwise()

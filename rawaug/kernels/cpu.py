@@ -231,9 +231,9 @@ def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: igno
 
 
 @compiled
-def _raw_rows(
-    srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop
-):  # type: ignore[no-untyped-def]
+def _raw_rows(  # type: ignore[no-untyped-def]
+    srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop,
+):  # fmt: skip
     """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
     height, width = srgb.shape[2], raw.shape[3]
     nodes, shares = np.empty(2 * _TILE, np.int32), np.empty((3, 2 * _TILE), np.float32)

@@ -1,9 +1,4 @@
-"""Where code runs: devices by name, threads, loops compiled by Numba, kernels compiled by Triton.
-
-A pass over pixels exists up to three times, with one result: in PyTorch (:mod:`rawaug.kernels.reference`), as loops
-for the CPU (:mod:`rawaug.kernels.cpu`), and as Triton kernels for CUDA (:mod:`rawaug.kernels.gpu`), among which
-:func:`fastest` chooses. PyTorch runs where Numba or Triton is missing, switched off (``NUMBA_DISABLE_JIT=1``), or fails
-to compile. With ``TRITON_INTERPRET=1`` Triton's kernels run step by step on CPU tensors, for tests.
+"""Where code runs: devices by name, threads, and loops compiled by Numba.
 
 PyTorch's loops divide a tensor among threads, and the ends of each share go through other instructions than its middle,
 so the last bit of a power depends on the number of threads; :func:`one_thread` gives the same bits everywhere. OpenMP's
@@ -13,19 +8,15 @@ threads do not survive a fork, and a loop waiting for them never ends, so a fork
 from __future__ import annotations
 
 import os
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, wraps
-from importlib import import_module
-from importlib.util import find_spec
 from itertools import pairwise
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from torch import Tensor
 
 from rawaug.registry import nearest
 
@@ -176,37 +167,3 @@ def over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
     for helper in helpers:
         if not helper.cancel():
             helper.result()
-
-
-_failed: list[str] = []
-"""Names of the errors that Triton's kernels have raised; after one they are not tried again."""
-
-
-def triton_usable(image: Tensor) -> bool:
-    """Whether to try a Triton kernel on ``image``."""
-    return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
-
-
-def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
-    """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
-    if triton_usable(image):
-        return kernel_or(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
-    if image.device.type == "cpu" and has_numba():
-        result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
-        return result
-    return otherwise()
-
-
-def kernel_or(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
-    """The result of ``kernel``, or of ``otherwise`` after a warning if it fails."""
-    try:
-        return kernel()
-    except torch.OutOfMemoryError:  # says nothing about the kernel
-        raise
-    except Exception as error:  # whatever a compiler, its driver or its cache may raise
-        _failed.append(type(error).__name__)
-        reason = (str(error).splitlines() or [""])[-1]
-        warnings.warn(
-            f"rawaug's GPU kernel is unavailable, using PyTorch instead: {type(error).__name__}: {reason}", stacklevel=3
-        )
-        return otherwise()

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, pack
-from rawaug.io import read_raw
 from rawaug.noise.models import Params, PoissonGaussianNoise, new_seeds
 from rawaug.noise.sensor import Range, draw
 from rawaug.registry import NOISE
@@ -96,6 +95,7 @@ class DarkFrames(PoissonGaussianNoise):
 
     def __init__(self, path: str, shot_var: Range | None = None) -> None:
         from rawaug.data.folders import RawFolder
+        from rawaug.io import read_raw
 
         frames = [read_raw(file) for file in RawFolder(path).files]
         untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]

@@ -24,8 +24,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from rawaug.bayer import noise_variance
+from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
-from rawaug.kernels.runtime import eager, fastest
+from rawaug.kernels.runtime import eager
 from rawaug.noise.levels import NoiseLevels
 from rawaug.noise.poisson import poisson
 from rawaug.seeding import derived_seed, keyed_generator
@@ -126,11 +128,6 @@ def drawn_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor
     return drawn
 
 
-def shot_read_variance(signal: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
-    """``shot_var max(signal, 0) + read_var``, of the signal's shape."""
-    return read_var + shot_var * signal.clamp_min(0.0)
-
-
 class ShotReadModel(NoiseModel):
     """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
 
@@ -149,8 +146,7 @@ class ShotReadModel(NoiseModel):
         return {"shot_var": shot_var, "read_var": read_var, "seed": new_seeds(batch, generator)}
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        shot_var, read_var = (per_picture(params[name], clean) for name in ("shot_var", "read_var"))
-        return torch.addcmul(read_var, clean.clamp(min=0), shot_var)
+        return noise_variance(clean, *(per_picture(params[name], clean) for name in ("shot_var", "read_var")))
 
 
 class ShotReadNoise(ShotReadModel):

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from rawaug import bayer
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, pattern
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP
@@ -31,7 +31,6 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
-from rawaug.patterns import pattern
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.registry import nearest
@@ -61,7 +60,7 @@ class RawAugment(nn.Module):
             default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
             above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
-            like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.patterns`.
+            like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.bayer`.
         light: of an ISP of published cameras, the light that cameras are drawn in: a colour temperature in kelvin, or
             one of :data:`rawaug.isp.cameras.LAMPS` by name. Any light by default.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.

@@ -33,8 +33,8 @@ from torch import Tensor, nn
 
 from denoisers.inference import Recorrupted
 from denoisers.network import Denoiser
+from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Sample
-from rawaug.noise.models import shot_read_variance
 from rawaug.registry import ESTIMATORS
 from rawaug.training.criteria import Criterion
 
@@ -81,7 +81,7 @@ class NoisyCrop(NamedTuple):
 
     def variance(self, signal: Tensor) -> Tensor:
         """Of the noise at ``signal``, its shape."""
-        return shot_read_variance(signal, self.shot_var, self.read_var)
+        return noise_variance(signal, self.shot_var, self.read_var)
 
     @property
     def deviation(self) -> Tensor:

@@ -58,7 +58,7 @@ class RealCrops:
         if pair.noisy is not None:
             params = {"shot_var": torch.tensor([pair.shot_var]), "read_var": torch.tensor([pair.read_var])}
             clean, noisy = packed[:1], packed[1:]
-            level = params["read_var"] + params["shot_var"] * noisy.clamp_min(0.0)
+            level = bayer.noise_variance(noisy, params["shot_var"], params["read_var"])
             return Sample(noisy[0], clean[0], level[0])
         noisy = self.noise.apply(packed, params)
         return Sample(noisy[0], packed[0], self.noise.variance(noisy, params)[0])

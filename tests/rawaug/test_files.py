@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import torch
@@ -100,20 +101,25 @@ def test_a_folder_without_permission_is_refused(tmp_path: Path, monkeypatch: pyt
         require_writable(tmp_path / "report.html")
 
 
-def test_two_writers_of_one_file_do_not_meet_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
+def test_two_writers_take_turns_and_what_a_killed_one_left_is_removed(tmp_path: Path) -> None:
     path = tmp_path / ("n" * 251 + ".txt")  # as long as a name can be
-    with replacing(path) as first:
-        first.write_text("first")
-        with replacing(path) as second:
-            assert second != first
-            second.write_text("second")
-        left = first.read_text()
-    assert left == path.read_text() == "first"
+
+    def write_second() -> None:
+        with replacing(path) as partial:
+            partial.write_text("second")
+
+    other = Thread(target=write_second)
     with replacing(path) as partial:
+        other.start()
+        partial.write_text("first")
+        other.join(0.2)
+        assert other.is_alive() and partial.read_text() == "first"
         abandoned = partial.name
+    other.join(10)
+    assert path.read_text() == "second"
     (tmp_path / abandoned).write_text("half of a file, and the process was killed")
-    with replacing(path) as partial:
-        assert partial.name == abandoned and partial.read_text() == ""
+    with pytest.raises(FileNotFoundError), replacing(path) as partial:
+        assert partial.name == abandoned and not partial.exists()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 

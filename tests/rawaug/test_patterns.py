@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.bayer import PATTERNS, Pattern, pattern
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import ColourBias
-from rawaug.patterns import PATTERNS, Pattern, pattern
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 

@@ -32,7 +32,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rawaug._version import __version__
+from rawaug import __version__
 from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig

@@ -9,9 +9,10 @@ from unittest import mock
 
 import torch
 
+from rawaug import kernels
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import cpu, gpu, reference, runtime
+from rawaug.kernels import cpu, gpu, reference
 from rawaug.noise.levels import FixedLevels
 from rawaug.noise.models import ShotReadNoise
 from tests.rawaug.kernels.full_isp import CONFIGURATIONS, full_isp
@@ -57,10 +58,10 @@ def check_kernels_are_used() -> None:
         asked.append(image.shape)
         return True
 
-    with mock.patch.object(runtime, "triton_usable", usable):
+    with mock.patch.object(kernels, "triton_usable", usable):
         torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
-    assert asked == [clean.shape, srgb.shape] and not runtime._failed
+    assert asked == [clean.shape, srgb.shape] and not kernels._failed
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.kernels import runtime
+from rawaug import kernels
 
 triton = pytest.importorskip("triton", reason="pip install rawaug[test] on Linux")
 
@@ -59,18 +59,18 @@ def compiled_for_a_gpu(kernel: Any, types: dict[str, str], constants: dict[str, 
 
 
 def test_a_kernel_that_fails_is_reported_once_and_pytorch_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "_failed", [])
+    monkeypatch.setattr(kernels, "_failed", [])
 
     def fails() -> int:
         raise RuntimeError("no ptxas\nfor this target")
 
     with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
-        assert runtime.kernel_or(fails, lambda: 2) == 2
-    assert not runtime.triton_usable(torch.zeros(1, device="meta"))
+        assert kernels.kernel_or(fails, lambda: 2) == 2
+    assert not kernels.triton_usable(torch.zeros(1, device="meta"))
 
     def has_no_room() -> int:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     with pytest.raises(torch.OutOfMemoryError):
-        runtime.kernel_or(has_no_room, lambda: 2)
-    assert runtime._failed == ["RuntimeError"]
+        kernels.kernel_or(has_no_room, lambda: 2)
+    assert kernels._failed == ["RuntimeError"]

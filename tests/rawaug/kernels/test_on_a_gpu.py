@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from rawaug import kernels
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels import reference, runtime
+from rawaug.kernels import reference
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, ShotReadNoise
 from rawaug.plugin.augment import RawAugment
@@ -42,7 +43,7 @@ def assert_same_bits(a: RawPair, b: RawPair) -> None:
 def test_the_kernels_are_the_ones_that_run() -> None:
     srgb = pictures().to(DEVICE)
     on_device()(srgb)
-    assert runtime.triton_usable(srgb) and not runtime._failed
+    assert kernels.triton_usable(srgb) and not kernels._failed
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import denoisers
-from rawaug.noise.models import shot_read_variance
+from rawaug.bayer import noise_variance
 from rawaug.training.estimators import (
     NEIGHBOURS,
     R2R,
@@ -31,7 +31,7 @@ def scene_and_shots(shots: int = 1, clean: Tensor | None = None, seed: int = 0) 
     generator = torch.Generator().manual_seed(seed)
     if clean is None:
         clean = 0.4 + SIGNAL_VAR**0.5 * torch.randn(4, 256, 256, generator=generator)
-    noise = torch.randn(shots, *clean.shape, generator=generator) * shot_read_variance(clean, SHOT_VAR, READ_VAR).sqrt()
+    noise = torch.randn(shots, *clean.shape, generator=generator) * noise_variance(clean, SHOT_VAR, READ_VAR).sqrt()
     return clean, clean + noise
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
 from rawaug.experiment.arms import frames_of, training_stream, validation_samples
@@ -18,7 +18,6 @@ from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, noise_model
-from rawaug.noise.models import shot_read_variance
 from rawaug.plugin.augment import RawAugment
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.estimators import (
@@ -164,7 +163,7 @@ def test_the_signal_is_cut_and_turned_with_the_shots(cfa: CFA) -> None:
 def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: RawAugment) -> None:
     frame = FrozenPictures(pictures, augment, seed=3)[0]
     below_white = frame.signal < 0.6
-    deviation = shot_read_variance(frame.signal, frame.shot_var, frame.read_var).sqrt()
+    deviation = noise_variance(frame.signal, frame.shot_var, frame.read_var).sqrt()
     noise = ((frame.shots - frame.signal) / deviation)[below_white]
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.03) and float(noise.var()) == pytest.approx(1.0, rel=0.05)
 
@@ -240,7 +239,7 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     frames = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
     net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)
     packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
-    sample = Watched(unseen, packed, shot_read_variance(unseen, 0.01, 1e-3))
+    sample = Watched(unseen, packed, noise_variance(unseen, 0.01, 1e-3))
     assert validate(net, [sample], torch.device("cpu"))["psnr"] > float(psnr(unseen, packed)) + 1.0
 
 
