@@ -1,13 +1,11 @@
-r"""What the stages of a fit minimise, and what frames left out are judged by.
+r"""The losses of a fit, and gradient descent that can be stopped and resumed.
 
 The loss on RAW is ``(y_hat - y)^2 / (4 (y_hat + 0.01))``, with the denominator taken as a constant: shot noise makes
 the error of a reading proportional to its square root, and weights that do not depend on ``y`` keep noise unbiased.
 The loss on sRGB takes in the images between the stages (Conde et al., AAAI 2022, "Training").
 
-Gradient descent that can be stopped and resumed: Adam with a cosine, a progress bar, a file of its state.
-
-A stage is a loss and its tensors. What a step draws is keyed by (seed, stage, step), so that a resumed stage ends with
-the same bits as one that was not stopped.
+A fit has stages; one is a loss and its tensors. What a step draws is keyed by (seed, stage, step), so that a resumed
+stage ends with the same bits as one that was not stopped.
 """
 
 from __future__ import annotations
@@ -15,9 +13,9 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +24,7 @@ from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import PixelSamples, Shot
+from rawaug.isp.fit.samples import FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -70,16 +68,13 @@ def apart(ours: ISPParams, theirs: ISPParams) -> Tensor:
 
 @torch.no_grad()
 def decibels(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frames: Sequence[int], as_shot: bool = False
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[FrameSummary],
+    frames: Sequence[int],
+    as_shot: bool = False,
 ) -> float:
-    """Mean PSNR of some frames, each under the parameters that the ISP chooses for its thumbnail.
-
-    Args:
-        isp: the ISP.
-        samples, shots: all frames.
-        frames: which of them.
-        as_shot: with the gains that their files state.
-    """
+    """Mean PSNR of ``frames``, each in the setting that the ISP chooses for its thumbnail, or with as-shot gains."""
     every, values = torch.arange(samples.srgb.shape[-1]), []
     for k in frames:
         given = shots[k].white_balance if as_shot else None
@@ -88,11 +83,41 @@ def decibels(
     return float(-10.0 * torch.cat(values).log10().mean())
 
 
+def adam(
+    tensors: Sequence[Tensor],
+    learning_rate: float,
+    loss: Callable[[int], Tensor],
+    spent: Callable[[int], float],
+    *,
+    start: int = 0,
+    state: Mapping[int, Any] | None = None,
+    clip_norm: float | None = None,
+) -> Iterator[tuple[torch.optim.Adam, Tensor]]:
+    """Adam on ``loss(step)`` until ``spent(step)`` is 1; the rate falls to 0 by half a cosine of what is spent.
+
+    Yields the optimiser and the loss after each step; ``start`` and ``state`` resume a descent.
+    """
+    optimiser = torch.optim.Adam(tensors, lr=learning_rate)
+    if state:
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+    step = start
+    while (share := spent(step)) < 1.0:
+        optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
+        value = loss(step)
+        optimiser.zero_grad(set_to_none=True)
+        value.backward()
+        if clip_norm is not None:
+            torch.nn.utils.clip_grad_norm_(tensors, clip_norm)
+        optimiser.step()
+        step += 1
+        yield optimiser, value.detach()
+
+
 SAVE_SECONDS = 10.0
 REPORT_STEPS = 50
 
 
-class Watched(NamedTuple):
+class BestScore(NamedTuple):
     """Score of a watched stage at its start, and the best one with its step."""
 
     start: float
@@ -113,9 +138,6 @@ class Descent:
 
     Attributes:
         watched: what the watched stages scored, by name.
-
-    Raises:
-        ValueError: if the file at ``path`` cannot be read.
     """
 
     def __init__(
@@ -129,7 +151,7 @@ class Descent:
     ) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
         self.report_steps, self.save_seconds = report_steps, save_seconds
-        self.watched: dict[str, Watched] = {}
+        self.watched: dict[str, BestScore] = {}
         self._steps: dict[str, int] = {}
         self._tensors: dict[str, Tensor] = {}
         if path is not None and path.is_file():
@@ -157,33 +179,34 @@ class Descent:
                 mean loss.
             watch: a score, taken at the start and as often; the tensors come back that had the highest.
         """
-        optimiser = torch.optim.Adam(list(tensors.values()), lr=learning_rate)
-        start = self._restore(stage, tensors, optimiser)
+        start, state = self._restored(stage, tensors)
         if watch is not None and stage not in self.watched:
             self._note(stage, 0, watch(), tensors)
         for tensor in tensors.values():
             tensor.requires_grad_()
-        bar = progress(range(start, steps), label=stage, unit="step", initial=start, total=steps, shown=self.progress)
+        descent = adam(
+            list(tensors.values()),
+            learning_rate,
+            lambda step: loss(keyed_generator(self.seed, stage, step)),
+            lambda step: step / steps if step < steps else 1.0,
+            start=start,
+            state=state,
+        )
+        bar = progress(descent, label=stage, unit="step", initial=start, total=steps, shown=self.progress)
         saved, losses = time.monotonic(), list[Tensor]()
-        for step in bar:
-            optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
-            value = loss(keyed_generator(self.seed, stage, step))
-            optimiser.zero_grad(set_to_none=True)
-            value.backward()
-            optimiser.step()
-            losses.append(value.detach())
-            if (step + 1) % self.report_steps == 0 or step + 1 == steps:
+        for done, (optimiser, value) in enumerate(bar, start + 1):
+            losses.append(value)
+            if done % self.report_steps == 0 or done == steps:
                 scores = "" if report is None else report()
-                scores += "" if watch is None else self._note(stage, step + 1, watch(), tensors)
+                scores += "" if watch is None else self._note(stage, done, watch(), tensors)
                 bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores}", refresh=False)
                 losses.clear()
-            if self.path is not None and time.monotonic() - saved > self.save_seconds:
-                self._keep(stage, step + 1, tensors, optimiser)
+            due = done == steps or time.monotonic() - saved > self.save_seconds
+            if self.path is not None and due:
+                self._keep(stage, done, tensors, optimiser)
                 saved = time.monotonic()
         for tensor in tensors.values():
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
-        if self.path is not None and start < steps:
-            self._keep(stage, steps, tensors, optimiser)
         if watch is not None:
             for name, tensor in tensors.items():
                 tensor.data.copy_(self._tensors[f"{stage}, best/{name}"])
@@ -195,9 +218,9 @@ class Descent:
 
     def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
         """Note a score, and the tensors if it is the best so far."""
-        before = self.watched.get(stage, Watched(score, step, -math.inf))
+        before = self.watched.get(stage, BestScore(score, step, -math.inf))
         if stage not in self.watched or score > before.best:
-            self.watched[stage] = Watched(before.start, step, score)
+            self.watched[stage] = BestScore(before.start, step, score)
             self._tensors |= {f"{stage}, best/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
         return f"held out {score:.2f} dB"
 
@@ -216,19 +239,16 @@ class Descent:
         header, tensors = read_tensors(path, "delete this state of an interrupted fit")
         if header.get("key") == self.key:
             self._steps = json.loads(header["steps"])
-            self.watched = {k: Watched(*values) for k, values in json.loads(header["watched"]).items()}
+            self.watched = {k: BestScore(*values) for k, values in json.loads(header["watched"]).items()}
             self._tensors = tensors
 
     @torch.no_grad()
-    def _restore(self, stage: str, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> int:
-        step = self._steps.get(stage, 0)
-        if step:
-            state = {}
-            for index, (name, tensor) in enumerate(tensors.items()):
-                tensor.copy_(self._tensors[f"{stage}/{name}"])
-                prefix = f"{stage}/{name}/"
-                moments = {k[len(prefix) :]: v for k, v in self._tensors.items() if k.startswith(prefix)}
-                if moments:
-                    state[index] = moments
-            optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
-        return step
+    def _restored(self, stage: str, tensors: Mapping[str, Tensor]) -> tuple[int, dict[int, Any]]:
+        """Steps that are done, with the optimiser's state after them."""
+        step, state = self._steps.get(stage, 0), dict[int, Any]()
+        for index, (name, tensor) in enumerate(tensors.items() if step else ()):
+            tensor.copy_(self._tensors[f"{stage}/{name}"])
+            prefix = f"{stage}/{name}/"
+            if moments := {k[len(prefix) :]: v for k, v in self._tensors.items() if k.startswith(prefix)}:
+                state[index] = moments
+        return step, state

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, apart, cycle_error, decibels, mean_square
-from rawaug.isp.fit.samples import PixelSamples, Shot
+from rawaug.isp.fit.samples import FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 
 Refit = Callable[[Sequence[int], str], DictionaryISP]
@@ -32,7 +32,7 @@ Refit = Callable[[Sequence[int], str], DictionaryISP]
 def train_encoders(
     isp: DictionaryISP,
     samples: PixelSamples,
-    shots: Sequence[Shot],
+    shots: Sequence[FrameSummary],
     config: FitConfig,
     descent: Descent,
     refit: Refit,
@@ -51,7 +51,7 @@ def train_encoders(
 def _train(
     isp: DictionaryISP,
     samples: PixelSamples,
-    shots: Sequence[Shot],
+    shots: Sequence[FrameSummary],
     frames: Sequence[int],
     config: FitConfig,
     descent: Descent,
@@ -73,7 +73,7 @@ def _train(
 def _frame_loss(
     isp: DictionaryISP,
     samples: PixelSamples,
-    shots: Sequence[Shot],
+    shots: Sequence[FrameSummary],
     frame: int,
     pixels: Tensor,
     config: FitConfig,
@@ -102,7 +102,7 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
 
 
 def _gain_on_frames_left_out(
-    samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent, refit: Refit
+    samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, refit: Refit
 ) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
     gain, folds = 0.0, config.encoder_training.folds
@@ -135,7 +135,7 @@ def joint_steps(config: FitConfig, frames: int) -> int:
 def train_jointly(
     isp: DictionaryISP,
     samples: PixelSamples,
-    shots: Sequence[Shot],
+    shots: Sequence[FrameSummary],
     config: FitConfig,
     descent: Descent,
     learning_rate: float = LEARNING_RATE,
@@ -163,7 +163,12 @@ def train_jointly(
 
 
 def _joint_frame_loss(
-    isp: DictionaryISP, samples: PixelSamples, shots: Sequence[Shot], frame: int, pixels: Tensor, config: FitConfig
+    isp: DictionaryISP,
+    samples: PixelSamples,
+    shots: Sequence[FrameSummary],
+    frame: int,
+    pixels: Tensor,
+    config: FitConfig,
 ) -> Tensor:
     part = samples.pick(pixels, torch.tensor([frame]))
     ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(isp.unshaded(shots[frame].raw, None))

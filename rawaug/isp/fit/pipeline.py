@@ -39,7 +39,7 @@ from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent, cycle_error, decibels, reading_error
 from rawaug.isp.fit.encoders import train_encoders, train_jointly
-from rawaug.isp.fit.samples import FramePair, PixelSamples, Shot, sample_pixels
+from rawaug.isp.fit.samples import FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, Stage
@@ -54,7 +54,7 @@ Refit = Callable[[Sequence[int], str, FitConfig], DictionaryISP]
 
 
 def with_better_tone(
-    samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, refit: Refit
+    samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, refit: Refit
 ) -> tuple[FitConfig, float | None]:
     """The settings with ``tone`` decided, and by how many dB the curve is better where it was asked for."""
     if config.tone != "auto":
@@ -136,14 +136,14 @@ def _path(state: str | Path | None) -> Path | None:
     return None if state is None else Path(state)
 
 
-def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[Shot]) -> str:
+def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[FrameSummary]) -> str:
     """What a kept state belongs to: the version, the settings, the very pixels and what the files say of them."""
     known = [(shot.name, shot.camera, shot.white_balance) for shot in shots]
     settings = repr((__version__, config, known)).encode()
     return digest(settings, samples.srgb.numpy().tobytes(), samples.target.numpy().tobytes())
 
 
-def new_isp(shots: Sequence[Shot], config: FitConfig) -> DictionaryISP:
+def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     """An ISP of the size that the frames call for, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
@@ -168,7 +168,7 @@ class _Fit:
     """The ISP under way, with every frame's own colour; ``part`` ends the names of its stages."""
 
     def __init__(
-        self, samples: PixelSamples, shots: Sequence[Shot], config: FitConfig, descent: Descent, part: str = ""
+        self, samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, part: str = ""
     ) -> None:
         self.samples, self.shots, self.config, self.descent, self.part = samples, shots, config, descent, part
         self.isp = new_isp(shots, config)

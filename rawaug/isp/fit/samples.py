@@ -53,7 +53,7 @@ class FramePair(Protocol):
     def color_known(self) -> bool: ...
 
 
-class Shot(NamedTuple):
+class FrameSummary(NamedTuple):
     """What is kept of a frame besides its pixels.
 
     Args:
@@ -99,7 +99,7 @@ class PixelSamples(NamedTuple):
 
 def sample_pixels(
     pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False
-) -> tuple[PixelSamples, list[Shot]]:
+) -> tuple[PixelSamples, list[FrameSummary]]:
     """Draw ``pixels`` a frame, keyed by ``seed`` and the frame's name, and note what else the fit needs of the frames.
 
     Args:
@@ -118,7 +118,7 @@ def sample_pixels(
     return PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True))), list(shots)
 
 
-def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, Shot]:
+def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
     if not pair.color_known:
         raise ValueError(
             f"{pair.name}: its white balance and colour matrix are unknown, so no ISP can be fitted to it; "
@@ -134,7 +134,9 @@ def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple
     except ValueError as error:
         raise ValueError(f"{pair.name}: {error}") from None
     small_srgb, small_raw = thumbnail(as_float(pair.srgb[None])), thumbnail(_colours(raw, pair.cfa)[None])
-    shot = Shot(pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw, pair.registered)
+    shot = FrameSummary(
+        pair.name, pair.camera, CFA(pair.cfa), pair.white_balance, small_srgb, small_raw, pair.registered
+    )
     return drawn, shot
 
 

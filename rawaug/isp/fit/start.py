@@ -26,7 +26,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import l1_normalised, log_light
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import PixelSamples, Shot
+from rawaug.isp.fit.samples import FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 from rawaug.seeding import derived_seed
 
@@ -76,7 +76,7 @@ class Tie:
         shots: the frames, in order.
     """
 
-    def __init__(self, shots: Sequence[Shot]) -> None:
+    def __init__(self, shots: Sequence[FrameSummary]) -> None:
         cameras = [shot.camera for shot in shots]
         self.groups = [torch.tensor([c == camera for c in cameras]) for camera in dict.fromkeys(cameras)]
         self.balance = torch.tensor([shot.white_balance for shot in shots])
@@ -140,7 +140,7 @@ REACH_ATOMS = 8
 
 
 @torch.no_grad()
-def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[Shot], config: FitConfig) -> None:
+def set_atoms(isp: DictionaryISP, colour: FrameColour, shots: Sequence[FrameSummary], config: FitConfig) -> None:
     """The frames' matrices and gains become the atoms; clusters of them where there are more frames than atoms."""
     balance = torch.tensor([shot.white_balance for shot in shots])
     params = colour.params()

@@ -1,14 +1,14 @@
-r"""What the methods that the dictionary ISP is compared with have in common: ``y = mosaic(u(x))``, u being the method.
+r"""What the methods that the dictionary ISP is compared with have in common, and how they are fitted.
 
-sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size, of which the mosaic keeps one channel a site.
-Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training sees the values as they are.
+``y = mosaic(u(x))``, u being the method: sRGB ``x`` ``(B, 3, H, W)`` becomes linear camera colour of the same size, of
+which the mosaic keeps one channel a site. Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training
+sees the values as they are.
 
-Fitting the baselines: one loop for all that learn by descent, each with its own loss, on random crops of the pairs.
-
-A step draws ``batch`` frames and as many crops from a generator keyed by the seed and the step's number. The crops
-start where the frame's CFA is that of the model, so frames of any pattern train one model. Adam; the rate falls to 0 by
-half a cosine over the budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same
-seed gives the same weights.
+One loop fits all that learn by descent, each with its own loss, on random crops of the pairs. A step draws ``batch``
+frames and as many crops from a generator keyed by the seed and the step's number. The crops start where the frame's CFA
+is that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
+budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same
+weights.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -27,6 +26,7 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp.config import ReverseISP
+from rawaug.isp.fit.descent import adam
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 from rawaug.progress import progress as progress_bar
@@ -34,17 +34,10 @@ from rawaug.seeding import keyed_generator
 
 
 class BaselineISP(ReverseISP):
-    """A method that the dictionary ISP is compared with.
-
-    Args:
-        cfa: pattern of the RAW that it makes and takes.
-
-    Attributes:
-        name: as in :data:`rawaug.paper.baselines.BASELINES`.
-        trainable: whether :func:`rawaug.paper.baselines.fit_baseline` changes anything in it.
-    """
+    """A method that the dictionary ISP is compared with; ``cfa`` is the pattern of the RAW that it makes and takes."""
 
     trainable: ClassVar[bool]
+    """Whether :func:`fit_baseline` changes anything in it."""
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
@@ -74,28 +67,14 @@ class BaselineISP(ReverseISP):
         )
 
     def reverse(self, srgb: Tensor) -> Tensor:
-        """sRGB to RAW.
-
-        Args:
-            srgb: ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides.
-
-        Returns:
-            The mosaic ``(B, 1, H, W)`` in :attr:`cfa`, within [0, 1].
-
-        Raises:
-            ValueError: if the shape or the type is another, or a side is odd.
-        """
+        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
         return self.to_mosaic(self.unprocess(checked_srgb(srgb)))
 
     def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
         return self.reverse(srgb)
 
     def forward(self, raw: Tensor) -> Tensor:
-        """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1].
-
-        Raises:
-            ValueError: if the method has no forward pass, the shape is another or a side is odd.
-        """
+        """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
         return self.render(checked_raw(raw)).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
@@ -239,7 +218,7 @@ class _Budget:
 
     def spent(self, seconds: float, steps: int) -> float:
         """The part of the budget that is used up, of that limit which is nearer."""
-        by_time = 0.0 if self.seconds is None else seconds / self.seconds
+        by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
         by_steps = 0.0 if self.steps is None else steps / self.steps
         return max(by_time, by_steps)
 
@@ -293,20 +272,16 @@ def _descend(
     model.train()
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     rate = model.learning_rate if learning_rate is None else learning_rate
-    optimiser = torch.optim.Adam(parameters, lr=rate)
-    bar = progress_bar(count(), label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
-    start, step, spent, value = time.perf_counter(), 0, 0.0, math.nan
-    for step in bar:
-        if spent >= 1.0:
-            break
-        for group in optimiser.param_groups:
-            group["lr"] = rate * 0.5 * (1.0 + math.cos(math.pi * spent))
-        loss = model.loss(draw(step, parameters[0].device), both)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(parameters, CLIP_NORM)
-        optimiser.step()
-        value, elapsed = loss.item(), time.perf_counter() - start
-        spent = budget.spent(elapsed, step + 1)
-        bar.set_postfix_str(f"loss {value:.2e}, {elapsed:.0f} s", refresh=False)
-    return step, value
+    start, done, value = time.perf_counter(), 0, math.nan
+    descent = adam(
+        parameters,
+        rate,
+        lambda step: model.loss(draw(step, parameters[0].device), both),
+        lambda step: budget.spent(time.perf_counter() - start, step),
+        clip_norm=CLIP_NORM,
+    )
+    bar = progress_bar(descent, label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
+    for _, loss in bar:
+        done, value = done + 1, loss.item()
+        bar.set_postfix_str(f"loss {value:.2e}, {time.perf_counter() - start:.0f} s", refresh=False)
+    return done, value

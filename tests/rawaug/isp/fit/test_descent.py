@@ -106,17 +106,17 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
     for pairs, config in ((exact_pairs, replace(TINY, learning_rate=1e-3)), ([liar, *exact_pairs[1:]], TINY)):
         state.write_bytes(stopped)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Descent, "_restore", _refusing(Descent._restore))
+            patch.setattr(Descent, "_restored", _refusing(Descent._restored))
             fit_isp(pairs, config, progress=False, state=state, **OFTEN)
 
 
-def _refusing(restore: Callable[..., int]) -> Callable[..., int]:
-    def restored(self: Descent, *args: object) -> int:
-        step = restore(self, *args)
+def _refusing(restored: Callable[..., tuple[int, Any]]) -> Callable[..., tuple[int, Any]]:
+    def from_the_start(self: Descent, *args: object) -> tuple[int, Any]:
+        step, state = restored(self, *args)
         assert step == 0
-        return step
+        return step, state
 
-    return restored
+    return from_the_start
 
 
 def test_what_it_shows_is_the_mean_loss_since_the_report_before(monkeypatch: pytest.MonkeyPatch) -> None:

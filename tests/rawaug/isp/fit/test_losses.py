@@ -14,7 +14,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, encoders
 from rawaug.isp.fit.descent import apart, cycle_error, mean_square, reading_error
-from rawaug.isp.fit.samples import PixelSamples, Shot, sample_pixels
+from rawaug.isp.fit.samples import FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 PIXELS = torch.arange(64)
@@ -22,7 +22,7 @@ CLEAN, NOISY = FitConfig(), FitConfig(noisy=True)
 
 
 @pytest.fixture(scope="module")
-def frame(exact_pair: Callable[..., Pair]) -> tuple[PixelSamples, list[Shot]]:
+def frame(exact_pair: Callable[..., Pair]) -> tuple[PixelSamples, list[FrameSummary]]:
     return sample_pixels([exact_pair("shot", (1.6, 1.0, 1.7), 0, size=(32, 40))], 64, 0)
 
 
@@ -54,7 +54,7 @@ def both_passes(isp: DictionaryISP, part: PixelSamples) -> tuple[dict[str, Tenso
 
 
 def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[Shot]]
+    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
 ) -> None:
     part, _ = frame
     back, ahead, srgb = both_passes(isp, part)
@@ -75,7 +75,7 @@ def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(
 
 
 def test_from_noisy_readings_the_way_back_starts_where_the_reverse_pass_ended(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[Shot]]
+    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
 ) -> None:
     part, _ = frame
     back, _, _ = both_passes(isp, part)
@@ -92,7 +92,7 @@ def test_weights_apart_add_up_over_both_dictionaries(isp: DictionaryISP) -> None
 
 
 def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[Shot]]
+    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
 ) -> None:
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
@@ -103,7 +103,7 @@ def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(
 
 
 def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consistency(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[Shot]]
+    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
 ) -> None:
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
@@ -141,7 +141,7 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain
 
 
-def test_readings_weigh_as_shot_noise_has_it(frame: tuple[PixelSamples, list[Shot]]) -> None:
+def test_readings_weigh_as_shot_noise_has_it(frame: tuple[PixelSamples, list[FrameSummary]]) -> None:
     part, _ = frame
     known = part.known.bool()
     predicted = torch.where(known, part.target + 0.01, part.target)

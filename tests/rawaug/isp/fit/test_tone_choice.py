@@ -13,7 +13,7 @@ from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import decibels
 from rawaug.isp.fit.pipeline import with_better_tone
-from rawaug.isp.fit.samples import PixelSamples, Shot, sample_pixels
+from rawaug.isp.fit.samples import FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
@@ -57,19 +57,21 @@ def refitted(gains: dict[str, float]) -> Callable[..., DictionaryISP]:
 
 
 @pytest.fixture(scope="module")
-def two_frames(exact_pairs: list[Pair]) -> tuple[PixelSamples, list[Shot]]:
+def two_frames(exact_pairs: list[Pair]) -> tuple[PixelSamples, list[FrameSummary]]:
     return sample_pixels(exact_pairs[:2], 256, 0)
 
 
 @pytest.mark.parametrize("better", ["learned", "curve"])
-def test_auto_takes_what_is_better_on_frames_left_out(two_frames: tuple[PixelSamples, list[Shot]], better: str) -> None:
+def test_auto_takes_what_is_better_on_frames_left_out(
+    two_frames: tuple[PixelSamples, list[FrameSummary]], better: str
+) -> None:
     off = {"learned": 1.0, "curve": 1.0} | {better: 0.0}
     decided, gain = with_better_tone(*two_frames, replace(QUICK, tone="auto"), refitted(off))
     assert decided.tone == better and gain is not None and (gain > 0) == (better == "curve")
 
 
 def test_what_is_asked_for_is_not_tried_and_one_frame_cannot_decide(
-    two_frames: tuple[PixelSamples, list[Shot]],
+    two_frames: tuple[PixelSamples, list[FrameSummary]],
 ) -> None:
     samples, shots = two_frames
     assert with_better_tone(samples, shots, QUICK, refitted({})) == (QUICK, None)
@@ -77,7 +79,7 @@ def test_what_is_asked_for_is_not_tried_and_one_frame_cannot_decide(
     assert with_better_tone(samples, shots[:1], alone, refitted({})) == (replace(alone, tone="learned"), None)
 
 
-def test_frames_are_judged_under_their_own_gains(two_frames: tuple[PixelSamples, list[Shot]]) -> None:
+def test_frames_are_judged_under_their_own_gains(two_frames: tuple[PixelSamples, list[FrameSummary]]) -> None:
     isp = DictionaryISP()
     with torch.no_grad():
         isp.gain.log_gains.fill_(1.0)
