@@ -142,7 +142,7 @@ def evaluate(
             result["classical"] = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
-            page = Page(f"{weights.stem} on {data}", {weights.stem: [runs]}, result.get("classical", {}))
+            page = Page.of_scores(f"{weights.stem} on {data}", {weights.stem: [runs]}, result.get("classical", {}))
             scoring.add_frames(page, classical)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:

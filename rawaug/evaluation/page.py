@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import base64
 import csv
-import html
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -35,32 +35,30 @@ WHOLE = 640
 ON_PAGE = 12
 """Largest number of frames on the page."""
 
-PICTURES = "<h2>Pictures</h2>"
-
 CURVES = {"loss": "loss", "psnr": "validation PSNR, RAW (dB)", "psnr_srgb": "validation PSNR, sRGB (dB)"}
 """Columns of a log that are drawn, with what they are."""
 LINES = {"": "-", "_low": ":", "_middle": "--", "_high": "-."}
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 90rem; padding: 0 1rem; color: #222; }
-h1, h3, figcaption { overflow-wrap: anywhere; }
-.table { overflow-x: auto; margin: 1rem 0; } table { border-collapse: collapse; }
-th, td { padding: .25rem .8rem; border-bottom: 1px solid #ddd; text-align: right; font-variant-numeric: tabular-nums; }
-td + td { white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff; }
-.frame { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-start; margin-bottom: 2rem; }
-figure { margin: 0; } figcaption { font-size: 13px; }
-.window { width: 256px; } .window img { width: 100%; image-rendering: pixelated; }
-.curve { flex: 1 1 20rem; max-width: 36rem; } .curve img { width: 100%; }
-.two .curve { flex-basis: max(20rem, 40%); }
-img { max-width: 100%; } pre { background: #f4f4f4; padding: 1rem; overflow-x: auto; }
-@media (max-width: 40rem) {
-  body { margin: 1rem auto; padding: 0 .6rem; font-size: 14px; } h1 { font-size: 1.3rem; }
-  th, td { padding: .2rem .4rem; } th { vertical-align: bottom; } .table { font-size: 13px; }
-  td:first-child { max-width: 45vw; overflow-wrap: break-word; }
-  .window { width: calc(50% - .3rem); }
-}
-"""
+
+class Figure(NamedTuple):
+    """A PNG file on the page; ``style`` is a class of the template: window, curve, or none for a whole frame."""
+
+    png: bytes
+    alt: str
+    style: str = ""
+    caption: str = ""
+
+
+@dataclass
+class Part:
+    """What stands under a heading: texts, a table, figures; what is empty is left out."""
+
+    heading: str = ""
+    name: str = ""
+    texts: Sequence[str] = ()
+    head: Sequence[str] = ()
+    rows: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    figures: Sequence[Figure] = ()
 
 
 class Page:
@@ -68,30 +66,32 @@ class Page:
 
     Args:
         title: of the page.
-        results: by arm, one entry a seed.
-        classical: summaries of the classical denoisers, by name.
+        parts: that come first.
     """
 
-    def __init__(self, title: str, results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> None:
-        self.title = title
-        self.parts = [f"<h1>{html.escape(title)}</h1>", "<h2>Scores</h2>"]
+    def __init__(self, title: str, parts: Sequence[Part] = ()) -> None:
+        self.title, self.parts = title, list(parts)
+
+    @classmethod
+    def of_scores(cls, title: str, results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> Page:
+        """A page with the scores of ``results``, by arm with one entry a seed, and of classical denoisers, by name."""
+        note = levels_note(next(iter(results.values()))[0]["plain"])
+        page = cls(title, [Part("Scores", texts=[note] if note else [])])
         for columns in (COLUMNS, QUARTERS):
             rows = table_rows(results, classical, columns)
             filled = [k for k in range(len(columns)) if any(cells[k] for cells in rows.values())]
             kept = {name: [cells[k] for k in filled] for name, cells in rows.items()}
-            self.parts.append(_table(["", *(list(columns)[k] for k in filled)], kept))
-        if note := levels_note(next(iter(results.values()))[0]["plain"]):
-            self.parts.append(f"<p>{html.escape(note)}</p>")
-        self.parts += ["<h2>Every image</h2>", _images_table(results, classical)]
+            page.parts.append(Part(head=["", *(list(columns)[k] for k in filled)], rows=kept))
+        page.parts.append(_every_image(results, classical))
+        return page
 
-    def add_curves(self, pngs: Mapping[str, bytes]) -> None:
+    def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
         """Figures as :func:`draw_curves` makes them."""
-        self.parts += ["<h2>Training</h2>", _curves(pngs)]
+        self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
         """One test frame."""
-        if PICTURES not in self.parts:
-            self.parts.append(PICTURES)
+        first = not any(part.heading == "Pictures" for part in self.parts)
         clean = list(row.panels.values())[-1]
         exposure = exposure_of(clean, row.pair)
         top, left = most_detailed(clean)
@@ -100,44 +100,25 @@ class Page:
         for name, packed in row.panels.items():
             window = packed[..., top : top + WINDOW, left : left + WINDOW]
             png = encode_png(develop_packed(window, cfa, row.pair, exposure))
-            caption = html.escape(name if name == "clean" else f"{name}, {row.captions.get(name, '')}")
-            figures.append(f'<figure class="window">{_picture(png, name)}<figcaption>{caption}</figcaption></figure>')
+            figures.append(Figure(png, name, "window", ", ".join(filter(None, [name, row.captions.get(name)]))))
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"<figcaption>whole frame, clean; window at row {2 * top}, column {2 * left}</figcaption>"
-        figures.append(f"<figure>{_picture(encode_png(whole), 'whole frame')}{caption}</figure>")
-        self.parts.append(f'<h3>{html.escape(row.pair.name)}</h3><div class="frame">{"".join(figures)}</div>')
+        caption = f"whole frame, clean; window at row {2 * top}, column {2 * left}"
+        figures.append(Figure(encode_png(whole), "whole frame", caption=caption))
+        self.parts.append(Part("Pictures" if first else "", row.pair.name, figures=figures))
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """The file, with ``settings`` at its end."""
-        return _write(path, self.title, self.parts, settings)
+        from jinja2 import Environment, PackageLoader
 
-
-def write_figure_page(
-    path: Path,
-    title: str,
-    pngs: Mapping[str, bytes],
-    head: Sequence[str],
-    rows: Mapping[str, Sequence[str]],
-    settings: Mapping[str, Any],
-) -> Path:
-    """A page of figures, by title, and one table."""
-    parts = [f"<h1>{html.escape(title)}</h1>", _curves(pngs), _table(head, rows)]
-    return _write(path, title, parts, settings)
-
-
-def _write(path: Path, title: str, parts: Sequence[str], settings: Mapping[str, Any]) -> Path:
-    shown = html.escape(json.dumps(settings, indent=1))
-    body = "\n".join([*parts, f"<h2>Settings</h2><pre>{shown}</pre>"])
-    head = (
-        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title>"
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{_STYLE}</style></head>\n<body>\n{body}\n'
-    path.write_text(f"{text}</body></html>\n", encoding="utf-8", errors="backslashreplace")
-    return path
+        templates = Environment(loader=PackageLoader(__package__, ""), autoescape=True, trim_blocks=True)
+        templates.filters["b64"] = lambda png: base64.b64encode(png).decode()
+        template = templates.get_template("page.html")
+        text = template.render(title=self.title, parts=self.parts, settings=json.dumps(settings, indent=1))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", errors="backslashreplace")
+        return path
 
 
 def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:
@@ -210,25 +191,7 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
     return file.getvalue()
 
 
-def _curves(pngs: Mapping[str, bytes]) -> str:
-    """Figures side by side, or one below the other on a phone."""
-    figures = (f'<figure class="curve">{_picture(png, title)}</figure>' for title, png in pngs.items())
-    return f'<div class="frame{" two" if len(pngs) == 4 else ""}">{"".join(figures)}</div>'
-
-
-def _picture(png: bytes, alt: str) -> str:
-    return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-
-
-def _table(head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
-    def line(tag: str, cells: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    body = "".join(line("td", [name, *cells]) for name, cells in rows.items())
-    return f'<div class="table"><table><thead>{line("th", head)}</thead><tbody>{body}</tbody></table></div>'
-
-
-def _images_table(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> str:
+def _every_image(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> Part:
     """PSNR / SSIM of every image by every method, on the mosaic; an arm's first seed."""
     summaries = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
     rows: dict[str, list[str]] = {}
@@ -236,7 +199,7 @@ def _images_table(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> 
         for image in summary["images"]:
             cells = rows.setdefault(image["name"], [_both(image, "_noisy")])
             cells.append(_both(image, ""))
-    return _table(["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows)
+    return Part("Every image", head=["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows=rows)
 
 
 def _both(image: Mapping[str, Any], suffix: str) -> str:

@@ -23,9 +23,9 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import each_readable
 from rawaug.data.pairs import Pair, Sample, SomePairs
-from rawaug.evaluation.page import write_figure_page
+from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
-from rawaug.evaluation.tables import METRICS
+from rawaug.evaluation.tables import METRICS, print_rows
 from rawaug.experiment.recipe import SHORT_CROP
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
@@ -193,9 +193,6 @@ def scored(make: Maker, pair: Pair, noise: NoiseModel, seed: int, label: str, se
 
 def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
     """``table.json``, the figure, the page and the printed table."""
-    from rich.console import Console
-    from rich.table import Table
-
     folder, rows = run_folder(settings), result["rows"]
     write_json(result, folder / "table.json")
     with replacing(folder / "figure.png") as partial:
@@ -210,14 +207,12 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
         ]
         for name, row in rows.items()
     }
-    page = write_figure_page(folder / "report.html", title, curves, head, cells, asdict(settings))
-    table = Table(title=f"{title}; threads: {result['threads']}")
-    for k, column in enumerate(head):
-        table.add_column(column, justify="right" if k else "left")
-    for name, row in cells.items():
-        table.add_row(name, *row)
-    Console(width=140).print(table)
-    print(f"table: {folder / 'table.json'}\nfigure: {folder / 'figure.png'}\npage: {page}")
+    page = Page(title)
+    page.add_curves(curves, heading="")
+    page.parts.append(Part(head=head, rows=cells))
+    written = page.write(folder / "report.html", asdict(settings))
+    print_rows(f"{title}; threads: {result['threads']}", head, [[name, *row] for name, row in cells.items()])
+    print(f"table: {folder / 'table.json'}\nfigure: {folder / 'figure.png'}\npage: {written}")
 
 
 def _figure(rows: dict[str, Any], settings: DenoiserSweep, titles: Mapping[str, str]) -> bytes:

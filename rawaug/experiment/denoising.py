@@ -268,7 +268,7 @@ class _Run:
             write_json(everything, self.folder / "results.json")
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
-        page, shown = Page(title, results, classical), list[Row]()
+        page, shown = Page.of_scores(title, results, classical), list[Row]()
         seeds = range(recipe.seed, recipe.seed + recipe.seeds)
         page.add_curves(
             draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})

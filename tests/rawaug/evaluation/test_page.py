@@ -57,7 +57,7 @@ def page(tmp_path: Path) -> Elements:
     log = tmp_path / "log.csv"
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
-    made = Page("a & b", results, {"Wavelet": scores(37.5)})
+    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)})
     made.add_curves(draw_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)
