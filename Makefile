@@ -56,7 +56,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .[all]
+	$(PIP) --editable .[raw,train,data]
 	touch $@
 
 $(VENV)/.test: setup.cfg pyproject.toml constraints.txt | $(BIN)/python
@@ -73,4 +73,4 @@ $(VENV)/.uv: | $(BIN)/python
 
 $(WHEEL): setup.cfg $(VENV)/.uv
 	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/resolve .
-	echo "rawaug[test,docs,export,explore] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@
+	echo "rawaug[test,docs] @ file://$(CURDIR)/$$(ls build/resolve/rawaug-*.whl)" > $@

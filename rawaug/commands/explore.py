@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rawaug.data.demo.pairs import demo_files
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
+from rawaug.errors import extra
 from rawaug.explore.page import address, build, listening, server_of
 
 
@@ -18,6 +19,8 @@ def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 
         host: address to listen on; by default this machine alone can open the page.
         port: port to listen on.
     """
+    with extra("explore"):  # one line that names all that the page needs, before the pictures ask for theirs
+        import gradio  # noqa: F401
     page = build(*choices(pictures))
     with listening(host, port) as open_, suppress(KeyboardInterrupt):
         print(f"{address(open_)} (Ctrl-C stops it)", flush=True)

@@ -1,11 +1,13 @@
-"""The check of dependencies: what it asks, what it says, and that it passes where there is no network."""
+"""What runs beside the tests: the check of dependencies, with and without a network, and what a release shows."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import socket
 import threading
+from configparser import ConfigParser
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +18,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture
-def check() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("advisories", ROOT / ".ci" / "advisories.py")
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def check() -> ModuleType:
+    return script("advisories")
 
 
 def test_an_advisory_fails_the_check(check: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,3 +61,15 @@ def test_without_a_network_it_says_so_in_one_line(check: ModuleType, capsys: pyt
         assert check.main([str(ROOT / "constraints.txt")], f"http://127.0.0.1:{nobody.getsockname()[1]}") == 0
     out = capsys.readouterr().out
     assert "not checked" in out and out.count("\n") == 1
+
+
+def test_a_package_index_gets_absolute_links_and_urls() -> None:
+    release, url = script("release"), "https://host/owner/name"
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    places = re.findall(r"\]\(([^)]+)\)", release.absolute(readme, url))
+    assert len(places) > 10 and all(place.startswith(("https://", "#")) for place in places)
+    for place in re.findall(r"\]\((?!http|#)([^)]+)\)", readme):
+        assert (ROOT / place).is_file(), f"README.md: {place} is not there"
+    setup = ConfigParser()
+    setup.read_string(release.with_urls((ROOT / "setup.cfg").read_text(encoding="utf-8"), url))
+    assert f"Homepage = {url}" in setup["metadata"]["project_urls"] and setup["metadata"]["name"] == "rawaug"
