@@ -11,9 +11,10 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
-from rawaug.explore.quick_development import grey_curve
 from rawaug.explore.view_state import Drawn
 from rawaug.io import encode_srgb
+from rawaug.isp.config import ISPParams
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
@@ -173,3 +174,11 @@ def _pixels(figure: Any) -> np.ndarray:
     """The drawn figure, uint8 ``(H, W, 3)``."""
     figure.canvas.draw()
     return np.array(figure.canvas.buffer_rgba())[..., :3]
+
+
+@torch.no_grad()
+def grey_curve(isp: DictionaryISP, setting: ISPParams) -> Tensor:
+    """x2 of the 256 greys of sRGB under a setting without the leading B, ``(256,)``."""
+    if isp.tone is None:
+        return isp.tone_curve().mean(dim=1)
+    return isp.tone.combine(setting.tone_weights[None])[0, ::STEPS]

@@ -1,17 +1,14 @@
-"""Panels as HTML: pictures inside of it as data, so that the page loads nothing else.
+"""The page: controls on one side, a tab for each view on the other; every change redraws the open tab alone.
 
-The page: controls on one side, a tab for each view on the other; every change redraws the open tab alone.
-
-Nothing is loaded from elsewhere and nothing is sent: system fonts, no analytics, no sharing.
+Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, fonts are the system's, and there
+are no analytics and no sharing.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 import io
 import os
-import re
 import socket
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -19,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment
 
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, extra, printable
@@ -45,24 +43,33 @@ STYLE = """
 """
 
 
+_PANELS = """
+<div class="panels">
+{%- for panel in panels %}
+<figure><img src="{{ panel.image|data_url }}" alt="{{ panel.title }}"><figcaption>
+{%- for word in panel.title.split() %}{% if "e-" in word %}<span class="number">{{ word }}</span>{% else %}{{ word }}
+{%- endif %} {% endfor %}</figcaption></figure>
+{%- endfor %}
+</div>
+"""
+"""Pictures with their titles; numbers such as 2.9e-03 stay on one line."""
+_MESSAGE = """{% if text %}<div class="message" role="alert">{{ text }}</div>{% endif %}"""
+
+
 def as_html(panels: Sequence[Panel]) -> str:
     """A grid of pictures with their titles."""
-    figures = "".join(
-        f'<figure><img src="{data_url(panel.image)}" alt="{html.escape(panel.title)}">'
-        f"<figcaption>{_caption(panel.title)}</figcaption></figure>"
-        for panel in panels
-    )
-    return f'<div class="panels">{figures}</div>'
-
-
-def _caption(title: str) -> str:
-    """The title; numbers such as 2.9e-03 stay on one line."""
-    return re.sub(r"\S+e-\d+", r'<span class="number">\g<0></span>', html.escape(title))
+    return _rendered(_PANELS, panels=panels)
 
 
 def message(text: str) -> str:
     """What went wrong, or nothing."""
-    return f'<div class="message" role="alert">{html.escape(text)}</div>' if text else ""
+    return _rendered(_MESSAGE, text=text)
+
+
+def _rendered(template: str, **values: Any) -> str:
+    templates = Environment(autoescape=True)
+    templates.filters["data_url"] = data_url
+    return templates.from_string(template).render(values)
 
 
 def data_url(image: np.ndarray) -> str:
@@ -189,7 +196,9 @@ def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:
+    view = VIEWS.get(name, denoised)
     with gr.Tab(name) as tab:
+        gr.Markdown(str(view.__doc__).partition("\n")[0])  # what it shows
         if name == DENOISE:
             outputs["compared"] = gr.HTML(elem_id="compared")
             outputs[name] = gr.ImageSlider(show_label=False, format="png", elem_id="slider", max_height=560)

@@ -2,6 +2,9 @@
 
 Noisy and clean are shown pixel by pixel, of large pictures the central part. The eight draws are developed alike, by
 the setting of the first, so that cameras, lights and exposures can be seen to differ.
+
+RAW is developed quickly, by the setting of a draw backwards, x = T^-1(C^+ diag(g) d(y) / G): bilinear demosaicing d,
+gains g, colour matrix C, shading mask G and tone curve T. Of a learned tone network T is the curve of greys.
 """
 
 from __future__ import annotations
@@ -22,10 +25,12 @@ from rawaug.bayer import CFA, pattern
 from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.explore import figures
-from rawaug.explore.quick_development import Development
+from rawaug.explore.figures import grey_curve
 from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.metrics import psnr
 from rawaug.plugin.pictures import even_sided
 from rawaug.plugin.sampling_config import draw_key
@@ -38,6 +43,7 @@ _WHOLE_CELLS = 12
 _THUMBNAIL = 384
 _ZOOM = (24, 36)
 _SCALE = 8
+_LEVELS = 2**14
 
 
 class Panel(NamedTuple):
@@ -156,6 +162,43 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "Eight draws": draws,
 }
 """The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
+
+
+class Development:
+    """Develops RAW of one setting.
+
+    Args:
+        isp: whose stages are reversed.
+        setting: of one picture, without the leading B.
+    """
+
+    @torch.no_grad()
+    def __init__(self, isp: DictionaryISP, setting: ISPParams) -> None:
+        matrix = torch.linalg.pinv(setting.matrix) if isp.find(ColorCorrection) else torch.eye(3)
+        gains = setting.gains if isp.find(WhiteBalance) else torch.ones(3)
+        self.colour = matrix * gains
+        self.shading = isp.find(LensShading)
+        curve = grey_curve(isp, setting)
+        codes = np.interp(
+            np.linspace(0, 1, _LEVELS + 1), np.maximum.accumulate(curve.numpy()), np.linspace(0, 255, 256)
+        )
+        self.codes = torch.from_numpy(codes.round().astype(np.uint8))
+
+    @torch.no_grad()
+    def __call__(self, rgb: Tensor, place: tuple[int, int, int, int] | None = None) -> np.ndarray:
+        """Demosaiced RAW ``(3, H, W)`` to sRGB, uint8 ``(H, W, 3)``.
+
+        Args:
+            rgb: demosaiced.
+            place: top, left, and the full frame's height and width; the whole frame by default.
+        """
+        height, width = rgb.shape[-2:]
+        if self.shading is not None:
+            top, left, *frame = place or (0, 0, height, width)
+            rgb = rgb / self.shading.mask(place_in_frame(height, width, (top, left), (frame[0], frame[1])))[0]
+        linear = (self.colour @ rgb.reshape(3, -1)).mul_(_LEVELS).clamp_(0, _LEVELS)
+        picture: np.ndarray = self.codes[linear.int()].T.reshape(height, width, 3).numpy()
+        return np.ascontiguousarray(picture)
 
 
 @lru_cache(maxsize=1)
