@@ -27,6 +27,7 @@ from rawaug.commands.frame_denoisers import (
     FrameDenoiser,
     NetworkDenoiser,
     Noise,
+    UnknownNoise,
     as_json,
     frame_denoiser,
     levels_of,
@@ -43,6 +44,8 @@ from rawaug.progress import progress
 from rawaug.registry import Spec
 
 _NO_NOISE = (0.0, 0.0)
+UNREADABLE = (".braw", ".crm", ".gpr", ".r3d", ".x3f")
+"""Extensions of RAW that the decoder does not read."""
 
 
 def run(
@@ -118,11 +121,12 @@ class Denoised:
 
 @dataclass
 class DenoisedFolder:
-    """What a run over a folder did."""
+    """What a run over a folder did: files done, done before, failed with the reason, and RAW of unknown kinds."""
 
     files: list[Denoised] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
 
 
 def denoise_file(
@@ -250,7 +254,9 @@ def denoise_folder(
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
-    result = DenoisedFolder()
+    result = DenoisedFolder(
+        unread=[file.name for file in sorted(source.rglob("*")) if file.suffix.lower() in UNREADABLE]
+    )
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists() and not overwrite:
             result.existing += 1
@@ -260,7 +266,8 @@ def denoise_folder(
         except (OSError, ValueError) as error:
             if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
                 raise  # what cannot be written, such as to a full disk, is no fault of the file
-            result.broken[str(file)] = str(error)
+            named = str(error) if file.stem in str(error) else f"{file}: {error}"
+            result.broken[str(file)] = f"{'noise unknown' if isinstance(error, UnknownNoise) else 'broken'}: {named}"
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
     return result
@@ -289,5 +296,7 @@ def print_denoised(result: DenoisedFolder) -> None:
         print(f"{printable(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
-    for file, reason in result.broken.items():
-        print(printable(f"broken: {reason}" if Path(file).stem in reason else f"failed: {file}: {reason}"))
+    for reason in result.broken.values():
+        print(printable(reason))
+    if result.unread:
+        print(printable(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))

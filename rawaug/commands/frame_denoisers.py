@@ -1,9 +1,8 @@
-r"""The noise of a RAW frame: from its NoiseProfile tag, by an estimate, by a camera's law at its ISO, or as given.
+r"""What denoises a RAW frame, and the noise levels that it is told.
 
-What denoises a RAW frame: a network, or a classical filter where there is none.
-
-A network takes packed RAW and its noise map ``shot_var max(y, 0) + read_var``, a filter the same RAW with its noise
-made white (:class:`denoisers.Stabilised`). Both work in tiles, on the mosaic as the sensor gave it.
+The levels come from the NoiseProfile tag, an estimate, a camera's law at the frame's ISO, or are given. A network takes
+packed RAW and its noise map shot_var max(y, 0) + read_var, a filter the same RAW with its noise made white
+(:class:`denoisers.Stabilised`). Both work in tiles, on the mosaic as the sensor gave it.
 """
 
 from __future__ import annotations
@@ -39,59 +38,94 @@ from rawaug.noise import (
     estimate_noise,
     noise_levels,
 )
+from rawaug.noise.cameras import ProfileLevels
 from rawaug.registry import FILTERS, Spec
 from rawaug.seeding import keyed_generator
 
 Noise = str | Sequence[float] | MeasuredLevels
 """``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
 
+LOOSE = 0.9
+"""R^2 below which an estimate is called uncertain."""
+_GIVEN = "--noise '[shot_var, read_var]'"
 DISAGREE = 1.75
 """Ratio of tag and estimate, in the variance at the mean signal, from which ``auto`` trusts the estimate: it is within
 1.24 on frames whose noise is known, and a denoiser that is told half the variance leaves most of the noise."""
 
 
+class UnknownNoise(ValueError):
+    """The noise levels of a sound frame are not known."""
+
+
 def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str]:
-    """(shot_var, read_var) of a frame and their source; ``auto`` is the profile where the frame bears it out, else the
-    estimate.
+    """(shot_var, read_var) of a frame and their source.
+
+    ``auto`` is the profile where the frame bears it out, else the estimate, else the camera's published law.
 
     Raises:
-        ValueError: if the frame has no profile, its noise cannot be estimated, or the name is unknown or needs an ISO.
+        UnknownNoise: if the frame has no profile, its noise cannot be estimated, or a law does not reach its ISO.
+        ValueError: if there is no such name.
     """
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
     if not isinstance(noise, str):
         fixed = FixedLevels(*noise)
         return fixed.shot_var, fixed.read_var, "given"
-    if noise == "profile" or (noise == "auto" and frame.noise_profile is not None):
-        if frame.noise_profile is None:
-            raise ValueError(
-                f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or --noise '[shot_var, read_var]'"
-            )
-        return (*frame.noise_profile, "profile") if noise == "profile" else _checked_profile(frame, frame.noise_profile)
-    if noise in ("auto", "estimate"):
-        try:
-            estimate = estimate_noise(frame.mosaic, frame.cfa)
-        except ValueError as error:
-            raise ValueError(
-                f"{frame.name}: {error}; or pass --noise '[shot_var, read_var]' or a camera's name"
-            ) from None
-        return estimate.shot_var, estimate.read_var, "estimate"
-    if noise not in camera_names():
-        raise ValueError(
-            f"noise {noise!r} is unknown; use auto, profile, estimate, [shot_var, read_var] or one of {camera_names()}"
-        )
-    if frame.iso is None:
-        raise ValueError(
-            f"{frame.name}: has no ISO tag, needed for {noise}'s noise levels; pass --noise '[shot_var, read_var]'"
-        )
+    if noise == "auto":
+        return _automatic(frame)
+    if noise == "estimate":
+        return _estimated(frame)
+    if noise != "profile":
+        return *_published(frame, noise), noise
+    if frame.noise_profile is None:
+        raise UnknownNoise(f"{frame.name}: has no NoiseProfile tag; pass --noise estimate or {_GIVEN}")
+    return *frame.noise_profile, "profile"
+
+
+def _automatic(frame: RawFrame) -> tuple[float, float, str]:
+    if frame.noise_profile is not None:
+        return _checked_profile(frame, frame.noise_profile)
     try:
-        levels = noise_levels(noise, iso=frame.iso)
+        return _estimated(frame)
+    except UnknownNoise as error:
+        try:
+            return *_published(frame, frame.camera), f"published for {frame.camera}"
+        except ValueError:
+            raise error from None
+
+
+def _estimated(frame: RawFrame) -> tuple[float, float, str]:
+    """The estimate; half of the camera's published read variance is its least: flat areas say little about it."""
+    try:
+        estimate = estimate_noise(frame.mosaic, frame.cfa)
     except ValueError as error:
-        raise ValueError(f"{frame.name}: {error}") from None
+        raise UnknownNoise(f"{frame.name}: {error}; or pass {_GIVEN} or a camera's name") from None
+    source = f"estimate, R^2 {estimate.r2:.2f}"
+    if estimate.r2 < LOOSE:
+        source += ": uncertain, the points follow no line"
+    try:
+        least = _published(frame, frame.camera)[1] / 2
+    except ValueError:
+        least = 0.0
+    if estimate.read_var < least:
+        source += "; read_var is half the camera's published one"
+    return estimate.shot_var, max(estimate.read_var, least), source
+
+
+def _published(frame: RawFrame, name: str) -> tuple[float, float]:
+    """The levels of a measured or published camera at the frame's ISO."""
+    if not isinstance(noise_levels(name), (EldLevels, ProfileLevels)) and name not in camera_names():
+        raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_GIVEN}")
+    if frame.iso is None:
+        raise UnknownNoise(f"{frame.name}: has no ISO tag, needed for {name}'s noise levels; pass {_GIVEN}")
+    try:
+        levels = noise_levels(name, iso=frame.iso)
+    except ValueError as error:
+        raise UnknownNoise(f"{frame.name}: {error}") from None
     if isinstance(levels, EldLevels):
-        return *levels.typical(), noise
+        return levels.typical()
     shot_var, read_var = levels.sample(1, keyed_generator(0, "denoise"))  # at one ISO the draw is deterministic
-    return float(shot_var), float(read_var), noise
+    return float(shot_var), float(read_var)
 
 
 def _checked_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[float, float, str]:
@@ -119,7 +153,7 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
     try:
         return law.at(frame.iso)
     except ValueError as error:
-        raise ValueError(f"{frame.name}: {error}; pass --noise estimate or --noise '[shot_var, read_var]'") from None
+        raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_GIVEN}") from None
 
 
 def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
