@@ -100,15 +100,7 @@ def run(
 
 @dataclass(frozen=True)
 class Denoised:
-    """What was done to a file.
-
-    Attributes:
-        source, out: the files.
-        shot_var, read_var: the noise levels used.
-        noise_source: ``"profile"``, ``"estimate"``, or as requested.
-        below_zero: share of sites whose result was below the digital number 0, and became 0.
-        seconds: reading and writing included.
-    """
+    """What was done to a file; ``below_zero`` is the share of sites whose result was below the digital number 0."""
 
     source: Path
     out: Path
@@ -234,15 +226,10 @@ def denoise_folder(
 ) -> DenoisedFolder:
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
-    A file that cannot be read, or whose decoder crashes or hangs, is named and counted.
-
-    Args:
-        source, out: the folders.
-        method, noise, strength: as in :func:`denoise_file`.
-        overwrite: replace existing results, of other settings too.
+    A file that cannot be read, or whose decoder crashes or hangs, is named and counted; arguments are those of
+    :func:`denoise_file`.
 
     Raises:
-        FileNotFoundError: if there is no such file of weights.
         OSError: if a result cannot be written, such as to a full disk; those that were are kept.
         ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
             of another denoiser or other settings.

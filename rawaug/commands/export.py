@@ -1,18 +1,14 @@
-"""ONNX files of modules whose pictures may have any size, and how they are run here.
+"""``rawaug export``: a denoiser as an ONNX file, an ISP as JSON, .cube and ONNX, for programs without PyTorch.
 
-An ISP for programs without PyTorch: its numbers as JSON, a .cube, and its reverse pass as ONNX.
+A denoiser's inputs are ``noisy`` and, where the network reads it, ``variance`` = shot_var max(noisy, 0) + read_var, its
+output ``denoised``: float32 packed RAW (R, Gr, Gb, B) ``(1, 4, h, w)`` of any h, w >= 2. An ISP becomes
 
 - JSON: what ``rawaug info --json`` prints, and ``lut``, the table of the .cube.
 - .cube (Adobe's format, 33 nodes along each axis): sRGB to linear camera RGB, up to lens shading and mosaic.
 - ONNX: ``srgb (1, 3, h, w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and
-  ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``, packed R, Gr, Gb, B; the JSON has a typical matrix and gains. ONNX
-  Runtime and PyTorch are compared before the file is left there.
+  ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``, packed R, Gr, Gb, B; the JSON has a typical matrix and gains.
 
-``rawaug export``: a denoiser as an ONNX file, for programs that have no PyTorch; an ISP by :mod:`.export_isp`.
-
-Inputs ``noisy`` and, where the network reads it, ``variance``; output ``denoised``: float32 packed RAW (R, Gr, Gb, B)
-``(1, 4, h, w)`` of any h, w >= 2, that is any even mosaic. Variance is ``shot_var max(noisy, 0) + read_var``, of each
-value. The file is run by ONNX Runtime on a frame with noise and compared with PyTorch before it is left there.
+An ONNX file is run by ONNX Runtime and compared with PyTorch before it is left there.
 """
 
 from __future__ import annotations
@@ -47,6 +43,10 @@ from rawaug.seeding import keyed_generator
 TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
+NODES = 33
+"""Of a .cube along each axis."""
+SIDE = 512
+"""Mosaic pixels on the longer side of the frame on which both are run and timed."""
 
 
 def require_onnx(way_out: str = "") -> None:
@@ -57,14 +57,7 @@ def require_onnx(way_out: str = "") -> None:
 
 
 def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path) -> None:
-    """One ONNX file of float32; height and width of four-dimensional inputs are free.
-
-    Args:
-        model: called with the inputs in order.
-        inputs: by name, of a typical size.
-        output: its name.
-        path: the file.
-    """
+    """One ONNX file of float32 of ``model(*inputs)``; height and width of four-dimensional inputs are free."""
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
     with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
         warnings.simplefilter("ignore")
@@ -102,35 +95,15 @@ def feeds(names: Sequence[str], values: Sequence[Tensor]) -> dict[str, Any]:
 
 
 def require_equal(result: Any, expected: Tensor, path: Path) -> float:
-    """The largest difference between ONNX Runtime's result and PyTorch's.
-
-    Raises:
-        ValueError: if it is above :data:`TOLERANCE`, or not a number.
-    """
+    """The largest difference between ONNX Runtime's result and PyTorch's, unless it is above :data:`TOLERANCE`."""
     difference = (torch.from_numpy(result) - expected).abs().max().item()
     if not difference <= TOLERANCE:
         raise ValueError(f"{path}: ONNX Runtime differs from PyTorch by {difference:.1e}, more than {TOLERANCE}")
     return difference
 
 
-NODES = 33
-"""Of the table along each axis."""
-
-
 def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[float] | None = None) -> list[Path]:
-    """Write an ISP to ``out``, by its extension .json, .cube or .onnx; without one, a folder with all three.
-
-    Args:
-        isp: the ISP.
-        out: the file, or a folder to make.
-        white_balance: as-shot multipliers R, G, B of the setting; the fit's typical one by default.
-
-    Returns:
-        The files, each written whole.
-
-    Raises:
-        ValueError: for another extension; for ONNX, if a package is missing or ONNX Runtime differs from PyTorch.
-    """
+    """Write an ISP to ``out``, by its extension .json, .cube or .onnx; without one, a folder with all three."""
     out = Path(out)
     if out.suffix not in ("", *WRITERS):
         raise ValueError(f"{out}: an ISP is exported to {', '.join(WRITERS)}, or to a folder with all of them")
@@ -186,11 +159,7 @@ WRITERS: dict[str, Callable[[DictionaryISP, Path, Sequence[float] | None], None]
 
 
 class ReversePass(nn.Module):
-    """The reverse pass of an ISP as a function of tensors alone: sRGB, matrix and gains to packed RAW, any size.
-
-    Args:
-        isp: whose tone, shading and mosaic are taken; tone curves of a dictionary are mixed as is typical.
-    """
+    """The reverse pass of an ISP as a function of tensors alone; its tone curves are mixed as is typical."""
 
     def __init__(self, isp: DictionaryISP) -> None:
         super().__init__()
@@ -212,18 +181,8 @@ def _places(image: Tensor) -> Tensor:
     return torch.cat([rows - 0.5 - height / 2, columns - 0.5 - width / 2], dim=1) / half_diagonal
 
 
-SIDE = 512
-"""Mosaic pixels on the longer side of what both are run on and timed on."""
-
-
 class Exported(NamedTuple):
-    """What was written.
-
-    Args:
-        out: the file.
-        difference: largest between ONNX Runtime and PyTorch on the frame, white at 1.
-        seconds_onnx, seconds_torch: a mosaic megapixel, on as many threads as PyTorch has.
-    """
+    """What was written, the largest difference from PyTorch with white at 1, and seconds a mosaic megapixel."""
 
     out: Path
     difference: float
@@ -248,7 +207,8 @@ def run(
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
 
     Raises:
-        ValueError: if an option is given that is of the other kind.
+        FileNotFoundError, ValueError: if the weights or the frame cannot be read, ``out`` has another extension, an
+            option is of the other kind, a package is missing, or ONNX Runtime and PyTorch differ.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
         if frame is not None:
@@ -265,12 +225,7 @@ def run(
 
 
 def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None) -> Exported:
-    """Write ``denoiser`` to the ONNX file ``out``, whole or not at all.
-
-    Raises:
-        FileNotFoundError, ValueError: if the denoiser or the frame cannot be read, a package is missing, ``out`` is not
-            named .onnx, or ONNX Runtime and PyTorch differ by more than :data:`rawaug.commands.export.TOLERANCE`.
-    """
+    """Write ``denoiser`` to the ONNX file ``out``, whole or not at all; see :func:`run`."""
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")

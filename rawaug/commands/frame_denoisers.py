@@ -211,16 +211,7 @@ class FrameDenoiser(Protocol):
 
 
 class NetworkDenoiser:
-    """A trained network.
-
-    Args:
-        weights: its file, or the name of a shipped one.
-        self_ensemble: average eight views.
-        device: see :func:`rawaug.kernels.runtime.find_device`.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such denoiser or device.
-    """
+    """A trained network, by its file or the name of a shipped one."""
 
     def __init__(self, weights: str | Path, self_ensemble: bool = False, device: str = "auto") -> None:
         where, path = find_device(device), find(weights)
@@ -242,15 +233,7 @@ class NetworkDenoiser:
 def denoise_mosaic(
     model: Denoiser, cfa: CFA, frame: Frame, levels: tuple[float, float], self_ensemble: bool = False
 ) -> Tensor:
-    """The frame's mosaic denoised, float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black.
-
-    Args:
-        model: a network for packed RAW, on any device.
-        cfa: the pattern of the mosaics that it was trained on.
-        frame: what to denoise.
-        levels: (shot_var, read_var).
-        self_ensemble: average eight views.
-    """
+    """The frame's mosaic denoised by a network trained on mosaics of ``cfa``; see :class:`FrameDenoiser`."""
     height, width = frame.mosaic.shape[-2:]
     rows, columns = frame.cfa.shift_to(cfa)
     packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
@@ -262,14 +245,7 @@ def denoise_mosaic(
 
 
 class ClassicalDenoiser:
-    """A classical filter, which needs no training.
-
-    Args:
-        spec: a name of :data:`rawaug.registry.FILTERS`, or ``{name, settings}``.
-
-    Raises:
-        ValueError: if there is no such filter, or its library is not installed.
-    """
+    """A classical filter of :data:`rawaug.registry.FILTERS`, which needs no training."""
 
     reads_levels = True
 

@@ -52,44 +52,17 @@ def run(
         cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
         max_pixels: a larger picture is refused before it is decoded.
     """
-    for path in preview(picture, isp, out, count, seed, max_pixels, cfa):
-        print(path)
-
-
-def preview(
-    picture: str | Path,
-    weights: str | Path,
-    out: str | Path,
-    count: int = 8,
-    seed: int = 0,
-    max_pixels: int = MAX_PIXELS,
-    cfa: str | None = None,
-) -> list[Path]:
-    """Draw both figures.
-
-    Args:
-        picture: an sRGB picture.
-        weights: an ISP, shipped or a path.
-        out: the PNG of the stages; the dictionaries go beside it, ``NAME-atoms.png``.
-        count: number of augmented RAWs to plot.
-        seed: random seed of the augmented RAWs.
-        max_pixels: a larger picture is refused before it is decoded.
-        cfa: pattern of the RAW, as in :class:`rawaug.RawAugment`.
-
-    Returns:
-        The two paths.
-    """
     if count < 0:
         raise ValueError(f"count must be at least 0, got {count}")
-    out = Path(out) if Path(out).suffix else Path(f"{out}.png")
-    require_writable(out)
-    augment = RawAugment.from_pretrained(weights, cfa=cfa)
+    stages = Path(out) if Path(out).suffix else Path(f"{out}.png")
+    require_writable(stages)
+    augment = RawAugment.from_pretrained(isp, cfa=cfa)
     whole = even_sided(read_picture(picture, max_pixels))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    atoms = out.with_name(f"{out.stem}-atoms{out.suffix}")
-    _draw_stages(augment, whole, count, seed).savefig(out, dpi=130)
+    stages.parent.mkdir(parents=True, exist_ok=True)
+    atoms = stages.with_name(f"{stages.stem}-atoms{stages.suffix}")
+    _draw_stages(augment, whole, count, seed).savefig(stages, dpi=130)
     _draw_atoms(augment.isp).savefig(atoms, dpi=130)
-    return [out, atoms]
+    print(f"{stages}\n{atoms}")
 
 
 def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
