@@ -1,10 +1,4 @@
-"""What an arm of a recipe is trained on: its estimator, its stream of samples, and the samples it is watched on.
-
-A setting of an estimator that is chosen on validation: one candidate is trained for each value, the best is named.
-
-No test frame has a say. The score is the one by which a training keeps its weights: the best of ``log.csv``, or the
-last where there are no validation frames.
-"""
+"""What an arm of a recipe is trained on: its estimator, its stream of samples, and the samples it is watched on."""
 
 from __future__ import annotations
 
@@ -35,12 +29,7 @@ WATCHED = 16
 
 
 def estimator_of(arm: ArmConfig) -> Supervised:
-    """The estimator that the arm names.
-
-    Example:
-        >>> estimator_of(ArmConfig(estimator={"name": "r2r", "settings": {"alpha": 0.5}})).alpha
-        0.5
-    """
+    """The estimator that the arm names."""
     estimator: Supervised = ESTIMATORS.make(arm.estimator)
     return estimator
 
@@ -75,33 +64,23 @@ def training_stream(
 
     Args:
         frames: the real ones, see :func:`frames_of`.
-        pictures: the sRGB pictures.
-        isp, noise: make RAW of them.
+        pictures: the sRGB pictures, which ``isp`` and ``noise`` make RAW of.
         seed: of the run.
     """
-    config, seed = recipe.train, derived_seed(seed, "stream")
-    estimator = estimator_of(arm)
+    crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
+    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure) if arm.augmented else None
     real: Source | None = None
-    synthetic: Source | None = None
+    made: Source | None = None
     if isinstance(estimator, SelfSupervised):
         if frames and arm.augmented < 1.0:
-            real = NoisyCrops(frames, estimator, config.crop, isp.cfa)
-        if arm.augmented:
-            augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
+            real = NoisyCrops(frames, estimator, crop, isp.cfa)
+        if augment:
             frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
-            synthetic = NoisyCrops(frozen, estimator, config.crop, isp.cfa)
+            made = NoisyCrops(frozen, estimator, crop, isp.cfa)
     else:
-        if frames:
-            real = RealCrops(frames, noise, config.crop, isp.cfa)
-        if arm.augmented:
-            synthetic = picture_source(recipe, arm, pictures, isp, noise)
-    return TrainingStream(real, synthetic, config.batch, arm.augmented, seed)
-
-
-def picture_source(recipe: Recipe, arm: ArmConfig, pictures: Any, isp: DictionaryISP, noise: NoiseModel) -> Source:
-    """Crops of the sRGB pictures as RAW of the ISP's cameras."""
-    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure)
-    return PictureCrops(RawPairs(pictures, augment, recipe.train.crop, zoom=arm.zoom))
+        real = RealCrops(frames, noise, crop, isp.cfa) if frames else None
+        made = PictureCrops(RawPairs(pictures, augment, crop, zoom=arm.zoom)) if augment else None
+    return TrainingStream(real, made, recipe.train.batch, arm.augmented, seed)
 
 
 def validation_samples(
@@ -124,12 +103,14 @@ def validation_samples(
 
 
 def chosen(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
-    """Of every arm with a search its candidates and their mean validation PSNR over the runs, the highest first.
+    """The candidates of every arm with a search, with their mean validation PSNR over the runs, the highest first.
+
+    No test frame has a say: the score is the one by which a training keeps its weights.
 
     Args:
-        candidates: by name, the arm whose they are.
+        candidates: candidate to its arm.
         folders: of the runs, each with a folder for each candidate.
-        best: weights are those of the best score, else those of the last.
+        best: whether the weights of the best validation are kept, else those of the last.
     """
     scores: dict[str, dict[str, float]] = {}
     for label, arm in candidates.items():

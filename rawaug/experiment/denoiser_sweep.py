@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -22,16 +23,25 @@ from denoisers.files import DEFAULT, find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import each_readable
-from rawaug.data.pairs import Pair, Sample, SomePairs
+from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.page import Page, Part
-from rawaug.evaluation.scores import Method, classical_method, denoise, installed_classical, label_of, score_method
+from rawaug.evaluation.scores import (
+    Method,
+    Score,
+    classical_method,
+    denoise,
+    installed_classical,
+    label_of,
+    score_method,
+)
 from rawaug.evaluation.tables import METRICS, print_rows
+from rawaug.experiment.plan import some
 from rawaug.experiment.recipe import SHORT_CROP
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import replacing, write_json
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, noise_model
-from rawaug.registry import EXPERIMENTS, Spec
+from rawaug.registry import EXPERIMENTS
 
 TITLES = {"psnr": "PSNR, RAW (dB)", "ssim": "SSIM, RAW", "psnr_srgb": "PSNR, sRGB (dB)", "ssim_srgb": "SSIM, sRGB"}
 
@@ -89,54 +99,37 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
         settings: of the sweep.
         overwrite: replace another of its name.
     """
-    noises, makers, data = prepared_sweep(settings, overwrite)
-    frames = [clean_middle(pair, settings.crop) for spec, pairs in data.items() for pair in each_readable(pairs, spec)]
+    require_free(settings, overwrite)
+    noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
+    makers, frames = _makers(settings), list[Pair]()
+    for spec in settings.data:
+        chosen = some(open_pairs(spec, split="test"), settings.count, settings.crop)
+        frames += [replace(p, noisy=None, shot_var=None, read_var=None) for p in each_readable(chosen, spec)]
     claim(settings, overwrite)
+    megapixels = sum(pair.raw.numel() / 1e6 for pair in frames)
     rows: dict[str, Any] = {}
     for name, make in makers.items():
-        seconds, rows[name] = list[float](), {"iso": {}}
+        took, rows[name] = 0.0, {"iso": {}}
         for iso, noise in noises.items():
-            scores = [scored(make, pair, noise, settings.seed, f"{name}, ISO {iso}", seconds) for pair in frames]
-            rows[name]["iso"][str(iso)] = {key: fmean(score[key] for score in scores) for key in METRICS}
-        rows[name]["seconds_per_megapixel"] = sum(seconds) / len(noises) / sum(p.raw.numel() / 1e6 for p in frames)
+            found = [scored(make(noise), pair, noise, settings.seed, f"{name}, ISO {iso}") for pair in frames]
+            rows[name]["iso"][str(iso)] = {key: fmean(getattr(score, key) for score, _ in found) for key in METRICS}
+            took += sum(seconds for _, seconds in found)
+        rows[name]["seconds_per_megapixel"] = took / len(noises) / megapixels
     result = {"settings": asdict(settings), "threads": torch.get_num_threads(), "frames": len(frames), "rows": rows}
     _report(result, settings)
     return result
 
 
-def prepared_sweep(
-    settings: DenoiserSweep, overwrite: bool = False
-) -> tuple[dict[int, NoiseModel], dict[str, Maker], dict[str, Sequence[Pair]]]:
-    """The noise by ISO, the methods by name and the frames by dataset, not yet read; all that can be missing is found.
-
-    Raises:
-        OSError, ValueError: in one line, for the first thing that is missing or wrong.
-    """
-    require_free(settings, overwrite)
-    noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
-    makers, opened = _makers(settings), dict[str, Sequence[Pair]]()
-    for spec in settings.data:
-        pairs = open_pairs(spec, split="test")
-        opened[spec] = SomePairs(pairs, range(len(pairs))[: settings.count])
-    return noises, makers, opened
-
-
-def clean_middle(pair: Pair, crop: int | None) -> Pair:
-    """The middle of a frame, without its own noisy capture."""
-    middle = pair if crop is None else pair.middle(crop)
-    return replace(middle, noisy=None, shot_var=None, read_var=None)
-
-
-Maker = Callable[[Pair, NoiseModel, int], Method]
-"""Of a frame, its noise and the seed: what denoises it."""
+Maker = Callable[[NoiseModel], Method]
+"""Of the noise of the frames: what denoises them."""
 
 
 def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
     """Every method by name, the noisy input first."""
     device = find_device(settings.device)
-    makers: dict[str, Maker] = {"noisy input": lambda pair, noise, seed: lambda _, sample: sample.noisy}
+    makers: dict[str, Maker] = {"noisy input": lambda noise: lambda _, sample: sample.noisy}
     for spec in installed_classical(settings.classical):
-        makers[label_of(spec)] = _filter(spec)
+        makers[label_of(spec)] = partial(classical_method, spec, seed=settings.seed)
     for name in settings.denoisers:
         model, info = denoisers.load(find(name))
         makers[Path(name).stem] = _network(model.to(device), CFA(info.get("cfa", "RGGB")), clip=False)
@@ -145,19 +138,12 @@ def _makers(settings: DenoiserSweep) -> dict[str, Maker]:
     return makers
 
 
-def _filter(spec: Spec) -> Maker:
-    return lambda pair, noise, seed: classical_method(spec, noise, seed)
-
-
 def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:
-    def make(pair: Pair, noise: NoiseModel, seed: int) -> Method:
-        def method(_: Pair, sample: Sample) -> Tensor:
-            denoised = denoise(model, sample, CFA(pair.cfa), own=own)
-            return denoised.clamp(0.0, 1.0) if clip else denoised
+    def method(pair: Pair, sample: Sample) -> Tensor:
+        denoised = denoise(model, sample, pair.cfa, own=own)
+        return denoised.clamp(0.0, 1.0) if clip else denoised
 
-        return method
-
-    return make
+    return lambda noise: method
 
 
 def published_pmrid(path: str) -> denoisers.PMRID:
@@ -178,17 +164,18 @@ def published_pmrid(path: str) -> denoisers.PMRID:
     return model.eval()
 
 
-def scored(make: Maker, pair: Pair, noise: NoiseModel, seed: int, label: str, seconds: list[float]) -> dict[str, float]:
-    method = make(pair, noise, seed)
+def scored(method: Method, pair: Pair, noise: NoiseModel, seed: int, label: str) -> tuple[Score, float]:
+    """The scores of a frame, and the seconds that denoising it took."""
+    seconds = 0.0
 
     def timed(pair: Pair, sample: Sample) -> Tensor:
+        nonlocal seconds
         start = time.perf_counter()
         denoised = method(pair, sample)
-        seconds.append(time.perf_counter() - start)
+        seconds = time.perf_counter() - start
         return denoised
 
-    score = next(score_method(timed, [pair], noise, CFA(pair.cfa), seed, label))[0]
-    return {key: getattr(score, key) for key in METRICS}
+    return next(score_method(timed, [pair], noise, pair.cfa, seed, label))[0], seconds
 
 
 def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:

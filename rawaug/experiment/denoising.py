@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import denoisers
@@ -89,9 +88,7 @@ def run(
 class _Run:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
 
-    def __init__(
-        self, recipe: Recipe, overwrite: bool = False, given: Mapping[str, Sequence[Pair]] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, recipe: Recipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
         recipe = with_given_pairs(recipe, given)
         require_free(recipe, overwrite)
         require_trainable(recipe.device, recipe.devices, recipe.train.precision)
@@ -102,37 +99,28 @@ class _Run:
             noise_model(recipe.noise)
         for arm in recipe.arms:
             first_network(recipe.network_of(arm), seed=0)
+        self.estimators = {label: estimator_of(arm) for label, arm in recipe.arms.items()}
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
-        self.plan = plan = planned(recipe, given)
-        self.test, self.validation, self.pictures = plan.test, plan.validation, plan.pictures
-        self.pairs: list[Pair] = []
-        self.frames: dict[str, Sequence[Any]] = {}
-        self.unreadable: list[str] = []
-
-    def read(self) -> None:
-        """The training frames into memory; what frames lack, or cannot be read, is found before anything is fitted."""
-        if _leads():
-            print("\n".join(self.plan.lines(self.recipe)))
-        read, self.unreadable = self.plan.read()
-        self.pairs, self.validation, self.test = list(read.pairs), read.validation, read.test
-        if _leads() and self.unreadable:
-            print("\n".join(self.unreadable))
-        if self.recipe.self_supervised:  # from here on nothing knows a clean frame but the test
+        plan = planned(recipe, given)
+        _say(*plan.lines(recipe))
+        plan, self.unreadable = plan.read()
+        _say(*self.unreadable)
+        self.pairs, self.validation, self.test = list(plan.pairs), plan.validation, plan.test
+        if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
-        if self.data.pictures == OWN_PICTURES:
-            self.pictures = PairPictures(self.pairs)
-        require_usable(self.recipe, self.pairs, self.validation)
+        self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
+        self.frames: dict[str, Sequence[Any]] = {}
+        require_usable(recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
     def all_stages(self) -> Results:
         recipe = self.recipe
-        self.read()
         if _leads():
             claim(recipe, self.overwrite)
         results: Results = {arm: [] for arm in recipe.arms}
         models: dict[str, Denoiser] = {}
-        for seed in range(recipe.seed, recipe.seed + recipe.seeds):
+        for seed in self.seeds:
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
             if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
@@ -142,10 +130,17 @@ class _Run:
                 models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
                 if _leads():
                     results[arm].append(self.evaluated(arm, models[arm], noise, isp, seed))
-        if not _leads():
-            return results
-        self.reported(results, models, noise, isp)
+        if _leads():
+            self.reported(results, models, noise, isp)
         return results
+
+    @property
+    def seeds(self) -> range:
+        return range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
+
+    def place(self, arm: str, seed: int) -> Path:
+        """The folder of an arm's files."""
+        return self.folder / f"seed{seed}" / arm
 
     def pattern(self, arm: str, isp: DictionaryISP) -> CFA:
         """The CFA that an arm is trained for: that of the weights that it starts from, else the ISP's."""
@@ -166,8 +161,7 @@ class _Run:
         if path.is_file():
             isp = DictionaryISP.from_pretrained(path)
             if isp.info.get("key") == key:
-                if _leads():
-                    print(f"already fitted: {path}")
+                _say(f"already fitted: {path}")
                 return isp
         isp = fit(self.pairs, noise="on" if measure else "off", **settings)
         isp.info["key"] = key
@@ -176,7 +170,7 @@ class _Run:
 
     def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
         """The denoiser of one arm."""
-        recipe, place = self.recipe, self.folder / f"seed{seed}" / arm
+        recipe, place = self.recipe, self.place(arm, seed)
         path = place / "denoiser.safetensors"
         config, network, start = recipe.loop_of(arm), recipe.network_of(arm), self.starts[arm]
         key = self.weights_key(arm, isp, seed)
@@ -187,9 +181,20 @@ class _Run:
                 return model
         stream = training_stream(recipe, recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed)
         validation = validation_samples(recipe, self.frames["validation"], self.pictures, isp, noise)
-        label, estimator = f"seed {seed}, {arm}", estimator_of(recipe.arms[arm])
-        where, choose = (recipe.device, recipe.devices), bool(self.validation)
-        model = train(stream, validation, network, config, place, seed, *where, label, estimator, choose, key)
+        model = train(
+            stream,
+            validation,
+            network,
+            config,
+            place,
+            seed,
+            recipe.device,
+            recipe.devices,
+            label=f"seed {seed}, {arm}",
+            estimator=self.estimators[arm],
+            choose=bool(self.validation),
+            key=key,
+        )
         if not _leads():
             return model
         levels = camera_law(isp.info["noise"]).spec() if recipe.noise == "camera" else recipe.noise
@@ -204,22 +209,18 @@ class _Run:
     def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
         """What the weights of an arm depend on."""
         recipe, data, start = self.recipe, self.data, self.starts[arm]
-        pictures = (data.pictures, len(self.pictures), *([] if data.max_pixels is None else [data.max_pixels]))
-        settings = _settings(recipe.arms[arm])
-        samples = [isp.info["key"], recipe.noise, settings, data.pairs, stamps(self.pairs), pictures]
-        samples += [] if start is None else [start.sha256]
-        samples += [revision] if (revision := estimator_of(recipe.arms[arm]).revision) else []
+        real = isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
+        pictures = data.pictures, len(self.pictures), data.max_pixels
+        how = asdict(recipe.arms[arm]), self.estimators[arm].revision, start and start.sha256
         validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
-        return weights_key(recipe.network_of(arm), recipe.loop_of(arm), (seed, *samples), validation)
+        samples = (seed, *real, *pictures, *how)
+        return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
-        place = self.folder / f"seed{seed}" / arm
-        digest = sha256(place / "denoiser.safetensors")
-        settings: list[Any] = [] if self.recipe.views == 8 else [self.recipe.views]
-        settings += [] if self.data.test_crop is None else ["crop", self.data.test_crop]
-        key = fingerprint(digest, self.data.test, stamps(self.test), *settings)
-        path = place / "evaluation.json"
+        path = self.place(arm, seed) / "evaluation.json"
+        digest = sha256(path.with_name("denoiser.safetensors"))
+        key = fingerprint(digest, self.data.test, self.data.test_crop, stamps(self.test), self.recipe.views)
         known = json.loads(path.read_text()) if path.is_file() else {}
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
         missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
@@ -235,10 +236,8 @@ class _Run:
 
     def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
         """The denoiser of an arm as it is tested."""
-        at_test = estimator_of(self.recipe.arms[arm]).at_test
-        return network_method(
-            model.to(find_device(self.recipe.device)), isp.cfa, self.pattern(arm, isp), views, at_test
-        )
+        at_test, where = self.estimators[arm].at_test, find_device(self.recipe.device)
+        return network_method(model.to(where), isp.cfa, self.pattern(arm, isp), views, at_test)
 
     def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
@@ -253,56 +252,55 @@ class _Run:
         others = self.untrained(noise, cfa)
         classical: dict[str, Any] = {}
         everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
-        runs = [self.folder / f"seed{s}" for s in range(recipe.seed, recipe.seed + recipe.seeds)]
         candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
-        searches = chosen(candidates, runs, bool(self.validation))
+        searches = chosen(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
         everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
-        searched = [
-            f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
-            for arm, found in searches.items()
-        ]
         write_json(everything, self.folder / "results.json")
         for name, method in others.items():
             classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
             write_json(everything, self.folder / "results.json")
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
-        page, shown = Page.of_scores(title, results, classical), list[Row]()
-        seeds = range(recipe.seed, recipe.seed + recipe.seeds)
-        page.add_curves(
-            draw_curves({arm: [self.folder / f"seed{s}" / arm / "log.csv" for s in seeds] for arm in models})
-        )
-        hidden = [label_of(spec) for spec in self.classical[1:]]
-        methods = {name: method for name, method in others.items() if name not in hidden}
-        for arm, model in models.items():
-            methods[arm] = self.method(arm, model, isp)
-        for pair in shown_on_page(self.test):
-            row = row_of(methods, pair, noise, cfa, seed=0)
-            page.add_frame(row, cfa)
-            shown += [row] if len(shown) < SHOWN else []
-        picture = draw(shown, cfa, self.folder / "picture.png")
-        written = page.write(self.folder / "report.html", asdict(recipe))
+        methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
+        picture = self.pictured(Page.of_scores(title, results, classical), methods, noise, cfa)
         print_table(results, title, classical)
-        print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {written}")
-        print("\n".join([*reports(self.pictures), *self.unreadable, *searched, *self.usage(results)]))
+        print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")
+        searched = [
+            f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
+            for arm, found in searches.items()
+        ]
+        _say(*reports(self.pictures), *self.unreadable, *searched, *self.usage(results))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
+    def pictured(self, page: Page, methods: Mapping[str, Method], noise: NoiseModel, cfa: CFA) -> Path:
+        """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
+        logs = {arm: [self.place(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
+        page.add_curves(draw_curves(logs))
+        hidden = [label_of(spec) for spec in self.classical[1:]]
+        shown = {name: method for name, method in methods.items() if name not in hidden}
+        rows: list[Row] = []
+        for pair in shown_on_page(self.test):
+            row = row_of(shown, pair, noise, cfa, seed=0)
+            page.add_frame(row, cfa)
+            rows += [row] if len(rows) < SHOWN else []
+        page.write(self.folder / "report.html", asdict(self.recipe))
+        return draw(rows, cfa, self.folder / "picture.png")
+
     def usage(self, results: Results) -> list[str]:
         """The files of weights, and the command that uses those of the arm with the highest PSNR."""
-        seeds = range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
-        places = {arm: [self.folder / f"seed{s}" / arm / "denoiser.safetensors" for s in seeds] for arm in results}
-        lines = [f"denoiser, {arm}: {place}" for arm, found in places.items() for place in found]
-        runs = {(arm, k): run["plain"] for arm, found in results.items() for k, run in enumerate(found)}
-        best, seed = max(runs, key=lambda run: runs[run].get("psnr", 0.0))
-        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {places[best][seed]}"]
+        files = {(arm, s): self.place(arm, s) / "denoiser.safetensors" for arm in results for s in self.seeds}
+        runs = [run["plain"].get("psnr", 0.0) for found in results.values() for run in found]
+        best = list(files.values())[runs.index(max(runs))]
+        lines = [f"denoiser, {arm}: {file}" for (arm, _), file in files.items()]
+        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {best}"]
 
 
-def _settings(part: Any) -> dict[str, Any]:
-    """Of a part of the recipe; keys that came later are left out where they are null: older runs stay what they are."""
-    later = ("start", "denoiser", "learning_rate", "weigh", "steps", "search", "candidate_of")
-    return {key: value for key, value in asdict(part).items() if key not in later or value is not None}
+def _say(*lines: str) -> None:
+    """Print, in the process that writes."""
+    if lines and _leads():
+        print("\n".join(lines))
 
 
 def _leads() -> bool:

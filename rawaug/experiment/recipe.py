@@ -22,6 +22,12 @@ HELD_OUT = "auto"
 """``data.validation`` that is a part of ``data.pairs``."""
 _PAIRS = "pairs:"
 MOST_BYTES = 2**16
+_BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
+    **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
+    "max_pixels": (4, 2**40),
+    "read_seconds": (0.0, 1e6),
+}
 
 
 @dataclass
@@ -64,23 +70,13 @@ class DataConfig(PairSettings):
     test_crop: int | None = None
 
     def __post_init__(self) -> None:
-        if self.max_pixels is not None:
-            require_between("data.max_pixels", self.max_pixels, 4, 2**40)
-        if self.read_seconds is not None:
-            require_between("data.read_seconds", self.read_seconds, 0.0, 1e6)
+        for key, (least, most) in _BOUNDS.items():
+            if getattr(self, key) is not None:
+                require_between(f"data.{key}", getattr(self, key), least, most)
         if self.validation == HELD_OUT and self.pairs is None:
             raise ValueError("data.validation: auto holds out a part of data.pairs, which is null; set one of them")
         if not self.pictures:
             raise ValueError("data.pictures must name a folder, demo:, or a list of these, got an empty list")
-        for key, least in {
-            "count": 1,
-            "validation_count": 1,
-            "validation_crop": 32,
-            "test_count": 1,
-            "test_crop": 32,
-        }.items():
-            if getattr(self, key) is not None:
-                require_between(f"data.{key}", getattr(self, key), least, MOST)
         if self.pictures == OWN_PICTURES and self.pairs is None:
             raise ValueError("data.pictures: pairs takes those of data.pairs, which is null; set one of them")
         given = [key for key, value in self._pair_settings().items() if value is not None]
@@ -109,10 +105,9 @@ class ArmConfig:
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
-        alpha, correct, gamma: settings of the estimator, deprecated; older recipes set them here.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
             for each value, and the results name the best.
-        candidate_of: of such an arm: whose it is.
+        candidate_of: the arm whose search this one is part of.
         denoiser: this arm's network, in place of the recipe's; ``{start: rawaug-small}`` fine-tunes a shipped one.
         learning_rate: in place of ``train.learning_rate``; null takes that one.
         weigh: in place of ``train.weigh``; null takes that one.
@@ -125,9 +120,6 @@ class ArmConfig:
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
     estimator: str | dict[str, Any] = "supervised"
-    alpha: float | None = None
-    correct: bool | None = None
-    gamma: float | None = None
     search: dict[str, list[float]] | None = None
     candidate_of: str | None = None
     denoiser: DenoiserConfig | None = None
@@ -136,20 +128,13 @@ class ArmConfig:
     steps: int | None = None
 
     def __post_init__(self) -> None:
-        if self.augmented is None or not 0.0 <= self.augmented <= 1.0:
-            raise ValueError(f"augmented must be between 0 and 1, got {self.augmented}")
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps must be at least 1, or null for train.steps, got {self.steps}")
+        require_between("augmented", self.augmented, 0.0, 1.0)
+        if self.steps is not None:
+            require_between("steps", self.steps, 1, MOST)
         try:
-            name, settings = name_and_settings(self.estimator)
+            ESTIMATORS.make(self.estimator)
         except ValueError as error:
             raise ValueError(f"estimator: {error}") from None
-        for key in ("alpha", "correct", "gamma"):
-            if (old := getattr(self, key)) is not None:
-                settings[key] = old
-                setattr(self, key, None)
-        self.estimator = {"name": name, "settings": settings} if settings else name
-        ESTIMATORS.make(self.estimator)
 
     def candidates(self, label: str) -> dict[str, ArmConfig]:
         """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``.
