@@ -9,7 +9,7 @@ bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmar
 kind, number). A worker process reads one after the other, every eighth by the commands too (benchmarks/commands.py),
 and is restarted when a decoder takes it down. Counted are files that were read; that were refused as documented
 (ValueError or OSError of one line with the file's name); that crashed a decoder, by its name, which the package
-contains (:mod:`rawaug.io.apart`); and what must not be: other exceptions and numbers that are not finite, more than
+contains (:mod:`rawaug.io.isolated`); and what must not be: other exceptions and numbers that are not finite, more than
 10 s of a processor (60 with commands), more than 2 GiB. Exit status 1 if there is any of the last three. ``--keep``
 keeps all files but those of the first two columns; a run with ``--journal`` that was stopped goes on where it was.
 """

@@ -219,6 +219,27 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     return raw[..., top : top + height, left : left + width]
 
 
+def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int) -> Tensor:
+    """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides: each site is the mean of ``factor``^2 of its colour.
+
+    The pattern stays; independent noise has 1 / ``factor``^2 of its variance. The four sites of a new cell are means
+    over nearly the same area, so that demosaicing takes them to lie farther apart than they do.
+
+    Raises:
+        ValueError: if the CFA is not Bayer's (X-Trans), or a side is not a multiple of 2 ``factor``.
+
+    Example:
+        >>> bin_mosaic(torch.rand(1, 16, 24), "GRBG", 4).shape
+        torch.Size([1, 4, 6])
+    """
+    if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
+        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
+    planes = pack(raw, cfa)
+    *lead, height, width = planes.shape
+    cells = planes.reshape(*lead, height // factor, factor, width // factor, factor)
+    return unpack(cells.mean((-3, -1)), cfa)
+
+
 def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
     """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
     rows, columns = cfa.shift_to(target)

@@ -105,12 +105,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RuntimeError, MemoryError) as error:
         if (reason := shortage(error)) is None:
             raise
-        said = reason
+        said = reason + _being_read()
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
     print(f"rawaug: {printable(said)}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _being_read() -> str:
+    """The pictures that dead workers were reading, one of which may have crashed its decoder."""
+    folders = sys.modules.get("rawaug.data.folders")
+    files = folders.being_read() if folders is not None else []
+    return f"; it was reading {' or '.join(map(str, files))}" if files else ""
 
 
 def _one_line(error: Exception) -> str:

@@ -233,7 +233,7 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
             path.unlink() if fault == "vanishes" else path.write_bytes(path.read_bytes() + b"more")
         return picture
 
-    monkeypatch.setattr(pair_maker, "decode_picture", unlucky)
+    monkeypatch.setattr(pair_maker, "read_picture", unlucky)
     result = synth(tmp_path / "in", tmp_path / "out", workers=0)
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
 

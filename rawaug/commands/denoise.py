@@ -38,7 +38,7 @@ from rawaug.data.folders import RAW_EXTENSIONS, files_below
 from rawaug.errors import printable
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
-from rawaug.io.apart import apart
+from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
 from rawaug.progress import progress
 from rawaug.registry import Spec
@@ -249,7 +249,7 @@ def denoise_folder(
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, made, noise, strength, partial(apart, read_raw)))
+            result.files.append(_denoise_file(file, target, made, noise, strength, partial(isolated, read_raw)))
         except (OSError, ValueError) as error:
             if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
                 raise  # what cannot be written, such as to a full disk, is no fault of the file

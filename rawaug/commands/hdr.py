@@ -14,6 +14,7 @@ from torch import Tensor
 from rawaug.commands import YAML
 from rawaug.files import require_writable
 from rawaug.io import read_picture, write_picture
+from rawaug.io.isolated import isolated
 from rawaug.io.pictures import MAX_PIXELS, read_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
@@ -95,7 +96,7 @@ def _read(pictures: Sequence[str | Path], max_pixels: int) -> list[Tensor]:
     """The pictures, all of the size of the first."""
     read: list[Tensor] = []
     for path in pictures:
-        read.append(read_picture(path, max_pixels))
+        read.append(isolated(read_picture, path, max_pixels))
         (height, width), (first_height, first_width) = read[-1].shape[1:], read[0].shape[1:]
         if (height, width) != (first_height, first_width):
             raise ValueError(

@@ -1,18 +1,8 @@
-r"""A RAW pair on disk, in one of three formats, and the parameters that replay it.
+r"""A RAW pair on disk, ``NAME_clean.dng NAME_noisy.dng``, ``NAME.npz`` or ``NAME_clean.tif NAME_noisy.tif``.
 
-======  =====================================  ====================================================================
-format  files                                  content
-======  =====================================  ====================================================================
-dng     ``NAME_clean.dng NAME_noisy.dng``      16 bits, as a camera would; opens in a RAW developer
-npz     ``NAME.npz``                           packed float32 ``clean``, ``noisy`` ``(4, h, w)``, and statements
-                                               (mosaics ``(1, H, W)`` where the pattern is not Bayer's)
-tiff    ``NAME_clean.tif NAME_noisy.tif``      the mosaic in float32, black 0, white 1; statements in its description
-======  =====================================  ====================================================================
-
-The statements are ``cfa``, ``white_balance``, ``color_matrix``, ``shot_var`` and ``read_var``, as far as known.
-
-``NAME.safetensors`` is written last: a pair is there when its parameters are. A DNG's black level is as high as the
-darkest noisy value needs, so that nothing is clipped at black; the clean file has the same levels.
+:mod:`rawaug.data.formats` says what these hold. ``NAME.safetensors``, the parameters that replay the pair, is written
+last: a pair is there when its parameters are. A DNG's black level is as high as the darkest noisy value needs, so that
+nothing is clipped at black; the clean file has the same levels.
 """
 
 from __future__ import annotations
@@ -26,13 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
-from rawaug.errors import extra
-from rawaug.files import digest, read_header, replacing, write_tensors
+from rawaug.data.formats import write_npz, write_tiff
+from rawaug.files import digest, read_header, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.plugin.augment import RawAugment
@@ -122,13 +111,14 @@ def _numbered(stem: Path, number: int) -> Path:
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
     """Write a pair ``(4, h, w)`` and its parameters to files whose names begin with ``stem``."""
     if format == "dng":
-        _write_dngs(stem, pair, augment)
+        clean, noisy, stops = camera_frames(pair, augment)
+        write_dng(_beside(stem, "_clean.dng"), clean, baseline_exposure=stops)
+        write_dng(_beside(stem, "_noisy.dng"), noisy, baseline_exposure=stops)
     elif format == "npz":
-        _write_npz(stem, pair, augment)
+        write_npz(_beside(stem, ".npz"), pair.clean, pair.noisy, _stated(pair, augment))
     else:
-        stated = _stated(pair, augment)
-        _write_tiff(_beside(stem, "_clean.tif"), augment.mosaic(pair.clean), stated)
-        _write_tiff(_beside(stem, "_noisy.tif"), augment.mosaic(pair.noisy), stated)
+        for name, raw in (("clean", pair.clean), ("noisy", pair.noisy)):
+            write_tiff(_beside(stem, f"_{name}.tif"), augment.mosaic(raw), _stated(pair, augment))
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
     write_tensors(pair.params.tensors(), header, params_file(stem))
 
@@ -165,31 +155,8 @@ def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def _write_tiff(path: Path, mosaic: Tensor, stated: dict[str, Any]) -> None:
-    with extra("raw"):
-        import tifffile
-
-    with replacing(path) as partial:
-        tifffile.imwrite(
-            partial,
-            mosaic[0].numpy(),
-            photometric="minisblack",
-            metadata=None,
-            description=json.dumps(stated, sort_keys=True),
-        )
-
-
-def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    stated = {
-        key: np.array(value, None if key == "cfa" else np.float32) for key, value in _stated(pair, augment).items()
-    }
-    arrays: dict[str, Any] = {**stated, "clean": pair.clean.numpy(), "noisy": pair.noisy.numpy()}
-    with replacing(_beside(stem, ".npz")) as partial, partial.open("wb") as file:
-        np.savez(file, **arrays)
-
-
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
-    """What :mod:`rawaug.data.mosaic_files` reads beside a mosaic; a colour that no camera has is left out."""
+    """The metadata of a mosaic; a colour that no camera has is left out."""
     noise = pair.params.noise
     stated: dict[str, Any] = {"cfa": augment.cfa}
     stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
@@ -198,12 +165,6 @@ def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     except (ValueError, RuntimeError):
         return stated
     return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
-
-
-def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    clean, noisy, stops = camera_frames(pair, augment)
-    write_dng(_beside(stem, "_clean.dng"), clean, baseline_exposure=stops)
-    write_dng(_beside(stem, "_noisy.dng"), noisy, baseline_exposure=stops)
 
 
 def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFrame, float]:

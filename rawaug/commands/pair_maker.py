@@ -1,8 +1,7 @@
-"""The settings that the files of an output folder were made with, so that it never holds files of two settings.
+"""The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
 
-The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
-
-The draws of a pair depend on (seed, picture's name, number) alone.
+The draws of a pair depend on (seed, picture's name, number) alone. The settings that the files of an output folder were
+made with are kept in it, so that it never holds files of two settings.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 from rawaug import __version__
 from rawaug.files import find_weights, sha256, write_json
 from rawaug.io import read_picture
-from rawaug.io.apart import apart
-from rawaug.io.pictures import MAX_PIXELS, decode_picture
+from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
@@ -128,7 +126,7 @@ class PairMaker:
             OSError, ValueError: if it cannot be read, or changes meanwhile, here and not on iteration.
         """
         before, content = picture.stat(), sha256(picture)
-        srgb = even_sided(apart(decode_picture, picture, self.max_pixels)).contiguous()
+        srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()
         if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
             raise ValueError(f"{picture}: changed while it was read; run the same command again")

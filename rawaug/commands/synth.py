@@ -31,7 +31,6 @@ from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.errors import printable
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import LOCK, find_weights, locked, sha256
-from rawaug.io.apart import prepare
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
 from rawaug.plugin.sampling_config import Drawing
@@ -223,7 +222,6 @@ _maker: PairMaker
 def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
     """Of each task as it finishes."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
-    prepare()
     if workers < 1:
         _prepare(settings, max_pixels)
         yield from map(_make, tasks)
@@ -235,7 +233,10 @@ def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: i
         for future in as_completed([pool.submit(_make, task) for task in tasks]):
             yield future.result()
     except BrokenProcessPool:
-        raise OSError("a worker died, perhaps out of memory; run it again to resume, with fewer --workers") from None
+        raise OSError(
+            "a worker died, perhaps out of memory or of a damaged picture; run it again with fewer --workers, "
+            "or look for the picture with rawaug data check"
+        ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 

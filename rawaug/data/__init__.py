@@ -20,7 +20,7 @@ from rawaug.data.demo.pairs import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import Binned, LazyPairs, Pair
 from rawaug.data.published import Rawir, Rgb2Raw, Zurich, fivek_pairs
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission, write_submission
 from rawaug.data.sidd.frames import SiddFrames
@@ -28,6 +28,7 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
+    "Binned",
     "DataReport",
     "DemoCamera",
     "Dnd",
@@ -66,6 +67,7 @@ def open_pairs(
     split: str = "test",
     as_clean: bool = True,
     max_pixels: int | None = None,
+    bin: int = 1,
     **settings: Any,
 ) -> Sequence[Pair]:
     """Open RAW-sRGB pairs.
@@ -79,6 +81,7 @@ def open_pairs(
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
         max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
             for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
+        bin: K makes each site the mean of K x K sites of its colour: a reference with 1 / K^2 of its own noise.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:
@@ -89,6 +92,8 @@ def open_pairs(
         >>> len(open_pairs("demo:validation"))
         4
     """
+    if bin != 1:
+        return Binned(open_pairs(spec, split, as_clean, max_pixels, **settings), bin)
     settings = {key: value for key, value in settings.items() if value is not None}
     if not isinstance(spec, (str, Path)):
         return _as_they_are(spec, settings)

@@ -1,17 +1,18 @@
 """Identify the dataset in a folder, count its items, sizes, patterns and levels, and list damaged files.
 
-Everything is read once, as training would read it. A folder is recognised by its publisher's file
-names; anything else is a folder of RAW files, of pictures, or both. Files are decoded apart (:mod:`rawaug.io.apart`):
-one that crashes its decoder, or hangs, is named and the rest is read.
+Everything is read once, as training would read it, but in a helper process (:mod:`rawaug.io.isolated`): a file that
+crashes its decoder, or hangs, is named and the rest is read. A folder is recognised by its publisher's file names;
+anything else is a folder of RAW files, of pictures, or both.
 """
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, c
 from rawaug.data.sidd.frames import SiddFrames, is_scene
 from rawaug.errors import printable
 from rawaug.io import RawFrame, read_raw
-from rawaug.io.apart import apart
+from rawaug.io.isolated import isolated
 
 _SHOWN = 6
 _PAIRS = "pairs:"
@@ -109,15 +110,15 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     settings = {key: value for key, value in settings.items() if value is not None}
     if str(path).startswith(_PAIRS):
         folder = Path(str(path).removeprefix(_PAIRS))
-        opened = PairFolder(folder, **settings)
-        return DataReport(folder, [_part("noisy/clean pairs", lambda: opened, first)])
+        PairFolder(folder, **settings)  # raises for a wrong setting
+        return DataReport(folder, [_part("noisy/clean pairs", partial(PairFolder, folder, **settings), first)])
     if settings:
         raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file() and path.suffix in (".csv", ".mat"):
-        return DataReport(path, [_part("SIDD submission", lambda: list(check_submission(path)), first)])
+        return DataReport(path, [_part("SIDD submission", partial(_submission, path), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
         raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
@@ -129,15 +130,15 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     found = list(files_below(path))
     files = {file.name for file in found}
     if any("GT_RAW" in file.name.upper() and is_scene(file.parent.name) for file in found):
-        yield "SIDD, full frames", lambda: SiddFrames(path)
+        yield "SIDD, full frames", partial(SiddFrames, path)
     if any(re.fullmatch(r"Validation\w+BlocksRaw\.mat", name) for name in files):
-        yield "SIDD, validation blocks", lambda: SiddBlocks(path)
+        yield "SIDD, validation blocks", partial(SiddBlocks, path)
     if "BenchmarkNoisyBlocksRaw.mat" in files:
-        yield "SIDD, benchmark blocks (noisy only)", lambda: SiddBenchmark(path)
+        yield "SIDD, benchmark blocks (noisy only)", partial(SiddBenchmark, path)
     if any(re.fullmatch(r"siddplus_valid_\w+_raw\.mat", name) for name in files):
-        yield "SIDD+, validation blocks", lambda: SiddPlusBlocks(path)
+        yield "SIDD+, validation blocks", partial(SiddPlusBlocks, path)
     if (path / "info.mat").is_file():
-        yield "DND, boxes (noisy only)", lambda: Dnd(path)
+        yield "DND, boxes (noisy only)", partial(Dnd, path)
     if any((path / split / "huawei_raw").is_dir() for split in ("train", "test")):
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
@@ -153,14 +154,14 @@ def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
     """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
     files = [path] if path.is_file() else list(files_below(path))
     if path.is_dir() and looks_like_pairs(files):
-        yield "noisy/clean pairs", lambda: PairFolder(path)
+        yield "noisy/clean pairs", partial(PairFolder, path)
         return
     raws = sorted(file for file in files if file.suffix.lower() in RAW_EXTENSIONS)
     numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
     if raws:
-        yield f"RAW files{_fivek(numbers)}", lambda: _RawFrames(raws)
+        yield f"RAW files{_fivek(numbers)}", partial(_RawFrames, path)
     if any(file.suffix.lower() in PICTURE_EXTENSIONS for file in files) and path.is_dir():
-        yield "pictures", lambda: PictureFolder(path, allowed_share=1)
+        yield "pictures", partial(PictureFolder, path, allowed_share=1)
 
 
 def _fivek(numbers: set[str]) -> str:
@@ -174,16 +175,20 @@ def _fivek(numbers: set[str]) -> str:
 
 
 class _RawFrames(Sequence[RawFrame]):
-    """RAW files without a rendering of them."""
+    """The RAW files of a folder, or one, without a rendering of them."""
 
-    def __init__(self, files: list[Path]) -> None:
-        self.files = files
+    def __init__(self, path: Path) -> None:
+        self.files = [path] if path.is_file() else sorted(files_below(path, RAW_EXTENSIONS))
 
     def __len__(self) -> int:
         return len(self.files)
 
     def __getitem__(self, index: int) -> RawFrame:  # type: ignore[override]
-        return apart(read_raw, self.files[index])
+        return read_raw(self.files[index])
+
+
+def _submission(path: Path) -> list[Tensor]:
+    return list(check_submission(path))
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
@@ -196,14 +201,32 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
+    opening = pickle.dumps(open_part)
     for index in range(part.examined):
-        part.add(_facts(items, index))
+        try:
+            part.add(isolated(_facts, opening, index, name=_name(items, index)))
+        except OSError as error:  # of the helper: a crash or a hang
+            part.broken.append(str(error))
     return part
 
 
-def _facts(items: Any, index: int) -> PartReport:
+def _name(items: Any, index: int) -> object:
+    """Of an item, in the report of a crash."""
+    if isinstance(items, PictureFolder):
+        return items.file(index)
+    names = items.files if isinstance(items, _RawFrames) else getattr(items, "names", range(len(items)))
+    return names[index]
+
+
+@lru_cache(maxsize=1)
+def _opened(opening: bytes) -> Any:
+    """The part, opened once in the helper process; damaged blocks of a file stay known there."""
+    return pickle.loads(opening)()
+
+
+def _facts(opening: bytes, index: int) -> PartReport:
     """A report on one item."""
-    facts = PartReport("")
+    items, facts = _opened(opening), PartReport("")
     try:
         _take(facts, items.read(index) if isinstance(items, PictureFolder) else items[index])
     except (OSError, ValueError) as error:

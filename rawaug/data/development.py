@@ -1,4 +1,4 @@
-r"""Colour from DNG-style metadata, and a plain development.
+r"""A plain development of RAW to sRGB, with the colours that DNG's tags and their like state.
 
     srgb = encode(M diag(white_balance) demosaic(raw)),    M = (diag(X S 1)^-1 X S)^-1
 
@@ -6,19 +6,18 @@ with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ 
 white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
 (A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
 
-Demosaicing by gradient-corrected linear interpolation.
+Pictures of pairs are demosaiced by gradient-corrected linear interpolation,
 
     c^(i, j) = bilinear c(i, j) + alpha_c Laplacian of the colour known at (i, j),    alpha = 1/2, 5/8, 3/4
 
-as 5 x 5 kernels: the missing colour follows its neighbours, corrected by how the known colour bends there.
-Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned color
-images", ICASSP 2004.
-
-RAW developed for the eye by one fixed pipeline: bilinear demosaic, the frame's white balance and colour matrix,
-one exposure, the sRGB curve of IEC 61966-2-1.
+as 5 x 5 kernels: the missing colour follows its neighbours, corrected by how the known colour bends there. Source:
+H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned color images",
+ICASSP 2004. Scores and figures take bilinear interpolation, which treats all denoisers alike.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -29,8 +28,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.io import encode_srgb
-
-_XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+from rawaug.io.raw import XYZ_FROM_SRGB
 
 
 def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
@@ -39,7 +37,7 @@ def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
     Raises:
         ValueError: if X has no such M.
     """
-    camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ _XYZ_FROM_SRGB
+    camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
         raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is not a valid XYZ-to-camera matrix")
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
@@ -57,11 +55,51 @@ def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
     return green / red, 1.0, green / blue
 
 
+def developed(
+    raw: Tensor,
+    cfa: CFA | str,
+    gains: Sequence[float],
+    matrix: Tensor,
+    demosaicing: str = "malvar",
+    exposure: float = 1.0,
+    least: float | None = 0.0,
+) -> Tensor:
+    """A mosaic as a picture, sRGB ``(3, H, W)`` in [0, 1]; no tone curve but sRGB's.
+
+    Args:
+        raw: ``(1, H, W)``, black 0, white 1.
+        cfa: its pattern.
+        gains: multipliers of R, G, B.
+        matrix: ``(3, 3)``, white-balanced camera colour to linear sRGB.
+        demosaicing: a name of :data:`DEMOSAICINGS`.
+        exposure: a factor on all colours.
+        least: camera colour is clipped at; None keeps the zero-mean noise of shadows until it is sRGB.
+
+    Example:
+        >>> developed(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
+        0.735...
+    """
+    rgb = DEMOSAICINGS[demosaicing](raw, cfa)
+    balanced = (rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)).clamp(least, 1)
+    return encode_srgb(torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1))
+
+
 def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
-    """A mosaic ``(1, H, W)`` as a picture, uint8 ``(3, H, W)``."""
-    balanced = (demosaic_malvar(raw, cfa) * torch.tensor(gains).reshape(3, 1, 1)).clamp_(0, 1)
-    linear = torch.einsum("ij,jhw->ihw", matrix, balanced).clamp_(0, 1)
-    return (encode_srgb(linear) * 255).round_().to(torch.uint8)
+    """A mosaic ``(1, H, W)`` as the picture of a pair, uint8 ``(3, H, W)``."""
+    return (developed(raw, cfa, gains, matrix) * 255).round_().to(torch.uint8)
+
+
+def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
+    """Packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``, for scores."""
+    raw = bayer.unpack(packed, cfa)[0]
+    return developed(raw, cfa, pair.white_balance, pair.color_matrix, "bilinear", exposure, least=None)
+
+
+def exposure_of(packed: Tensor, pair: Pair) -> float:
+    """The factor that brings the brightest percent of a clean frame to white."""
+    green = packed[:, 1:3].flatten()
+    stride = max(1, green.numel() // 1_000_000)
+    return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
 
 
 _GREEN_AT_RED_OR_BLUE = (
@@ -108,16 +146,8 @@ def demosaic_malvar(raw: Tensor, cfa: CFA | str) -> Tensor:
     return rgb
 
 
-def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` to sRGB ``(3, H, W)`` in [0, 1] with the colours of ``pair``."""
-    rgb = bayer.demosaic(bayer.unpack(packed, cfa), cfa)[0]
-    balanced = rgb * exposure * torch.tensor(pair.white_balance)[:, None, None]
-    linear = torch.einsum("ij,jhw->ihw", pair.color_matrix, balanced.clamp(max=1.0))
-    return encode_srgb(linear.clamp(0.0, 1.0))
-
-
-def exposure_of(packed: Tensor, pair: Pair) -> float:
-    """The factor that brings the brightest percent of a clean frame to white."""
-    green = packed[:, 1:3].flatten()
-    stride = max(1, green.numel() // 1_000_000)
-    return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
+DEMOSAICINGS: dict[str, Callable[[Tensor, CFA | str], Tensor]] = {
+    "bilinear": lambda raw, cfa: bayer.demosaic(raw[None], cfa)[0],
+    "malvar": demosaic_malvar,
+}
+"""Mosaic ``(1, H, W)`` to ``(3, H, W)``."""

@@ -1,15 +1,9 @@
-"""Pictures kept in memory once decoded, for training on a few hundred photographs.
+"""Folders: of sRGB pictures, of RAW files, and what becomes of the files in them that cannot be read.
 
-The pairs of a dataset that can be read; those that cannot are named.
-
-A folder of sRGB pictures as a map-style dataset, for real folders: large, with some damaged files.
-
-Nothing is opened to find out what is there: the folder is listed, and a file is judged when its turn comes. One that
-cannot be used is replaced by the next that can, in the order of the paths: the sample is the same whoever asks, in
-whatever order, with any number of workers. Damaged files are marked in memory shared by all workers, so that
-the main process can report them and no worker opens one twice.
-
-RAW files as pairs: the mosaic, and LibRaw's rendering or the camera's own JPEG of the same shot.
+A picture folder is listed and not opened: a file is judged when its turn comes. One that cannot be used is replaced by
+the next that can, in the order of the paths, so that a sample is the same whoever asks, in whatever order, with any
+number of workers. Damaged files are marked in memory shared by all workers: the main process can report them, and no
+worker opens one twice. Pairs that cannot be read are skipped and reported.
 """
 
 from __future__ import annotations
@@ -24,6 +18,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -34,10 +29,21 @@ from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs
 from rawaug.errors import printable
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
-from rawaug.io.apart import apart, apart_each, prepare
-from rawaug.io.pictures import MAX_PIXELS, decode_picture, through_jpeg
+from rawaug.io.pictures import MAX_PIXELS, through_jpeg
 
+PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
+RAW_EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+)
 _OF_NO_DATASET = (".DS_Store", "Thumbs.db")
+_JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
+_JPEG_MARGIN = 0.03
+"""Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
+_SLOTS = 64
+_NAMED = 20
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
@@ -60,10 +66,158 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
                 yield Path(parent, file)
 
 
-class Remembered(Dataset[Tensor]):
-    """A dataset of pictures, kept as decoded up to ``megabytes``; the rest is read again each time.
+class PictureFolder(Dataset[Tensor]):
+    """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
-    Each worker process has its own cache.
+    After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
+    a warning; :attr:`skipped` and :meth:`report` list them at any time. Where a decoder crashes a worker,
+    :meth:`being_read` names the file, and ``rawaug data check`` finds all such files.
+
+    Args:
+        path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
+        min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
+        max_pixels: larger pictures are skipped.
+        allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        ValueError: if it holds no file with such an extension, or, on access, if too many of them had to be skipped.
+
+    Example:
+        >>> pictures = PictureFolder("photographs", min_side=256)  # doctest: +SKIP
+        >>> pictures[0].shape  # doctest: +SKIP
+        torch.Size([3, 375, 500])
+        >>> print(pictures.report())  # doctest: +SKIP
+        photographs: none of 25000 pictures skipped so far
+    """
+
+    def __init__(
+        self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
+    ) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise FileNotFoundError(f"{path}: no such folder of pictures")
+        self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
+        found = files_below(self.path, PICTURE_EXTENSIONS)
+        # an array, since the reference counts of a list would be copied into every forked worker, page by page
+        self._names = np.array([os.fsencode(name) for name in sorted(str(f.relative_to(self.path)) for f in found)])
+        if not len(self):
+            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
+        self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
+        # one slot a worker, which alone writes to it
+        self._read = torch.zeros(_SLOTS, dtype=torch.int64).share_memory_()
+        self._reading = torch.full((_SLOTS,), -1, dtype=torch.int64).share_memory_()
+        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._reasons: dict[int, str] = {}
+        _OPENED.add(self)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, index: int) -> Tensor:
+        first = range(len(self))[index]
+        for candidate in chain(range(first, len(self)), range(first)):
+            if not self._bad[candidate] and (picture := self._attempt(candidate)) is not None:
+                self._count()
+                return picture
+        raise AssertionError("the share of skipped files is checked before the last one is")
+
+    def file(self, index: int) -> Path:
+        """The file at ``index``."""
+        return self.path / os.fsdecode(self._names[index])
+
+    def read(self, index: int) -> Tensor:
+        """The picture of one file, not replaced by another.
+
+        Raises:
+            FileNotFoundError, OSError, ValueError: if it cannot be used.
+        """
+        picture = read_picture(self.file(index), self.max_pixels)
+        if min(picture.shape[1:]) < self.min_side:
+            size = f"{picture.shape[1]} x {picture.shape[2]}"
+            raise ValueError(f"{self.file(index)}: is {size}, smaller than min_side {self.min_side}")
+        return picture
+
+    @property
+    def skipped(self) -> dict[Path, str]:
+        """The files that could not be used, with the reason, as far as any worker has met them."""
+        bad = self._bad.nonzero()[:, 0].tolist()
+        for index in bad:
+            if index not in self._reasons:  # met by a worker: ask the file again
+                try:
+                    self.read(index)
+                    self._reasons[index] = f"{self.file(index)}: was damaged, but is readable now"
+                except (OSError, ValueError) as error:
+                    self._reasons[index] = str(error)
+        return {self.file(index): self._reasons[index] for index in bad}
+
+    def report(self) -> str:
+        """What was skipped so far, one line a file."""
+        skipped = self.skipped
+        folder = printable(self.path)
+        if not skipped:
+            return f"{folder}: none of {len(self)} pictures skipped so far"
+        lines = map(printable, skipped.values())
+        return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
+
+    def being_read(self) -> list[Path]:
+        """The files that processes are reading now, or were reading when they died."""
+        return [self.file(index) for index in self._reading.tolist() if index >= 0]
+
+    def _attempt(self, index: int) -> Tensor | None:
+        """The picture, or None and a mark where it is damaged."""
+        slot = _slot()
+        self._reading[slot] = index
+        try:
+            return self.read(index)
+        except (OSError, ValueError) as error:
+            self._reasons[index] = str(error)
+        finally:
+            self._reading[slot] = -1
+        self._bad[index] = 1
+        count = int(self._bad.sum())
+        if count > self.allowed_share * len(self):
+            names = [f"{self.file(i)}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
+            more = f" and {count - _NAMED} more" if count > _NAMED else ""
+            raise ValueError(
+                f"{self.path}: {count} of {len(self)} pictures are unusable, more than allowed_share "
+                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
+            )
+        return None
+
+    def _count(self) -> None:
+        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
+        self._read[_slot()] += 1
+        epoch = int(self._read.sum()) // len(self)
+        if epoch > self._epochs_logged[0]:
+            self._epochs_logged[0] = epoch
+            if self._bad.any():
+                _log.warning("%s", self.report())
+
+
+_OPENED: WeakSet[PictureFolder] = WeakSet()
+
+
+def being_read() -> list[Path]:
+    """:meth:`PictureFolder.being_read` of all folders that this process has opened."""
+    return [file for folder in _OPENED for file in folder.being_read()]
+
+
+def _slot() -> int:
+    worker = get_worker_info()
+    return (0 if worker is None else 1 + worker.id) % _SLOTS
+
+
+def reports(pictures: Any) -> list[str]:
+    """What each folder in ``pictures`` skipped so far, a text a folder; those behind a cache or in a list too."""
+    if isinstance(pictures, PictureFolder):
+        return [pictures.report()] if pictures.skipped else []
+    inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
+    return [report for each in inside if each is not None for report in reports(each)]
+
+
+class Remembered(Dataset[Tensor]):
+    """A dataset of pictures that keeps up to ``megabytes`` of them decoded, in each worker its own.
 
     Example:
         >>> import torch
@@ -89,13 +243,10 @@ class Remembered(Dataset[Tensor]):
         return self._kept[index]
 
 
-T = TypeVar("T")
-
-
 class Readable(Sequence[Pair]):
-    """Goes over pairs one by one; one whose files are damaged is left out, its reason kept.
+    """Pairs without those that cannot be read, whose reasons are kept.
 
-    To go over pairs of which none can be read ends in a ValueError with the first reason.
+    Iterating raises ValueError if no pair is readable.
 
     Attributes:
         broken: by index, why a pair could not be read; a pair is tried once.
@@ -180,198 +331,13 @@ def each_readable(pairs: Sequence[Pair], of: str, seconds: float = math.inf, lea
         print("\n".join(lines))
 
 
-PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
-_COUNTERS = 64
-_NAMED = 20
-_log = logging.getLogger(__name__)
-
-
-class PictureFolder(Dataset[Tensor]):
-    """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
-
-    Files are decoded apart (:mod:`rawaug.io.apart`): one that crashes its decoder, or hangs, is skipped like any other
-    damaged one. After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far
-    are logged as a warning; :attr:`skipped` and :meth:`report` list them at any time.
-
-    Args:
-        path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
-        min_side: smaller pictures are skipped; use the side of your crops. A mosaic has sides of at least 2.
-        max_pixels: larger pictures are skipped.
-        allowed_share: part of the files that may be skipped; above it, reading raises an error that names them.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it holds no file with such an extension, or, on access, if too many of them had to be skipped.
-
-    Example:
-        >>> pictures = PictureFolder("photographs", min_side=256)  # doctest: +SKIP
-        >>> pictures[0].shape  # doctest: +SKIP
-        torch.Size([3, 375, 500])
-        >>> print(pictures.report())  # doctest: +SKIP
-        photographs: none of 25000 pictures skipped so far
-    """
-
-    def __init__(
-        self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
-    ) -> None:
-        self.path = Path(path)
-        if not self.path.is_dir():
-            raise FileNotFoundError(f"{path}: no such folder of pictures")
-        self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
-        files = files_below(self.path, PICTURE_EXTENSIONS)
-        self.names = _Names(sorted(str(file.relative_to(self.path)) for file in files))
-        if not len(self.names):
-            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
-        self._bad = torch.zeros(len(self.names), dtype=torch.uint8).share_memory_()
-        self._read = torch.zeros(_COUNTERS, dtype=torch.int64).share_memory_()  # a slot a worker: one writer each
-        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
-        self._reasons: dict[int, str] = {}
-        prepare()
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int) -> Tensor:
-        return self._picture(range(len(self))[index])
-
-    def __getitems__(self, indices: Sequence[int]) -> list[Tensor]:
-        """Those of a batch, as a DataLoader asks for them."""
-        return list(self.read_ahead(indices))
-
-    def read_ahead(self, indices: Sequence[int]) -> Iterator[Tensor]:
-        """The pictures in this order, the next ones decoded while the caller works on one."""
-        wanted = [range(len(self))[index] for index in indices]
-        usable = [not self._bad[index] for index in wanted]
-        files = [self.path / self.names[index] for index, use in zip(wanted, usable, strict=True) if use]
-        found = apart_each(decode_picture, files, self.max_pixels)
-        for index, use in zip(wanted, usable, strict=True):
-            yield self._picture(index, next(found) if use else None)
-
-    def _picture(self, first: int, known: Tensor | Exception | None = None) -> Tensor:
-        """The picture of a file, or of the next that can be used; ``known`` is what came of reading the first."""
-        for candidate in chain(range(first, len(self)), range(first)):
-            if self._bad[candidate]:
-                continue
-            picture = self._judged(candidate, known if candidate == first else None)
-            if picture is not None:
-                self._count()
-                return picture
-        raise AssertionError("the share of skipped files is checked before the last one is")
-
-    def read(self, index: int) -> Tensor:
-        """The picture of one file, not replaced by another.
-
-        Raises:
-            FileNotFoundError, OSError, ValueError: if it cannot be used.
-        """
-        return self._required(index, apart(decode_picture, self.path / self.names[index], self.max_pixels))
-
-    def _required(self, index: int, picture: Tensor) -> Tensor:
-        file = self.path / self.names[index]
-        if min(picture.shape[1:]) < self.min_side:
-            size = f"{picture.shape[1]} x {picture.shape[2]}"
-            raise ValueError(f"{file}: is {size}, smaller than min_side {self.min_side}")
-        return picture.contiguous()
-
-    @property
-    def skipped(self) -> dict[Path, str]:
-        """The files that could not be used, with the reason, as far as any worker has met them."""
-        bad = self._bad.nonzero()[:, 0].tolist()
-        for index in bad:
-            if index not in self._reasons:  # met by a worker: ask the file again
-                self._reasons[index] = (
-                    self._fault(index) or f"{self.path / self.names[index]}: was damaged, but is readable now"
-                )
-        return {self.path / self.names[index]: self._reasons[index] for index in bad}
-
-    def report(self) -> str:
-        """What was skipped so far, one line a file."""
-        skipped = self.skipped
-        folder = printable(self.path)
-        if not skipped:
-            return f"{folder}: none of {len(self)} pictures skipped so far"
-        lines = map(printable, skipped.values())
-        return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
-
-    def _judged(self, index: int, known: Tensor | Exception | None) -> Tensor | None:
-        """The picture, or None and a mark where it is damaged; ``known`` is what came of reading it, None if unread."""
-        try:
-            if isinstance(known, Exception):
-                raise known
-            return self.read(index) if known is None else self._required(index, known)
-        except (OSError, ValueError) as error:
-            self._reasons[index] = str(error)
-        self._bad[index] = 1
-        count = int(self._bad.sum())
-        if count > self.allowed_share * len(self):
-            names = [f"{self.path / self.names[i]}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
-            more = f" and {count - _NAMED} more" if count > _NAMED else ""
-            raise ValueError(
-                f"{self.path}: {count} of {len(self)} pictures are unusable, more than allowed_share "
-                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
-            )
-        return None
-
-    def _fault(self, index: int) -> str | None:
-        try:
-            self.read(index)
-        except (OSError, ValueError) as error:
-            return str(error)
-        return None
-
-    def _count(self) -> None:
-        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
-        worker = get_worker_info()
-        self._read[(0 if worker is None else 1 + worker.id) % _COUNTERS] += 1
-        epoch = int(self._read.sum()) // len(self)
-        if epoch > self._epochs_logged[0]:
-            self._epochs_logged[0] = epoch
-            if self._bad.any():
-                _log.warning("%s", self.report())
-
-
-def reports(pictures: Any) -> list[str]:
-    """What each folder in ``pictures`` skipped so far, a text a folder; those behind a cache or in a list too."""
-    if isinstance(pictures, PictureFolder):
-        return [pictures.report()] if pictures.skipped else []
-    inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
-    return [report for each in inside if each is not None for report in reports(each)]
-
-
-class _Names(Sequence[str]):
-    """Many strings in two arrays: a list's reference counts would be copied into every forked worker, page by page."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        encoded = [os.fsencode(name) for name in names]
-        self._ends = np.cumsum([len(name) for name in encoded], dtype=np.int64)
-        self._bytes = np.frombuffer(b"".join(encoded), np.uint8)
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    def __getitem__(self, index: int) -> str:  # type: ignore[override]
-        index = range(len(self))[index]
-        start = self._ends[index - 1] if index else 0
-        return os.fsdecode(self._bytes[start : self._ends[index]].tobytes())
-
-
-RAW_EXTENSIONS = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
-    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
-)
-_MARGIN = 0.03
-"""Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
-_JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
-
-
 class RawFolder(LazyPairs):
     """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
 
     A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
     is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
-    ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`, also on forked workers), with
-    a warning if there is a JPEG of another size. Its name is the file's stem; where two would have the same, the path.
-    Files are read when asked for; the last one stays.
+    ``registered``), else LibRaw's rendering (see :func:`rawaug.io.read_raw_and_develop`), with a warning if there is a
+    JPEG of another size. Its name is the file's stem; where two would have the same, the path.
 
     Args:
         path: where the RAW files are.
@@ -416,20 +382,19 @@ class RawFolder(LazyPairs):
         return (self.files[index],)
 
     def read(self, index: int) -> Pair:
-        """The frame of ``files[index]``, developed, or with its camera's JPEG."""
         file = self.files[index]
         jpeg = _jpeg_beside(file) if self.camera_jpeg else None
         if jpeg is not None:
-            frame = apart(read_raw, file)
-            srgb = turn_back(apart(read_picture, jpeg, self.max_pixels), frame.upright_view)
+            frame = read_raw(file)
+            srgb = turn_back(read_picture(jpeg, self.max_pixels), frame.upright_view)
             size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
-            if all(side - least <= _MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
+            if all(side - least <= _JPEG_MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
                 frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
                 return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
-        frame, srgb = apart(read_raw_and_develop, file, self.adjust_maximum_thr)
+        frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
         srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
         return _pair(self.names[index], frame, srgb, registered=True)
 

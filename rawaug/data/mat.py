@@ -1,4 +1,4 @@
-"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header; read apart.
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header.
 
 A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
 naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
@@ -8,24 +8,19 @@ naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rawaug.errors import extra
-from rawaug.io.apart import apart
+from rawaug.io.isolated import damage_as_os_error, isolated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _TEXT = b"MATLAB 5.0"
+_UNREADABLE = "cannot be read as a MATLAB file"
 MAX_BYTES = 2**30
 """Larger variables are refused before they are read: those of the published datasets have at most 0.5 GiB."""
-_DAMAGE = (
-    *(ArithmeticError, AttributeError, LookupError, MemoryError, NameError, OSError, RuntimeError),
-    *(TypeError, ValueError),
-)
 
 
 def mat_version(path: str | Path) -> str:
@@ -53,16 +48,16 @@ def variables(path: str | Path) -> list[str]:
     Raises:
         FileNotFoundError, ValueError, OSError: as :func:`read_array`.
     """
-    return apart(_variables, Path(path))
+    return isolated(_variables, Path(path))
 
 
 def _variables(path: Path) -> list[str]:
     if mat_version(path) == "5":
         from scipy.io import whosmat
 
-        with _as_os_error(path):
+        with damage_as_os_error(path, _UNREADABLE, _Missing):
             return [name for name, *_ in whosmat(path)]
-    with _as_os_error(path):
+    with damage_as_os_error(path, _UNREADABLE, _Missing):
         with extra("data"):
             import h5py
 
@@ -81,7 +76,7 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
         >>> read_array("0001_NOISY_RAW_010.MAT", "x").shape  # doctest: +SKIP
         (3000, 5328)
     """
-    value = apart(_read, Path(path), name, False)
+    value = isolated(_read, Path(path), name, False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
     return value
@@ -94,13 +89,13 @@ def read_value(path: str | Path, name: str) -> Any:
     Raises:
         FileNotFoundError, ValueError, OSError: as :func:`read_array`.
     """
-    return apart(_read, Path(path), name, True)
+    return isolated(_read, Path(path), name, True)
 
 
 def _read(path: Path, name: str, plain: bool) -> Any:
     if mat_version(path) == "5":
         return _read_5(path, name, plain)
-    with _as_os_error(path):
+    with damage_as_os_error(path, _UNREADABLE, _Missing):
         with extra("data"):
             import h5py
 
@@ -114,7 +109,7 @@ def _read(path: Path, name: str, plain: bool) -> Any:
 def _read_5(path: Path, name: str, plain: bool) -> Any:
     from scipy.io import loadmat, whosmat
 
-    with _as_os_error(path):
+    with damage_as_os_error(path, _UNREADABLE, _Missing):
         shapes = {found: shape for found, shape, _ in whosmat(path)}
         if name not in shapes:
             raise _missing(path, name, list(shapes))
@@ -135,22 +130,6 @@ def _member(group: Any, name: str) -> Any:
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"{name} is a link, not a variable")
     return group[name]
-
-
-@contextmanager
-def _as_os_error(path: Path) -> Iterator[None]:
-    """The many ways in which the libraries fail on a damaged file as one OSError that names it."""
-    import zlib
-
-    from scipy.io.matlab import MatReadError
-
-    try:
-        yield
-    except _Missing:
-        raise
-    except (*_DAMAGE, MatReadError, zlib.error) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise OSError(f"{path}: cannot be read as a MATLAB file ({reason}); copy it again") from error
 
 
 class _Missing(ValueError):

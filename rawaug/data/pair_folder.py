@@ -2,7 +2,7 @@
 
 The clean frame of ``NAME_noisy.EXT`` is ``NAME_clean.EXT`` beside it; NPZ and MATLAB files of other names hold both.
 Other names go by a pattern: the parts of ``noisy`` under ``*`` and ``?`` stand at the same places in ``clean``.
-:mod:`rawaug.data.mosaic_files` lists the formats.
+:mod:`rawaug.data.formats` lists the formats.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import torch
 
 from rawaug.data.development import develop_mosaic
 from rawaug.data.folders import RawFolder, files_below
-from rawaug.data.mosaic_files import READABLE, TWO_IN_ONE, read_mosaic
-from rawaug.data.mosaic_metadata import Statements
+from rawaug.data.formats import READABLE, TWO_IN_ONE, Metadata, read_mosaic
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.registry import DATASETS
 
@@ -101,7 +100,7 @@ class PairFolder(LazyPairs):
         black: float | Sequence[float] | None = None,
         white: float | None = None,
     ) -> None:
-        self.given = Statements.parse({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
+        self.given = Metadata.parse({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
         self.pairs = _pairs_below(Path(path), noisy, clean)
         super().__init__([pair.name for pair in self.pairs])
 

@@ -1,18 +1,16 @@
-"""A RAW frame and the sRGB picture of the same shot: what an ISP is fitted on and measured against.
+r"""RAW-sRGB pairs: one shot, sequences that read it when asked, which of them a recipe uses, and their noise.
 
-What a denoiser is trained and scored on: packed noisy RAW, its clean version and the variance of its noise.
+A frame is identified by the resolved paths of its files where it has some, else by its name: what is trained on must
+not be scored, and no frame has to be read to know. A dataset that knows more of its frames has ``labels``.
 
-Which frames a sequence of pairs holds, without reading them: what is trained on must not be scored.
+The noise levels of a capture whose clean version is known,
 
-A frame is identified by the resolved paths of its files where it has some, else by its name.
+    E[(noisy - clean)^2 | clean = y] = shot_var y + read_var,
 
-Pairs that are read when they are asked for.
-
-The sRGB pictures of RAW-sRGB pairs, as pictures to augment with: what few pairs alone can give.
-
-Which of many pairs a recipe uses: the first ones, whole scenes, one phone after another, or by name.
-
-A dataset that knows more of its frames than their names has ``labels``, one :class:`FrameLabel` a frame.
+are those of a line through the mean squared differences of equally filled bins of y, weighted by the inverse variance
+of these means, 2 (shot_var y + read_var)^2 / n, in a few rounds. Bins whose noise would reach black or white (three
+standard deviations) are left out while enough others remain: published frames are clipped there, which narrows the
+noise.
 """
 
 from __future__ import annotations
@@ -24,14 +22,14 @@ from itertools import accumulate, groupby
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, overload, runtime_checkable
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA
-from rawaug.data.captured_noise import measured_levels
+from rawaug.bayer import CFA, bin_mosaic
 from rawaug.files import digest
-from rawaug.io.apart import prepare
-from rawaug.io.pictures import MAX_PIXELS
+from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
 
 
 @dataclass(frozen=True)
@@ -132,6 +130,30 @@ class Pair:
         rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
         return self._window(rows, columns, self.cfa)
 
+    def binned(self, factor: int) -> Pair:
+        """The frame at 1 / ``factor`` of its sides, whose noise has 1 / ``factor``^2 of the variance.
+
+        Each site is the mean of ``factor`` x ``factor`` sites of its colour; pictures are averaged in linear light.
+
+        Raises:
+            ValueError: if a side is shorter than two of the new cell's.
+        """
+        if factor == 1:
+            return self
+        height, width = (side // (2 * factor) * 2 * factor for side in self.raw.shape[-2:])
+        if not min(height, width):
+            raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
+        changed: dict[str, Any] = {}
+        for key in ("raw", "noisy", "srgb", "noisy_srgb"):
+            image = getattr(self, key)
+            if image is None:
+                continue
+            cut = image[:, :height, :width]
+            changed[key] = bin_mosaic(cut, self.cfa, factor) if len(cut) == 1 else _bin_picture(cut, factor)
+        if self.shot_var is not None and self.read_var is not None:
+            changed |= {"shot_var": self.shot_var / factor**2, "read_var": self.read_var / factor**2}
+        return replace(self, **changed)
+
     def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:
         images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
         cut = {key: image[:, rows, columns].contiguous() for key, image in images.items() if image is not None}
@@ -145,8 +167,14 @@ class Pair:
             )
 
 
+def _bin_picture(srgb: Tensor, factor: int) -> Tensor:
+    """uint8 ``(3, H, W)``, averaged in linear light."""
+    linear = F.avg_pool2d(decode_srgb(srgb.float() / 255), factor)
+    return (encode_srgb(linear) * 255).round().to(torch.uint8)
+
+
 class Sample(NamedTuple):
-    """What a denoiser is trained on, packed ``(4, h, w)`` (in a batch ``(B, 4, h, w)``)."""
+    """What a denoiser is trained on, packed ``(4, h, w)`` or ``(B, 4, h, w)``."""
 
     noisy: Tensor
     clean: Tensor
@@ -205,7 +233,6 @@ class LazyPairs(Sequence[Pair], ABC):
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
         self._last: tuple[int, Pair] | None = None
-        prepare()
 
     @abstractmethod
     def read(self, index: int) -> Pair:
@@ -271,6 +298,37 @@ class Middles(SomePairs):
 
     def read(self, index: int) -> Pair:
         return super().read(index).middle(self.crop)
+
+
+class Binned(SomePairs):
+    """All pairs of a sequence, binned by colour site: references with less noise of their own.
+
+    Args:
+        pairs: the sequence.
+        factor: the mean of factor x factor sites of a colour is one site.
+
+    Raises:
+        ValueError: if the factor is below 1.
+
+    Example:
+        >>> from rawaug.data import demo_pairs
+        >>> Binned(demo_pairs("test", count=1), 4)[0].raw.shape
+        torch.Size([1, 72, 112])
+    """
+
+    def __init__(self, pairs: Sequence[Pair], factor: int) -> None:
+        if factor < 1:
+            raise ValueError(f"bin must be at least 1, got {factor}")
+        super().__init__(pairs, range(len(pairs)))
+        self.factor = factor
+        if isinstance(pairs, Labelled):
+            self.labels = pairs.labels
+
+    def read(self, index: int) -> Pair:
+        return super().read(index).binned(self.factor)
+
+    def stamp(self, index: int) -> str:
+        return f"{super().stamp(index)} binned by {self.factor}"
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:
@@ -395,3 +453,50 @@ def _named(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
             raise ValueError(f"data.select: {name} is none of the {len(names)} frames, such as {', '.join(names[:3])}")
         indices += [k for k in found if k not in indices]
     return indices
+
+
+# -- the noise of a capture --------------------------------------------------------------------------------------------
+
+_BINS = 64
+_FEWEST = 8
+_ROUNDS = 5
+_LEAST = 1e-9
+_SITES = 2**20
+
+
+def captured_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
+    """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> clean = rng.random((300, 300))
+        >>> noisy = clean + rng.normal(size=clean.shape) * np.sqrt(0.01 * clean + 0.0004)
+        >>> captured_noise(clean, noisy)  # doctest: +ELLIPSIS
+        (0.01..., 0.0003...)
+    """
+    signal = np.ravel(clean).astype(np.float64)
+    square = (np.ravel(noisy) - signal) ** 2
+    order = np.argsort(signal)
+    parts = [part for part in np.array_split(order, _BINS) if len(part)]
+    x, y = (np.array([values[part].mean() for part in parts]) for values in (signal, square))
+    weight: np.ndarray = np.ones_like(x)
+    for _ in range(_ROUNDS):
+        shot, read = _line(x, y, weight)
+        reach = 3 * np.sqrt(shot * x + read)
+        whole = (x > reach) & (x < 1 - reach)
+        weight = np.where(whole if whole.sum() >= _FEWEST else True, 1 / (shot * x + read) ** 2, 0.0)
+    return shot, read
+
+
+def measured_levels(clean: Tensor, noisy: Tensor) -> tuple[float, float]:
+    """:func:`captured_noise` of two mosaics ``(1, H, W)``, of about a million of their sites if they are larger."""
+    step = max(1, clean.numel() // _SITES) | 1  # odd, so that all four sites of the cell take part
+    return captured_noise(clean.flatten()[::step].numpy(), noisy.flatten()[::step].numpy())
+
+
+def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    middle = np.average(x, weights=weight), np.average(y, weights=weight)
+    spread = np.average((x - middle[0]) ** 2, weights=weight)
+    slope = np.average((x - middle[0]) * (y - middle[1]), weights=weight) / spread if spread > 0 else 0.0
+    shot = float(np.clip(slope, _LEAST, max(middle[1] / max(middle[0], _LEAST), _LEAST)))
+    return shot, float(max(middle[1] - shot * middle[0], _LEAST))

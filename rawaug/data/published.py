@@ -1,52 +1,37 @@
-r"""MIT-Adobe FiveK: DNGs of the Canon EOS 5D and the Nikon D700, split as for InvISP.
+r"""Published sets of DNGs or RAW crops with their pictures: MIT-Adobe FiveK, RAWIR, RGB2RAW and Zurich RAW to RGB.
 
-Each DNG is developed by LibRaw with the camera's white balance and without automatic brightness (see
-:func:`rawaug.io.read_raw_and_develop`), as the sRGB of the pair. ``fivek.json`` beside this file lists the numbers of
-the splits: 650 and 127 frames of the Canon, 414 and 73 of the Nikon. InvISP's pictures (``invisp_canon:``,
-``invisp_nikon:``) differ: LibRaw scales each frame by its own maximum (``adjust_maximum_thr`` 0.75, its default), and
-they are stored as JPEGs of quality 90.
-
+*FiveK* (Canon EOS 5D and Nikon D700, split as for InvISP): each DNG is developed by LibRaw with the camera's white
+balance and without automatic brightness. ``fivek.json`` beside this file lists the numbers of the splits: 650 and 127
+frames of the Canon, 414 and 73 of the Nikon. InvISP's pictures (``invisp_canon:``, ``invisp_nikon:``) differ: LibRaw
+scales each frame by its own maximum (``adjust_maximum_thr`` 0.75, its default), and they are JPEGs of quality 90.
 Source: V. Bychkovsky, S. Paris, E. Chan, F. Durand, "Learning photographic global tonal adjustment with a database of
 input/output image pairs", CVPR 2011; Y. Xing, Z. Qian, Q. Chen, "Invertible image signal processing", CVPR 2021.
 
-RAWIR and AIM 2022 Reversed ISP: crops of phone RAW, packed in ``.npy`` files, with the phone's picture beside them.
+*RAWIR* and AIM 2022 Reversed ISP: ``.npy`` files of uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the
+blue row, B, taken to be black-subtracted, with the phone's picture ``(2h, 2w)`` of the same stem. White is 2^10 where
+it is a JPEG (AIM 2022: Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). An ``.npz``
+holds the same array as ``raw`` and its white level as ``max_val``. White balance and colour matrix come as pickles,
+which are not opened: gains are 1 and the matrix is the identity. The P20's pictures are cropped and zoomed against
+their RAW: they are not registered. Source: M. V. Conde et al., "Reversed image signal processing and RAW
+reconstruction", ECCV workshops 2022, and the pages of both datasets.
 
-A file is uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the blue row, B, whatever the sensor, and taken to
-be black-subtracted; the picture of the same stem is ``(2h, 2w)``. White is 2^10 where the picture is a JPEG (AIM 2022:
-Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). An ``.npz`` holds the same array as
-``raw`` and its white level as ``max_val``. There is no white balance or colour matrix in a form that is safe to open
-(RAWIR's metadata are pickles): gains are 1 and the matrix is the identity.
+*RGB2RAW* (NTIRE 2025): the same for crops of three phones, ``PHONE/RAWID_CROP.npy``. Only the training pairs are
+public, so the splits are this package's own: of each folder's RAW files in the order of their names every tenth is for
+the test and the one after it for validation, with all of its crops. Source:
+<https://huggingface.co/datasets/marcosv/rgb2raw>.
 
-The P20's pictures are cropped and zoomed against their RAW: they are not registered. Source: M. V. Conde et al.,
-"Reversed image signal processing and RAW reconstruction", ECCV workshops 2022, and the pages of both datasets.
-
-RGB2RAW, the set of NTIRE 2025's RAW reconstruction from sRGB: crops of three phones, as RAWIR's.
-
-Files are ``PHONE/RAWID_CROP.npy``, uint16 ``(512, 512, 4)`` in RGGB with white at 2^12 - 1, and the phone's PNG
-of 1024 x 1024 beside each. Only the training pairs are public, so the splits are this package's own: of each folder's
-RAW files in the order of their names every tenth is for the test and the one after it for validation, with all
-of its crops. Source: the dataset's page, <https://huggingface.co/datasets/marcosv/rgb2raw>.
-
-Zurich RAW to RGB: crops of a Huawei P20's RAW, and of the same scenes by a Canon 5D Mark IV.
-
-    y = min((d - 63) / (1020 - 63), 1)
-
-for the numbers d of ``SPLIT/huawei_raw/0.png``, a PNG of 16 bits with 10 of them used, RGGB, 448 x 448; the picture is
-``SPLIT/canon/0.jpg``. It was taken by another camera from another place: the pairs are not registered, and no camera's
-ISP leads from one to the other. The files have no white balance: gains are 1, the colour matrix is the identity.
-
-Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing mobile camera ISP with a single deep learning model", CVPR
-workshops 2020, whose loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning
-RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
+*Zurich RAW to RGB*: RAW of a Huawei P20, RGGB, ``SPLIT/huawei_raw/0.png``, 16 bits with 10 of them used, and the same
+scene by a Canon 5D Mark IV, ``SPLIT/canon/0.jpg``, from another place: the pairs are not registered, and no camera's
+ISP leads from one to the other. There is no white balance. Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing
+mobile camera ISP with a single deep learning model", CVPR workshops 2020, whose loader divides by 1020 and leaves black
+in; the black level is that of Z. Zhang et al., "Learning RAW-to-sRGB mappings with inaccurately aligned supervision",
+ICCV 2021.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Sequence
 from functools import cache, partial
 from importlib import resources
@@ -58,10 +43,10 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.folders import RawFolder, files_below
-from rawaug.data.mat import MAX_BYTES
+from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.io import read_picture
-from rawaug.io.apart import apart
+from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
 
@@ -142,11 +127,6 @@ def _splits() -> dict[str, dict[str, str]]:
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
 
-_DAMAGE = (
-    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError),
-    tokenize.TokenError,
-)
-"""What NumPy raises for headers that say anything."""
 _ARRAYS = (".npy", ".npz")
 _MAGIC = b"\x93NUMPY"
 
@@ -194,7 +174,7 @@ class Rawir(LazyPairs):
         file, picture = self.files[index], self.pictures[index]
         return Pair(
             name=self.names[index],
-            srgb=apart(read_picture, picture, self.max_pixels),
+            srgb=read_picture(picture, self.max_pixels),
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             camera=self.camera_of(file),
@@ -211,7 +191,7 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
         OSError: if the file is damaged.
         ValueError: if its array is of another kind, or exceeds white.
     """
-    numbers, stated = apart(_archive, file) if file.suffix == ".npz" else (_array(file), None)
+    numbers, stated = _archive(file) if file.suffix == ".npz" else (_array(file), None)
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
     white = white or stated or WHITE[picture.suffix.lower()]
@@ -221,36 +201,19 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
 
 
 def _array(file: Path) -> np.ndarray:
-    """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory.
-
-    Raises:
-        OSError: if it is damaged.
-    """
-    try:
+    """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory."""
+    with damage_as_os_error(file, "cannot be read as an array"):
         with file.open("rb") as opened:
             if opened.read(len(_MAGIC)) != _MAGIC:  # NumPy would open an archive of arrays, or a pickle
                 raise ValueError("does not begin as one")
         return np.load(file, mmap_mode="r", allow_pickle=False)
-    except _DAMAGE as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise OSError(f"{file}: cannot be read as an array ({reason}); copy it again") from error
 
 
 def _archive(file: Path) -> tuple[np.ndarray, float]:
-    """``raw`` and ``max_val`` of an ``.npz`` file.
-
-    Raises:
-        OSError: if it is damaged, or lacks one.
-    """
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            size = sum(arrays.zip.getinfo(f"{name}.npy").file_size for name in ("raw", "max_val"))
-            if size > MAX_BYTES:
-                raise ValueError(f"declares {size} bytes, above the limit of {MAX_BYTES}")
-            return arrays["raw"], float(arrays["max_val"])
-    except (*_DAMAGE, zipfile.BadZipFile, zlib.error) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise OSError(f"{file}: cannot be read as raw and max_val ({reason}); copy it again") from error
+    """``raw`` and ``max_val`` of an ``.npz`` file."""
+    with damage_as_os_error(file, "cannot be read as raw and max_val"):
+        arrays = read_npz(file, lambda names: ["raw", "max_val"])
+        return arrays["raw"], float(arrays["max_val"])
 
 
 def picture_beside(file: Path) -> Path:
@@ -356,7 +319,7 @@ class Zurich(LazyPairs):
 
     def read(self, index: int) -> Pair:
         file = self.files[index]
-        numbers = apart(read_plane, file, self.max_pixels)
+        numbers = read_plane(file, self.max_pixels)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(
@@ -365,7 +328,7 @@ class Zurich(LazyPairs):
         light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
         return Pair(
             name=self.names[index],
-            srgb=apart(read_picture, self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
+            srgb=read_picture(self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
             raw=torch.from_numpy(np.minimum(light, 1))[None],
             cfa=CFA.RGGB,
             white_balance=(1.0, 1.0, 1.0),

@@ -38,7 +38,6 @@ from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
-from rawaug.io.apart import reading_within
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
@@ -81,8 +80,7 @@ def run(
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
     given_frames = {key: frames for key, frames in given.items() if frames is not None}
-    with reading_within(recipe.data.read_seconds):
-        return _Run(recipe, overwrite, given_frames).all_stages()
+    return _Run(recipe, overwrite, given_frames).all_stages()
 
 
 class _Run:

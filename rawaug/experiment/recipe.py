@@ -26,7 +26,6 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
     **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
     "max_pixels": (4, 2**40),
-    "read_seconds": (0.0, 1e6),
 }
 
 
@@ -44,7 +43,6 @@ class DataConfig(PairSettings):
             ``pairs``, those of the chosen pairs.
         memory_mb: size in megabytes of the cache of decoded pictures.
         max_pixels: larger pictures, those of pairs and PNG mosaics too, are refused; null for 2^26.
-        read_seconds: that a file may take to be read before it is given up; null for RAWAUG_READ_SECONDS, or 60.
         validation: validation pairs, of which self-supervised arms see only the noisy frames; auto holds out the last
             fifth of ``pairs``, at most 16, which nothing else then sees; null validates on RAW made from the pictures
             and keeps the final weights.
@@ -61,7 +59,6 @@ class DataConfig(PairSettings):
     pictures: str | list[str] = "demo:"
     memory_mb: int = 0
     max_pixels: int | None = None
-    read_seconds: float | None = None
     validation: str | None = "demo:validation"
     validation_count: int | None = None
     validation_crop: int | None = None

@@ -18,7 +18,7 @@ from rawaug.training.config import SAME_WEIGHTS
 STAMP = "run.json"
 FREE = frozenset({"name", "out", "device", "devices", "seeds", "self_ensemble", "views"})
 """Keys of a run that may change when it is resumed: where it runs, and what only adds to its results."""
-FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb", "read_seconds"}
+FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
 """Such keys of its parts."""
 
 

@@ -2,14 +2,12 @@ r"""Bayer mosaics out, as DNG: ``d = round(y (white - black) + black)``, 16 bits
 
 ``AsShotNeutral`` is the colour of grey to the camera, ``1 / white_balance``. ``ColorMatrix1`` takes XYZ to the camera
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
-sRGB) and S, which takes linear sRGB to XYZ: what :func:`rawaug.io.read_raw` makes M of, the other way round.
-Source: DNG specification 1.4, chapters 4 to 6. Any program that reads DNG takes it from there.
+sRGB) and S, which takes linear sRGB to XYZ: the inverse of what :func:`rawaug.io.read_raw` does.
 
-Metadata that a rewritten DNG keeps from its source: camera, colour, lens corrections, EXIF, GPS, XMP.
-
-Left out is what describes the old pixels (their layout, levels, digests, previews, noise profile) and what points into
-the old file (maker notes). The EXIF and GPS directories are copied value by value in their binary form.
-Source: TIFF 6.0, section 2; DNG specification 1.4, chapter 4.
+A rewritten DNG keeps camera, colour, lens corrections, EXIF, GPS and XMP of its source. Left out is what describes the
+old pixels (their layout, levels, digests, previews, noise profile) and what points into the old file (maker notes). The
+EXIF and GPS directories are copied value by value in their binary form.
+Source: DNG specification 1.4, chapters 4 to 6; TIFF 6.0, section 2.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from rawaug.errors import extra
 from rawaug.files import replacing
 from rawaug.io.gain_map import opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
-from rawaug.io.tiff import all_pages, damage_as_os_error, main_mosaic, opened_tiff
+from rawaug.io.tiff import all_pages, main_mosaic, opened_tiff, tag_damage
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
@@ -80,7 +78,7 @@ def write_dng(
     tags = own | carried.tags | _tags_of_the_pixels(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
-        with damage_as_os_error(Path(source)) if source is not None else nullcontext():
+        with tag_damage(Path(source)) if source is not None else nullcontext():
             _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
         for name, entries in directories.items():
             append_directory(partial, name, entries)
@@ -221,7 +219,6 @@ def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, 
     return tuple(numbers)
 
 
-_CARRIED_TAGS_DNG_VERSION, _ASCII = 50706, 2
 _SUB_DIRECTORIES = {"ExifTag": 34665, "GPSTag": 34853}
 _POINTERS = (37500, 40965)  # maker note, interoperability directory
 _SIZES = (0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8)
@@ -231,23 +228,8 @@ _VALUE = 8
 
 _OF_ANY_TIFF = (270, 271, 272, 306, 315, 700, 33432)
 _LAYOUT = (
-    *range(254, 260),
-    262,
-    266,
-    273,
-    277,
-    278,
-    279,
-    282,
-    283,
-    284,
-    296,
-    297,
-    317,
-    *range(320, 326),
-    330,
-    338,
-    339,
+    *(*range(254, 260), 262, 266, 273, 277, 278, 279, 282, 283, 284, 296, 297, 317),
+    *(*range(320, 326), 330, 338, 339),
 )
 _PREVIEW = (*range(512, 522), *range(529, 533), *range(50966, 50972))
 _LEVELS = (33421, 33422, 50711, 50712, *range(50713, 50718), 50829, 50830, 51041)
@@ -296,7 +278,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
         with opened_tiff(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
-            dng = any(_CARRIED_TAGS_DNG_VERSION in page.tags for page in pages)
+            dng = any(_DNG_VERSION in page.tags for page in pages)
             mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []
             tags: dict[int, Tag] = {}
             for page in (pages[0], *mosaics):
@@ -313,7 +295,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
 
 def _value(tag: Any) -> Any:
     """Text as tifffile writes it: 7 bits; other texts as the bytes that they are in UTF-8."""
-    if tag.dtype == _ASCII and isinstance(tag.value, str) and not tag.value.isascii():
+    if tag.dtype == ASCII and isinstance(tag.value, str) and not tag.value.isascii():
         return tag.value.encode() + b"\0"
     return tag.value
 

@@ -5,19 +5,9 @@ The display transfer of sRGB (IEC 61966-2-1:1999), for linear light l and displa
     v = 12.92 l                      for l <= 0.0031308
     v = 1.055 l^(1/2.4) - 0.055      otherwise
 
-OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space is
-applied (see :mod:`rawaug.io.pictures`); without one, a picture is taken to be sRGB whatever else its tags say.
-
-Exposure of a picture as its EXIF states it: ``EV = log2(t S / (100 N^2))``, with seconds t, ISO S and f-number N.
-
-One stop more is twice the RAW value. Unlike the exposure value of ISO 2720 it grows with exposure.
-
-Embedded ICC profiles: pictures of other colour spaces (Display P3, Adobe RGB, grey of another gamma) to sRGB.
-
-The conversion is LittleCMS's, relative colorimetric with black point compensation, in 8 bits. Source of the format:
-ICC.1:2022, "Image technology colour management".
-
-A picture as a JPEG file gives it back: 8 x 8 cosine transform, colour at half the width (4:2:2), one quality.
+OpenEXR and Radiance files hold l, everything else is taken to hold v. An embedded ICC profile of another space (Display
+P3, Adobe RGB, grey of another gamma) is applied by LittleCMS, relative colorimetric with black point compensation, in 8
+bits; without one, a picture is taken to be sRGB whatever else its tags say. Source: ICC.1:2022.
 """
 
 from __future__ import annotations
@@ -84,14 +74,9 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    return decode_picture(path, max_pixels).contiguous()
-
-
-def decode_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
-    """:func:`read_picture` in the strides of the decoder, for :mod:`rawaug.io.apart`, which copies it anyway."""
     with _text_damage_as_os_error(Path(path)):
         pixels, orientation = _read(Path(path), max_pixels)
-    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation))
+    return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -243,7 +228,9 @@ _ISO = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")
 
 
 def read_exposure(path: str | Path) -> float:
-    """The exposure in stops, up to a constant of the scene.
+    """The exposure in stops, ``log2(t S / (100 N^2))`` of its EXIF's seconds t, ISO S and f-number N.
+
+    One stop more is twice the RAW value; unlike the exposure value of ISO 2720 it grows with exposure.
 
     Raises:
         FileNotFoundError, OSError: if there is no such file, or it is not a picture.
@@ -299,8 +286,6 @@ def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _transform(profile: bytes) -> tuple[str, Any]:
     """The mode of the stored pixels, and the conversion; None for sRGB."""
-    from io import BytesIO
-
     with extra("raw"):
         from PIL import ImageCms
 
@@ -311,10 +296,6 @@ def _transform(profile: bytes) -> tuple[str, Any]:
     target = ImageCms.createProfile("sRGB")
     intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
     return mode, ImageCms.buildTransform(source, target, mode, "RGB", intent, flags)
-
-
-_HALF_WIDTH = 1
-"""Pillow's number of 4:2:2."""
 
 
 def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
@@ -337,5 +318,5 @@ def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
         raise ValueError(f"quality must be 1 to 100, got {quality}")
     stored = BytesIO()
     picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
-    picture.save(stored, "JPEG", quality=quality, subsampling=_HALF_WIDTH)
+    picture.save(stored, "JPEG", quality=quality, subsampling="4:2:2")
     return torch.from_numpy(np.array(Image.open(stored))).permute(2, 0, 1).contiguous()

@@ -1,6 +1,4 @@
-r"""Camera and exposure of a RAW file, from LibRaw, the file's tags or its thumbnail.
-
-RAW files, through LibRaw: the mosaic as the sensor gave it, and LibRaw's own rendering of it.
+r"""RAW files, through LibRaw: the mosaic as the sensor gave it, and LibRaw's own rendering of it.
 
     y = min((d - black) / (white - black), 1)
 
@@ -17,6 +15,7 @@ from __future__ import annotations
 
 import os
 import struct
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from rawaug.bayer import CFA
@@ -95,7 +95,7 @@ MAX_PIXELS = 200_000_000
 """Larger mosaics are refused before they are decoded; the largest sensors have 150 million sites."""
 
 _developed_in: int | None = None
-"""The process that last used LibRaw's OpenMP threads: they do not survive a fork."""
+"""The process that started LibRaw's OpenMP threads, which a fork does not have; LibRaw would wait for them."""
 
 
 @dataclass(frozen=True)
@@ -180,25 +180,20 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
     BT.709). ``adjust_maximum_thr`` above 0 lets LibRaw scale a frame by its own maximum where that exceeds this part of
     white (its default is 0.75): a digital gain that is not recorded in the file.
 
-    LibRaw renders with OpenMP, whose threads do not survive a fork: render in the main process, or start DataLoader
-    workers with ``multiprocessing_context="forkserver"``.
+    LibRaw renders with OpenMP, whose threads do not survive a fork: a process forked from one that has rendered, such
+    as a DataLoader's worker, renders on one thread.
 
     Raises:
-        RuntimeError: in a process forked after its parent rendered a file, where LibRaw would hang.
         FileNotFoundError, OSError, ValueError: as :func:`read_raw`.
     """
     global _developed_in
-    if _developed_in not in (None, os.getpid()):
-        raise RuntimeError(
-            f"{path}: LibRaw hangs when it renders in a process forked from one that rendered; "
-            'use multiprocessing_context="forkserver", or no workers'
-        )
     with _opened(Path(path)) as (raw, tags):
         frame = _frame(Path(path), raw, tags)  # before rendering, which may change LibRaw's white level
-        _developed_in = os.getpid()
-        pixels = raw.postprocess(
-            use_camera_wb=True, no_auto_bright=True, adjust_maximum_thr=adjust_maximum_thr, output_bps=8, user_flip=0
-        )
+        forked = _developed_in not in (None, os.getpid())
+        _developed_in = _developed_in or os.getpid()
+        settings = {"use_camera_wb": True, "no_auto_bright": True, "output_bps": 8, "user_flip": 0}
+        with threadpool_limits(1 if forked else None, "openmp"):
+            pixels = raw.postprocess(adjust_maximum_thr=adjust_maximum_thr, **settings)
     height, width = frame.mosaic.shape[-2:]
     if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
         raise ValueError(
@@ -216,6 +211,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such RAW file")
     require_utf8(path)
+    # rawpy warns of forks, which rendering on one thread makes safe
+    warnings.filterwarnings("ignore", "rawpy is being used in a process created by", RuntimeWarning)
     try:
         with rawpy.imread(str(path)) as raw:
             tags = read_tiff_tags(path)

@@ -1,9 +1,8 @@
-"""The directories of a TIFF file, followed once before anything else follows them.
+"""TIFF-based RAW files (DNG, NEF, CR2, ...): the tags that LibRaw does not expose, read by tifffile.
 
 A directory (IFD) names its successor and its children (SubIFDs, tag 330) by their offset. Damaged offsets make circles,
-in which a reader that trusts them never ends. Source: TIFF 6.0, section 2; BigTIFF; TIFF Technical Note 1 (SubIFDs).
-
-Tags of TIFF-based RAW files (DNG, NEF, CR2, ...) that LibRaw does not expose, read by tifffile.
+in which a reader that trusts them never ends, so directories are followed once before tifffile follows them. Source:
+TIFF 6.0, section 2; BigTIFF; TIFF Technical Note 1 (SubIFDs).
 
 A DNG's NoiseProfile (tag 51041, DNG specification 1.3 and later) holds pairs (S, O), one for all colour planes or one a
 plane, with noise variance S y + O for a signal y whose black is 0 and white 1: our ``shot_var`` and ``read_var``.
@@ -13,7 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from os import SEEK_END
@@ -24,6 +23,7 @@ import numpy as np
 
 from rawaug.errors import extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
+from rawaug.io.isolated import damage_as_os_error
 
 MOST_DIRECTORIES = 512
 _SUB_DIRECTORIES = 330
@@ -111,10 +111,6 @@ _ACTIVE_AREA = 50829
 _OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC = 32803
 _RATIONALS = (5, 10)
-_DAMAGE = (
-    *(ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError),
-    struct.error,
-)
 
 
 @dataclass(frozen=True)
@@ -185,25 +181,18 @@ def opened_tiff(path: Path) -> Iterator[Any]:
     with extra("raw"):
         import tifffile
 
-    with damage_as_os_error(path):
+    with tag_damage(path):
         require_no_circle(path)
         with tifffile.TiffFile(path) as tiff:
             yield tiff
 
 
-@contextmanager
-def damage_as_os_error(path: Path) -> Iterator[None]:
+def tag_damage(path: Path) -> AbstractContextManager[None]:
     """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
     with extra("raw"):
         import tifffile
 
-    try:
-        yield
-    except (tifffile.TiffFileError, OSError):
-        raise
-    except _DAMAGE as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise OSError(f"{path}: its TIFF tags are damaged ({reason}); copy it again") from error
+    return damage_as_os_error(path, "its TIFF tags are damaged", tifffile.TiffFileError, OSError)
 
 
 def all_pages(pages: Any) -> Iterator[Any]:

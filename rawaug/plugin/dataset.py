@@ -128,18 +128,6 @@ class RawPairs(Dataset[Any]):
         index = self._checked(index)
         return self.draw(index, self._generator(*self._epochs.key(index)))
 
-    def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        """Those of a batch, as a DataLoader asks for them; a dataset that can decodes the next pictures meanwhile."""
-        if not hasattr(self.dataset, "read_ahead") or type(self).__getitem__ is not RawPairs.__getitem__:
-            return [self[index] for index in indices]
-        checked = [self._checked(index) for index in indices]
-        samples = self.dataset.read_ahead(checked)
-        return [self._paired_next(samples, index) for index in checked]
-
-    def _paired_next(self, samples: Iterator[Any], index: int) -> Any:
-        generator = self._generator(*self._epochs.key(index))
-        return self._paired(next(samples), index, generator)
-
     def _checked(self, index: int) -> int:
         if not isinstance(index, SupportsIndex):
             raise TypeError(

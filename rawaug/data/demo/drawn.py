@@ -1,22 +1,13 @@
-r"""Dead-leaves pictures: opaque disks that fall on each other, with the statistics of natural images.
+r"""Drawn pictures with the statistics of natural images: dead leaves, and shapes as man-made things have them.
 
     p(r) = C r^-3   for r_min <= r <= r_max,    centres uniform
 
-With this law the pictures look alike at every scale, and have occlusion edges and a 1/f^2 power spectrum as photographs
-do. Source: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images: a statistical study of a
-scale-invariant dead leaves model", IJCV 41, 2001; as training data for restoration: R. Achddou, Y. Gousseau, S. Ladjal,
-"Synthetic images as a regularity prior for image restoration neural networks", SSVM 2021.
-
-Here a disk is a window of a photograph, or flat in one of its colours. Seen from below, the first leaf is on top: disks
-are laid front to back on what is still bare, until nothing is, which draws exactly from the stationary model.
-
-Pictures of boxes, ellipses, polygons, stripes and lettering: the edges, corners and text that man-made things have.
-
-    p(R) = C R^-3   for R_min <= R <= R_max,    centres uniform
-
-is the law of dead leaves (:mod:`rawaug.data.demo.drawn`), whose pictures have occlusion edges and a 1/f^2 power
-spectrum as photographs do; here the leaves are not disks. Photographs of landscapes have few long straight edges and no
-text, and a denoiser trained on them alone is weakest there.
+With this law of sizes pictures look alike at every scale, and have occlusion edges and a 1/f^2 power spectrum as
+photographs do. *Dead leaves* are disks that hide each other, each a window of a photograph or flat in one of its
+colours. Seen from below, the first leaf is on top: disks are laid front to back on what is still bare, until nothing
+is, which draws exactly from the stationary model. *Shapes* are boxes, ellipses, polygons, stripes and lettering:
+photographs of landscapes have few long straight edges and no text, and a denoiser trained on them alone is weakest
+there.
 
 Sources: A. B. Lee, D. Mumford, J. Huang, "Occlusion models for natural images: a statistical study of a scale-invariant
 dead leaves model", IJCV 41, 2001; as training data for restoration: R. Achddou, Y. Gousseau, S. Ladjal, "Synthetic

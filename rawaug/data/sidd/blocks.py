@@ -1,26 +1,20 @@
-"""The sRGB pictures of SIDD's blocks, as the sensor saw them.
-
-``ValidationGtBlocksSrgb.mat`` and its like hold uint8 (40 scene instances, 32 blocks, rows, columns, RGB). SIDD turns
-its pictures upright and not its mosaics, and the block files do not say how: of the eight turns, a frame's blocks take
-the one in which their green agrees best with the green of the mosaics.
-
-SIDD's blocks of 256 x 256: validation, benchmark, and those of SIDD+ (NTIRE 2020).
+"""SIDD's blocks of 256 x 256: validation, benchmark and its submission, and those of SIDD+ (NTIRE 2020).
 
 ``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
 same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
-:data:`rawaug.data.sidd.frames.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern
-of each frame in a line of ``siddplus_*bayer_patterns.csv``.
+:data:`rawaug.data.sidd.frames.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern of
+each frame in a line of ``siddplus_*bayer_patterns.csv``.
 
-Their pictures are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
-``siddplus_valid_gt_srgb.mat``) if these are below the same folder, gains and colour matrix from the METADATA files of
-their scene instances. Where there is neither, the gains are 1, the matrix is the identity, the picture shows camera
+Pictures are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
+``siddplus_valid_gt_srgb.mat``), uint8 (scene instances, blocks, rows, columns, RGB), where these are below the same
+folder. SIDD turns its pictures upright and not its mosaics, and these files do not say how: of the eight turns, a
+frame's blocks take the one in which their green agrees best with the green of the mosaics. Gains and colour matrix are
+those of METADATA files. Where there is neither, the gains are 1, the matrix is the identity, the picture shows camera
 colour, and the pair says so (``rendered`` is False): it can test a denoiser, but no ISP.
 
-The file in which results go to the SIDD benchmark (RAW track), and a check of it.
-
-Published in two forms: a CSV with the columns ID (0 to 1279, block by block, frame by frame) and BLOCK (the bytes of
-the float32 block, row by row, in base64), for the pages on Kaggle; and ``SubmitRaw.mat`` of version 5 with the array
-``SubmitRaw`` (40, 32, 256, 256). Source: the example code of the dataset's first author, ``sidd_kaggle_submit``.
+A submission is a CSV with the columns ID (0 to 1279, block by block, frame by frame) and BLOCK (the bytes of the
+float32 block, row by row, in base64), or ``SubmitRaw.mat`` of version 5 with the array ``SubmitRaw`` (40, 32, 256,
+256). Source: the example code of the dataset's first author, ``sidd_kaggle_submit``.
 """
 
 from __future__ import annotations
@@ -41,11 +35,10 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.captured_noise import captured_noise
 from rawaug.data.development import develop_mosaic
 from rawaug.data.folders import files_below
 from rawaug.data.mat import read_array
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import LazyPairs, Pair, captured_noise
 from rawaug.data.sidd.frames import (
     HELD_BACK,
     Colour,
@@ -155,7 +148,7 @@ class Once(Generic[T]):
 
     def __call__(self) -> T:
         if self.fault is not None:
-            raise self.fault
+            raise self.fault.with_traceback(None)
         if self.value is None:
             try:
                 self.value = self.read()

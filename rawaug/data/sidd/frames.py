@@ -1,18 +1,12 @@
-"""SIDD's scene instances: the fields of their names, and which are held back for validation and benchmark.
+"""SIDD's full frames of five phones, noisy and clean, with their pictures.
+
+A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are MATLAB files
+of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black; METADATA are of
+version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not.
 
 The pattern goes by phone (the dataset's ``bayer_patterns.csv``). The S6's is GRBG; it looks like GBRG to those who read
 the files of version 7.3 without exchanging the axes. Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality
-denoising dataset for smartphone cameras", CVPR 2018.
-
-SIDD: full frames of five phones, noisy and clean, with their pictures.
-
-A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are MATLAB files
-of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black; METADATA are
-of version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not. The pattern goes by phone:
-see :mod:`rawaug.data.sidd.frames`.
-
-Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
-the dataset's ``noise_level_functions.csv``.
+denoising dataset for smartphone cameras", CVPR 2018, and the dataset's ``noise_level_functions.csv``.
 """
 
 from __future__ import annotations
@@ -28,13 +22,11 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, turn_back
-from rawaug.data.captured_noise import measured_levels
 from rawaug.data.development import color_matrix, develop_mosaic, white_balance
 from rawaug.data.folders import files_below
 from rawaug.data.mat import read_array, read_value
-from rawaug.data.pairs import FrameLabel, LazyPairs, Pair
+from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, measured_levels
 from rawaug.io import read_picture
-from rawaug.io.apart import apart
 from rawaug.io.pictures import view_of_orientation
 
 PHONES = {
@@ -272,7 +264,7 @@ def colour_of(file: Path) -> Colour:
 
 def _turned_back(file: Path, view: int, max_pixels: int) -> Tensor:
     """The upright picture in ``file`` as the sensor saw it."""
-    return _even(turn_back(apart(read_picture, file, max_pixels), view)).contiguous()
+    return _even(turn_back(read_picture(file, max_pixels), view)).contiguous()
 
 
 def _even(image: Tensor) -> Tensor:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rawaug.data.captured_noise import captured_noise
+from rawaug.data.pairs import captured_noise
 
 
 @pytest.mark.parametrize(("shot_var", "read_var"), [(1e-2, 4e-4), (2e-3, 1e-6), (1e-5, 1e-3)])

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import ctypes
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,7 @@ from rawaug.cli import main
 from rawaug.data import PictureFolder, RawFolder, check
 from rawaug.data.folders import files_below
 from rawaug.data.sidd.frames import HELD_BACK
-from rawaug.io import read_picture, write_picture
-from rawaug.io.apart import time_limit
+from rawaug.io import write_picture
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 
@@ -101,19 +102,25 @@ def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
     assert len(report.broken) == 1 and "has values from 2 to 2" in report.broken[0]
 
 
-def _crash_on_marked(path: Path, max_pixels: int) -> torch.Tensor:
-    if path.stem == "1":
-        ctypes.string_at(0)
-    return read_picture(path, max_pixels)
+class Crashing(PictureFolder):
+    """Whose second file crashes its decoder, and whose third one hangs it."""
+
+    def read(self, index: int) -> torch.Tensor:
+        if index == 1:
+            ctypes.string_at(0)
+        if index == 2:
+            time.sleep(100)
+        return super().read(index)
 
 
-@pytest.mark.skipif(not time_limit(), reason="needs Unix sockets")
-def test_a_crash_of_a_decoder_is_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_pictures(tmp_path)
-    monkeypatch.setattr("rawaug.data.folders.decode_picture", _crash_on_marked)
+def test_a_crash_and_a_hang_are_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_pictures(tmp_path, 4)
+    monkeypatch.setattr(sys.modules["rawaug.data.check"], "PictureFolder", Crashing)
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "5")
     (part,) = check(tmp_path).parts
-    assert dict(part.sizes) == {"6 x 8": 2} and part.items == part.examined == 3
-    assert len(part.broken) == 1 and "1.png: crashes the decoder (killed by SIGSEGV)" in part.broken[0]
+    assert part.sizes.total() == 2 and part.items == part.examined == 4
+    crash, hang = part.broken
+    assert "1.png: crashes the decoder (SIGSEGV" in crash and "2.png: cannot be read within 5 s" in hang
 
 
 def test_what_is_unknown_is_reported(tmp_path: Path) -> None:

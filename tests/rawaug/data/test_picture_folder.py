@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 import os
 import pickle
+import signal
 import struct
 import time
 import zlib
@@ -15,6 +16,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from rawaug.data import PictureFolder, open_pictures
+from rawaug.data.folders import being_read
 from rawaug.io import write_picture
 
 
@@ -85,7 +87,8 @@ def messy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, set[str]]:
 
 def test_pictures_come_sorted_by_path(folder: Path) -> None:
     pictures = PictureFolder(folder)
-    assert len(pictures) == 3 and list(pictures.names) == ["a/z.TIF", "b.png", "c.bmp"]
+    names = [pictures.file(k).relative_to(folder).as_posix() for k in range(len(pictures))]
+    assert names == ["a/z.TIF", "b.png", "c.bmp"]
     assert [picture[0, 0, 0].item() for picture in (pictures[0], pictures[1], pictures[2])] == [10, 20, 30]
     assert torch.equal(pictures[-1], grey(30)) and pictures.skipped == {}
     assert pictures.report() == f"{folder}: none of 3 pictures skipped so far"
@@ -188,22 +191,38 @@ def test_the_end_of_an_epoch_is_reported(messy: tuple[Path, set[str]], caplog: p
 def test_nothing_is_opened_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for k in range(3000):
         (tmp_path / f"{k:04d}.jpg").touch()
-    monkeypatch.setattr("rawaug.data.folders.decode_picture", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr("rawaug.data.folders.read_picture", lambda *_: pytest.fail("opened"))
     start = time.perf_counter()
     assert len(PictureFolder(tmp_path)) == 3000
     assert time.perf_counter() - start < 2
 
 
-def test_names_take_two_arrays_however_many_there_are(tmp_path: Path) -> None:
+def test_names_may_hold_any_bytes(tmp_path: Path) -> None:
     strange = ["ä.png", "b c.png", os.fsdecode(b"\xff.png")]
     for name in strange:
         write_picture(tmp_path / "a.png", grey(1))
         (tmp_path / "a.png").rename(tmp_path / name)
-    pictures = PictureFolder(tmp_path, allowed_share=0.5)
-    assert sorted(pictures.names) == sorted(strange)
-    assert pickle.loads(pickle.dumps(pictures)).names[-1] == pictures.names[-1]
+    pictures = pickle.loads(pickle.dumps(PictureFolder(tmp_path, allowed_share=0.5)))
+    assert sorted(pictures.file(k).name for k in range(3)) == sorted(strange)
     assert pictures[2].shape == (3, 6, 8)
     assert "name is not UTF-8; rename it" in pictures.report()
+
+
+@pytest.mark.parametrize("context", ["fork", "forkserver"])
+def test_the_file_that_killed_a_worker_is_named(folder: Path, context: str) -> None:
+    pictures = Deadly(folder)
+    with pytest.raises(RuntimeError, match=r"worker \(pid.* exited unexpectedly"):
+        list(DataLoader(pictures, batch_size=None, num_workers=1, multiprocessing_context=context))
+    assert pictures.being_read() == [folder / "b.png"] and folder / "b.png" in being_read()
+
+
+class Deadly(PictureFolder):
+    """Whose second file kills its decoder."""
+
+    def read(self, index: int) -> torch.Tensor:
+        if index == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().read(index)
 
 
 def test_nothing_to_read_is_reported_at_once(tmp_path: Path) -> None:

@@ -106,8 +106,6 @@ def test_limits_of_reading_are_keys_of_data(data: DataConfig, tmp_path: Path) ->
         plan_of(small).pictures[0]
     with pytest.raises(ValueError, match=r"data\.max_pixels must be a whole number"):
         DataConfig(max_pixels=0)
-    with pytest.raises(ValueError, match=r"data\.read_seconds must be a number"):
-        DataConfig(read_seconds=-1.0)
 
 
 def test_the_same_kind_of_data_elsewhere_keeps_its_regime() -> None:

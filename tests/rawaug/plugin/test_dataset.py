@@ -146,36 +146,6 @@ class ImageFolder(Dataset[Any]):
         return (self.transform(picture) if self.transform else picture), target
 
 
-class Ahead(list[Tensor]):
-    """Pictures that are only to be had in order."""
-
-    asked: list[int]
-
-    def read_ahead(self, indices: list[int]) -> Iterator[Tensor]:
-        self.asked = indices
-        return (list.__getitem__(self, index) for index in indices)
-
-    def __getitem__(self, index: Any) -> Any:
-        raise AssertionError("read one by one")
-
-
-class Numbered(RawPairs):
-    def __getitem__(self, index: int) -> Any:
-        return index
-
-
-def test_a_dataset_that_reads_ahead_is_asked_for_a_batch(
-    augment: RawAugment, pictures: list[Tensor], expected: Tensor
-) -> None:
-    pairs = RawPairs(Ahead(pictures), augment, crop=16, seed=7)
-    pairs.set_epoch(2)
-    assert torch.equal(torch.cat([batch.noisy for batch in DataLoader(pairs, 5)]), expected)
-    assert pairs.dataset.asked == [10, 11]
-    with pytest.raises(IndexError, match=f"there is no picture {COUNT}"):
-        pairs.__getitems__([COUNT])
-    assert Numbered(Ahead(pictures), augment, crop=16).__getitems__([3, 1]) == [3, 1]
-
-
 def test_an_image_folder(augment: RawAugment, tmp_path: Path) -> None:
     for name in ("cat", "dog"):
         (tmp_path / name).mkdir()

@@ -1,0 +1,343 @@
+r"""The files that a mosaic, or both mosaics of a noisy/clean pair, are read from and written to, by extension.
+
+    y = (d - black) / (white - black)
+
+for a digital number d, which may not exceed white (except in camera RAW, which :func:`rawaug.io.read_raw` reads). What
+a file does not state (CFA, levels) must be given; what it states cannot be overridden. Floating point without levels
+holds y itself.
+
+======  ==============================================  =============================================  ===============
+file    numbers                                         metadata                                       written
+======  ==============================================  =============================================  ===============
+RAW     as LibRaw reads them                            all, by their tags                             dng, 16 bits
+npz     the array ``noisy`` or ``clean``, or the only   arrays ``cfa``, ``black``, ``white``,          packed float32
+        one; packed ``(4, h, w)`` or ``(H, W)``         ``white_balance``, ``color_matrix``,
+                                                        ``shot_var``, ``read_var``
+mat     the same, of version 5 or 7.3                   variables of these names                       no
+tiff    the first page                                  its description, as JSON with these keys       mosaic, float32
+png     16 bits, one channel                            none                                           no
+======  ==============================================  =============================================  ===============
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.folders import RAW_EXTENSIONS
+from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
+from rawaug.errors import extra
+from rawaug.files import replacing
+from rawaug.io import read_raw
+from rawaug.io.isolated import damage_as_os_error
+from rawaug.io.pictures import MAX_PIXELS, read_plane
+from rawaug.io.tiff import opened_tiff
+
+# -- metadata ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What is known of a mosaic besides its numbers; None where it is not."""
+
+    cfa: CFA | None = None
+    black: tuple[float, ...] | None = None
+    white: float | None = None
+    white_balance: tuple[float, float, float] | None = None
+    color_matrix: Tensor | None = None
+    shot_var: float | None = None
+    read_var: float | None = None
+
+    @classmethod
+    def parse(cls, values: Mapping[str, Any], where: str | Path) -> Metadata:
+        """From plain values or arrays; other keys are ignored.
+
+        Raises:
+            ValueError: if a value is not of its kind, naming ``where`` it comes from.
+        """
+        parsed: dict[str, Any] = {}
+        for key, value in values.items():
+            if key not in KINDS or value is None:
+                continue
+            try:
+                parsed[key] = KINDS[key](value)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
+        return cls(**parsed)
+
+    def joined(self, given: Metadata, file: Path) -> Metadata:
+        """The metadata of ``file``, completed by what is ``given``.
+
+        Raises:
+            ValueError: if both state something, but not the same.
+        """
+        for key in ("cfa", "black", "white"):
+            own, other = getattr(self, key), getattr(given, key)
+            if own is not None and other is not None and own != other:
+                raise ValueError(f"{file}: states {key} {shown(own)}, not {shown(other)} as given; leave {key} out")
+        chosen = {key: getattr(given, key) if getattr(self, key) is None else getattr(self, key) for key in KINDS}
+        return Metadata(**chosen)
+
+
+def levels(value: Any) -> tuple[float, ...]:
+    """One level, or those of R, Gr, Gb, B; four equal ones are one."""
+    floats = _floats(value)
+    found = floats[:1] if len(set(floats)) == 1 else floats
+    if len(found) not in (1, 4):
+        raise ValueError(f"{len(found)} levels; use one, or those of R, Gr, Gb, B")
+    return found
+
+
+def _floats(value: Any) -> tuple[float, ...]:
+    floats = tuple(float(number) for number in np.ravel(value))
+    if not floats or not np.isfinite(floats).all():
+        raise ValueError(f"{np.ravel(value).tolist()} must be finite numbers")
+    return floats
+
+
+def _one(value: Any) -> float:
+    (number,) = _floats(value)
+    return number
+
+
+def _variance(value: Any) -> float:
+    if _one(value) < 0:
+        raise ValueError(f"{_one(value):g} is negative")
+    return _one(value)
+
+
+def _gains(value: Any) -> tuple[float, float, float]:
+    red, green, blue = _floats(value)
+    if min(red, green, blue) <= 0:
+        raise ValueError(f"{red:g}, {green:g}, {blue:g} must be positive")
+    return red / green, 1.0, blue / green
+
+
+KINDS: dict[str, Callable[[Any], Any]] = {
+    "cfa": lambda value: CFA(str(value if isinstance(value, str) else np.ravel(value)[0]).strip().upper()),
+    "black": levels,
+    "white": _one,
+    "white_balance": _gains,
+    "color_matrix": lambda value: torch.tensor(_floats(value)).reshape(3, 3),
+    "shot_var": _variance,
+    "read_var": _variance,
+}
+"""What may be stated, and how each is read."""
+
+
+def shown(value: Any) -> str:
+    """A CFA or levels in a message."""
+    return "/".join(f"{level:g}" for level in value) if isinstance(value, tuple) else f"{value}"
+
+
+# -- files, by extension ----------------------------------------------------------------------------------------------
+
+Found = tuple[np.ndarray, Mapping[str, Any]]
+"""The numbers of a file, and what it states."""
+
+
+class _Unclear(ValueError):
+    """The file is whole, but which array is meant is not clear."""
+
+
+def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+    with damage_as_os_error(file, "cannot be read as NPZ", _Unclear):
+        arrays = read_npz(file, lambda names: [_name_of(file, names, which, alone), *KINDS.keys() & set(names)])
+        return arrays.pop(next(name for name in arrays if name not in KINDS)), arrays
+
+
+def read_npz(file: Path, wanted: Callable[[list[str]], Iterable[str]]) -> dict[str, np.ndarray]:
+    """The arrays of a file that ``wanted`` chooses by their names; together at most :data:`MAX_BYTES`."""
+    # opened here, since NumPy leaves the files of damaged archives open
+    with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+        names = list(wanted(list(arrays.files)))
+        size = sum(arrays.zip.getinfo(f"{name}.npy").file_size for name in names)
+        if size > MAX_BYTES:
+            raise ValueError(f"declares {size} bytes, above the limit of {MAX_BYTES}")
+        return {name: arrays[name] for name in names}
+
+
+def write_npz(file: Path, clean: Tensor, noisy: Tensor, stated: Mapping[str, Any]) -> None:
+    """Packed RAW ``(4, h, w)`` (or mosaics of other patterns) of a pair, and what is ``stated`` of both."""
+    arrays: dict[str, Any] = {
+        key: np.array(value, None if key == "cfa" else np.float32) for key, value in stated.items()
+    }
+    with replacing(file) as partial, partial.open("wb") as opened:
+        np.savez(opened, **arrays, clean=clean.numpy(), noisy=noisy.numpy())
+
+
+def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+    names = variables(file)
+    stated = {name: read_value(file, name) for name in names if name in KINDS}
+    return read_array(file, _name_of(file, names, which, alone)), stated
+
+
+def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+    with extra("raw"):
+        pass
+
+    try:
+        with damage_as_os_error(file, "cannot be read as TIFF", OSError), opened_tiff(file) as tiff:
+            page = tiff.pages[0]
+            if page.nbytes > MAX_BYTES:
+                raise ValueError(f"its first page declares {page.nbytes} bytes, above the limit of {MAX_BYTES}")
+            text = getattr(page, "description", "")
+            numbers = page.asarray()
+    except OSError as error:
+        if "imagecodecs" in str(error):
+            raise ValueError(f"{file}: has a compression that is not supported; save it without one") from error
+        raise
+    try:
+        stated = json.loads(text) if text.startswith("{") else {}
+    except ValueError:  # a description of another program
+        stated = {}
+    return numbers, stated
+
+
+def write_tiff(file: Path, mosaic: Tensor, stated: Mapping[str, Any]) -> None:
+    """A mosaic ``(1, H, W)`` as float32, black 0, white 1."""
+    with extra("raw"):
+        import tifffile
+
+    with replacing(file) as partial:
+        description = json.dumps(stated, sort_keys=True)
+        tifffile.imwrite(partial, mosaic[0].numpy(), photometric="minisblack", metadata=None, description=description)
+
+
+def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
+    numbers = read_plane(file, max_pixels)
+    if numbers.dtype != np.uint16:
+        raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
+    return numbers, {}
+
+
+READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {
+    ".npz": _read_npz,
+    ".tif": _read_tiff,
+    ".tiff": _read_tiff,
+    ".png": _read_png,
+    ".mat": _read_mat,
+}
+READABLE = (*RAW_EXTENSIONS, *READERS)
+TWO_IN_ONE = (".npz", ".mat")
+"""Files that may hold both mosaics of a pair."""
+
+
+# -- one mosaic -------------------------------------------------------------------------------------------------------
+
+
+class Mosaic(NamedTuple):
+    """A mosaic float32 ``(1, H, W)``, sides even (of an odd side the last line is left out), and its sensor.
+
+    Args:
+        white_balance, color_matrix: as in :class:`rawaug.data.Pair`; None where the file does not state them.
+        levels: (shot_var, read_var), None if not stated.
+    """
+
+    raw: Tensor
+    cfa: CFA
+    white_balance: tuple[float, float, float] | None
+    color_matrix: Tensor | None
+    levels: tuple[float, float] | None
+    camera: str = "unknown"
+    iso: float | None = None
+
+
+def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> Mosaic:
+    """Read a mosaic.
+
+    Args:
+        which: ``"noisy"`` or ``"clean"``.
+        given: CFA and levels for files that do not state them.
+        alone: the file holds both mosaics of its pair, each by its name.
+        max_pixels: a PNG with more is refused; other formats have limits of their own.
+
+    Raises:
+        FileNotFoundError, OSError: if it is missing or damaged.
+        ValueError: if CFA or levels are unknown or contradict ``given``, or the numbers are not a mosaic within them.
+    """
+    suffix = file.suffix.lower()
+    if suffix in RAW_EXTENSIONS:
+        return _camera_file(file, given)
+    if suffix not in READERS:
+        raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file")
+    numbers, values = READERS[suffix](file, which, alone, max_pixels)
+    stated = Metadata.parse(values, file).joined(given, file)
+    if stated.cfa is None:
+        raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
+    return Mosaic(
+        raw=_normalised(file, numbers, stated.cfa, stated),
+        cfa=stated.cfa,
+        white_balance=stated.white_balance,
+        color_matrix=stated.color_matrix,
+        levels=None if stated.shot_var is None or stated.read_var is None else (stated.shot_var, stated.read_var),
+    )
+
+
+def _camera_file(file: Path, given: Metadata) -> Mosaic:
+    frame = read_raw(file)
+    Metadata(frame.cfa, levels(frame.black), frame.white).joined(given, file)
+    gains, matrix = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
+    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera, frame.iso)
+
+
+def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
+    """The array of a file that is the mosaic: the one of that name, or the only one."""
+    arrays = [name for name in names if name not in KINDS]
+    if which in arrays:
+        return which
+    if len(arrays) == 1 and not alone:
+        return arrays[0]
+    raise _Unclear(f"{file}: has no array {which}, but {', '.join(arrays) or 'none'}; name its mosaics noisy and clean")
+
+
+def _normalised(file: Path, numbers: np.ndarray, cfa: CFA, stated: Metadata) -> Tensor:
+    """Numbers as RAW float32 ``(1, H, W)``, black 0, white 1."""
+    if numbers.dtype.kind not in "fui" or not numbers.size:
+        raise ValueError(f"{file}: holds {numbers.dtype} {numbers.shape}; a mosaic must hold numbers")
+    black, white = _levels_of(file, numbers, stated)
+    low, high = float(numbers.min()), float(numbers.max())
+    if not (high <= white and low > 2 * min(black) - white):
+        raise ValueError(
+            f"{file}: has values from {low:.4g} to {high:.4g}, outside black {shown(black)} and white {white:g}; "
+            "give the right black and white"
+        )
+    packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)
+    sites = torch.tensor(black, dtype=torch.float32).reshape(-1, 1, 1)
+    return bayer.unpack((packed - sites) / (white - sites), cfa)
+
+
+def _levels_of(file: Path, numbers: np.ndarray, stated: Metadata) -> tuple[tuple[float, ...], float]:
+    black, white = stated.black, stated.white
+    if black is None and white is None and numbers.dtype.kind == "f":
+        return (0.0,), 1.0
+    for key, level in (("black", black), ("white", white)):
+        if level is None:
+            raise ValueError(f"{file}: does not state its {key} level; give black and white")
+    assert black is not None and white is not None
+    if white <= max(black):
+        raise ValueError(f"{file}: white level {white:g} is not above black level {shown(black)}")
+    return black, white
+
+
+def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
+    """``(4, h, w)`` as it is; a mosaic ``(H, W)`` or ``(1, H, W)`` packed."""
+    if numbers.ndim == 3 and numbers.shape[0] == 4:
+        return numbers
+    if numbers.ndim == 3 and numbers.shape[0] == 1:
+        numbers = numbers[0]
+    if numbers.ndim != 2 or min(numbers.shape) < 2:
+        raise ValueError(f"{file}: has shape {tuple(numbers.shape)}; use a mosaic (H, W) or packed RAW (4, h, w)")
+    height, width = (side // 2 * 2 for side in numbers.shape)
+    return bayer.pack(numbers[None, :height, :width], cfa)
