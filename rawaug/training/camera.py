@@ -23,7 +23,6 @@ from rawaug.data.folders import Readable, left_out
 from rawaug.data.pairs import Pair, shared_frame
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import read_raw
-from rawaug.io.apart import apart
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import (
@@ -144,7 +143,7 @@ def _frames(pairs: Sequence[Pair]) -> list[MeasuredFrame]:
 
 def _frame(pairs: Sequence[Pair], index: int) -> MeasuredFrame:
     if isinstance(pairs, RawFolder):
-        frame = apart(read_raw, pairs.files[index])
+        frame = read_raw(pairs.files[index])
         return MeasuredFrame(frame.mosaic, frame.cfa, frame.camera, frame.iso)
     pair = pairs[index]
     return MeasuredFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, pair.camera, pair.iso)
