@@ -204,7 +204,7 @@ def test_the_first_pair_that_is_not_finite_ends_the_run(tmp_path: Path, pictures
     isp = DictionaryISP.from_pretrained("universal")
     isp.colour.known.fill_(3e38)
     isp.save(tmp_path / "absurd.safetensors")
-    with pytest.raises(ValueError, match=r"a\.jpg: pair 0 is not finite; the weights .*absurd.* are damaged"):
+    with pytest.raises(ValueError, match="not finite: the ISP's weights are damaged"):
         synth(pictures, tmp_path / "out", format="npz", isp=str(tmp_path / "absurd.safetensors"), workers=0)
     assert not list((tmp_path / "out").glob("*.npz"))
 

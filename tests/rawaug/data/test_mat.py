@@ -91,7 +91,7 @@ def _crash(path: Path, name: str, plain: bool) -> None:
 def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     savemat(tmp_path / "a.mat", {"x": ARRAY})
     monkeypatch.setattr("rawaug.data.mat._read", _crash)
-    with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(killed by SIGSEGV\)"):
+    with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(SIGSEGV"):
         read_array(tmp_path / "a.mat", "x")
 
 
