@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evaluation": CAMERA | {"plugin", "data", "io"},
     "training": CAMERA | {"plugin", "data", "io", "evaluation"},
     "explore": CAMERA | {"plugin", "data", "io", "evaluation"},
-    "commands": PRODUCT | {"explore"},
+    "commands": PRODUCT | {"explore", "experiment"},
     "experiment": PRODUCT,
     "paper": PRODUCT | {"experiment"},
     "cli": BASE | {"commands", "experiment", "paper"},

@@ -13,8 +13,14 @@ from rawaug.noise.cameras import (
     noise_model,
     noise_names,
 )
-from rawaug.noise.dark import DarkFrames, DarkNoise, from_dark_frames
-from rawaug.noise.estimate import NoiseEstimate, NoisePoints, estimate_noise, plot_noise
+from rawaug.noise.estimate import (
+    DarkNoise,
+    NoiseEstimate,
+    NoisePoints,
+    estimate_noise,
+    from_dark_frames,
+    plot_noise,
+)
 from rawaug.noise.levels import EldLevels, FixedLevels, NoiseLevels, PmridLevels, Preset, SiddLevels
 from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import (
@@ -22,6 +28,7 @@ from rawaug.noise.sensor import (
     ColourBias,
     ColumnNoise,
     Compose,
+    DarkFrames,
     DefectPixels,
     EldNoise,
     Quantisation,
@@ -31,43 +38,10 @@ from rawaug.noise.sensor import (
 )
 
 __all__ = [
-    "BlackOffset",
-    "CalibratedNoise",
-    "ColourBias",
-    "ColumnNoise",
-    "Compose",
-    "DarkFrames",
-    "DarkNoise",
-    "DefectPixels",
-    "EldLevels",
-    "EldNoise",
-    "FixedLevels",
-    "IsoLevel",
-    "MeasuredLevels",
-    "MeasuredNoise",
-    "NoiseEstimate",
-    "NoiseLevels",
-    "NoiseModel",
-    "NoisePoints",
-    "NoiseSpec",
-    "Params",
-    "PmridLevels",
-    "PoissonGaussianNoise",
-    "Preset",
-    "Quantisation",
-    "RowNoise",
-    "ScaledLevels",
-    "SensorNoise",
-    "ShotReadModel",
-    "ShotReadNoise",
-    "SiddLevels",
-    "TukeyLambdaNoise",
-    "camera_law",
-    "camera_names",
-    "estimate_noise",
-    "from_dark_frames",
-    "noise_levels",
-    "noise_model",
-    "noise_names",
-    "plot_noise",
-]
+    "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DarkFrames", "DarkNoise",
+    "DefectPixels", "EldLevels", "EldNoise", "FixedLevels", "IsoLevel", "MeasuredLevels", "MeasuredNoise",
+    "NoiseEstimate", "NoiseLevels", "NoiseModel", "NoisePoints", "NoiseSpec", "Params", "PmridLevels",
+    "PoissonGaussianNoise", "Preset", "Quantisation", "RowNoise", "ScaledLevels", "SensorNoise", "ShotReadModel",
+    "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise", "camera_law", "camera_names", "estimate_noise",
+    "from_dark_frames", "noise_levels", "noise_model", "noise_names", "plot_noise",
+]  # fmt: skip

@@ -1,30 +1,4 @@
-r"""Noise of a camera by name: darktable's profiles, 374 models by ISO.
-
-.. math:: \operatorname{var}(y) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
-
-of black-subtracted RAW, white 1. The ISO is drawn log-uniformly between the ends of a camera's profile, and both
-variances are interpolated in their logarithms against that of the ISO. Two things about the profiles:
-
-- The red and blue figures differ from the green ones as if they contained a white balance (a gain w multiplies a by w
-  and b by w squared), so the green ones are taken for all channels: photons and electronics are the same behind every
-  filter.
-- darktable measures after demosaicking and on fine details, where noise has been averaged. For four cameras that ELD
-  (Wei et al., CVPR 2020) measured on the mosaic the profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to
-  16 in read variance; all are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`.
-  The median of shot_var at ISO 100 is then 2.8e-5, a full well of 36,000 electrons.
-
-Rows whose green variance is not positive are left out, and counted in :attr:`Profiles.rows_left_out`.
-
-The noise law of a camera over ISO, measured on its own files.
-
-.. math:: \log \mathrm{shot\_var},\ \log \mathrm{read\_var} \text{ are linear in } \log \mathrm{ISO}
-
-between the ISO values that were measured, as in SIDD's tables (:mod:`rawaug.noise.levels`): a sensor's gain grows
-with the
-ISO, in steps where it switches its amplifier, so that a table follows it better than one line. Outside the measured
-range an ISO is refused. Files without an ISO give one level, which holds for every picture.
-
-Noise by name: the published presets and the measured cameras.
+r"""Noise by name: the published presets and the measured cameras.
 
 ===================================================================  ===========================  ============
 names                                                                what                         ``iso=``
@@ -43,10 +17,19 @@ Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": .
 ``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
 no name: ``{"pair_psnr": 41.18}``.
 
-Noise levels scaled so that noisy/clean pairs have a stated mean PSNR.
+*Profiles.* darktable has var = a y + b for 374 cameras by ISO. Its red and blue figures differ from the green ones as
+if they contained a white balance, so the green ones serve all channels: photons and electronics are the same behind
+every filter. It measures after demosaicing and on fine details, where noise has been averaged: for four cameras that
+ELD measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All
+are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100
+is then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out, and counted.
 
-A picture of mean signal m has noise of mean square ``shot_var m + read_var``, before the clip at white. A factor s on
-both variances shifts every pair's PSNR by ``-10 log10(s)``, so that the factor follows without a search:
+*Measured cameras.* Between the ISO values of a fitted camera's files, the logarithms of both variances are linear in
+that of the ISO: the gain grows with the ISO, in steps where an amplifier is switched, which a table follows better than
+one line. Outside the measured range an ISO is refused. Files without an ISO give one level for every picture.
+
+*Stated PSNR.* A picture of mean signal m has noise of mean square ``shot_var m + read_var`` before the clip at white,
+and a factor s on both variances shifts the PSNR of every pair by ``-10 log10(s)``. So a mean PSNR of P takes the factor
 
     s = 10^((P_0 - P) / 10),        P_0 = mean(-10 log10(shot_var m + read_var))
 
@@ -89,14 +72,13 @@ READ_ON_MOSAIC = 6.2
 
 
 class Profiles(NamedTuple):
-    """The usable rows of all cameras.
+    """The usable rows of darktable's N cameras.
 
     Args:
-        names: maker and model, ``N`` of them.
-        table: ``(3, N, R)`` float64, logarithms of ISO, shot_var and read_var, ISO increasing; behind a camera's
-            last row the ISO is infinite and the logarithms of the variances are 0.
+        names: maker and model.
+        table: ``(3, N, R)`` float64, logarithms of ISO, shot_var and read_var, ISO increasing and then infinite.
         rows: ``(N,)`` number of each camera's rows.
-        rows_left_out: rows of the profiles with a variance that is not positive.
+        rows_left_out: number of rows with a variance that is not positive.
         cameras_left_out: cameras with no other row.
     """
 
@@ -114,7 +96,7 @@ class Profiles(NamedTuple):
 
 @cache
 def published_profiles() -> Profiles:
-    """The package's ``profiles.tsv``. Where a camera has an ISO twice the geometric mean is taken."""
+    """The package's ``profiles.tsv``; the geometric mean where a camera has an ISO twice."""
     cameras: dict[str, dict[float, list[tuple[float, float]]]] = {}
     left_out = 0
     text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
@@ -192,12 +174,8 @@ class ProfileLevels:
         return torch.exp(torch.lerp(s0, s1, t))[:, 0].float(), torch.exp(torch.lerp(r0, r1, t))[:, 0].float()
 
 
-_ROUNDING = 1e-9
-"""Of logarithms that are the same ISO."""
-
-
-_LEAST = 1e-12
-"""Stands for a variance of 0, which is below what can be measured, in the logarithms."""
+_ROUNDING = 1e-9  # of logarithms that are the same ISO
+_LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
 
 class IsoLevel(NamedTuple):
@@ -280,12 +258,8 @@ class MeasuredLevels:
 
 
 def camera_law(stored: Mapping[str, Any]) -> MeasuredLevels:
-    """The law that the entry ``noise`` of an ISP's file holds.
-
-    Raises:
-        ValueError: if it is not such an entry.
-    """
-    if "shot_var" in stored:  # of version 0.1: one level, without its ISO
+    """The law in the entry ``noise`` of an ISP's file."""
+    if "shot_var" in stored:  # a single level, as in the shipped canon-powershot
         return MeasuredLevels([IsoLevel(None, stored["shot_var"], stored["read_var"], stored.get("r2"))])
     if stored.get("name") != "MeasuredNoise":
         raise ValueError(f"expected the noise law of a camera, got {dict(stored)}; fit the ISP again")
@@ -318,14 +292,13 @@ NoiseSpec = Spec | Sequence[float] | Sequence[str]
 
 @cache
 def _by_iso() -> dict[str, Callable[[Iso], NoiseLevels]]:
-    """The cameras that were measured one by one."""
     data = published()
     sidd = {name: partial(SiddLevels, name) for name in data["sidd_noise_level_function"]["cameras"]}
     return {**sidd, "pmrid": PmridLevels, **{name: partial(EldLevels, name) for name in data["eld"]["cameras"]}}
 
 
 def camera_names() -> list[str]:
-    """The cameras that were measured one by one: names that take ``iso=``, as those of the profiles do."""
+    """The cameras that were measured one by one."""
     return list(_by_iso())
 
 

@@ -1,4 +1,4 @@
-r"""A camera's own noise, from its RAW files: photon transfer on flat blocks.
+r"""A camera's own noise, measured on its RAW files: photon transfer on flat blocks, and dark frames.
 
 .. math:: \operatorname{var} = \mathrm{shot\_var} \cdot \operatorname{mean} + \mathrm{read\_var}
 
@@ -7,14 +7,16 @@ not charts: Foi et al. 2008). Each packed plane is cut into 8 x 8 blocks and tra
 white noise has the same variance in every coefficient and texture is strongest in the low ones. Low coefficients say
 whether a block is flat, high ones how noisy it is (Ponomarenko et al., "An automatic approach to lossy compression of
 AVIRIS images", 2007): as they are independent, the choice does not bias the measure. The first row and column are not
-used, so that banding does not count. Where the noise is not white, a codec has smoothed it or texture has entered, and
-the level is left out. A codec that quantises wavelet coefficients as coarsely as the noise itself can leave noise that
-is white and yet not the sensor's: ``read_var``, a small remainder in the shadows, is not to be trusted on such files.
+used, so that banding does not count. A level whose noise is not white, smoothed by a codec or mixed with texture, is
+left out. Noise that a codec quantised coarsely can be white and yet not the sensor's: do not trust ``read_var``, a
+small remainder in the shadows, on such files.
+
+Without light, in frames with the lens capped, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours
+of one colour hold n alone, twice its variance; those between the means of successive sensor rows hold the banding as
+well (after Wei et al. 2020). Slow gradients such as amplifier glow cancel in both.
 
 Signals are black-subtracted, white = 1. The variance that rounding to the sensor's grid adds (a twelfth of a squared
 step) is part of ``read_var``.
-
-The photon transfer curve: measured levels and the line through them.
 """
 
 from __future__ import annotations
@@ -53,6 +55,9 @@ _CLIP_MARGIN = 4.0  # in standard deviations of a pixel
 _MIN_BLOCKS = 30  # a level's
 _MIN_POINTS = 6
 _ROUNDS = 10
+
+_OUTLIER = 8.0  # in robust standard deviations: hot pixels, not tails
+_PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can be measured
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ class _Blocks:
 def estimate_noise(
     mosaics: Tensor | Sequence[Tensor], cfa: CFA | str, *, read_var: float | None = None
 ) -> NoiseEstimate:
-    """(shot_var, read_var) of one camera at one ISO, from the flat regions of its RAW files.
+    """The levels of one camera at one ISO, from the flat regions of its RAW files.
 
     Args:
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
@@ -257,6 +262,53 @@ def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) ->
 def _r2(points: NoisePoints, shot_var: float, read_var: float) -> float:
     x, y = points.signal[points.used], points.variance[points.used]
     return float(1 - (y - shot_var * x - read_var).square().sum() / (y - y.mean()).square().sum())
+
+
+@dataclass(frozen=True)
+class DarkNoise:
+    """``read_var`` of pixels, ``row_var`` of banding (0 if not measurable), and the black level's error in
+    R, Gr, Gb, B. Fixed pattern noise is part of ``read_var``."""
+
+    read_var: float
+    row_var: float
+    black_offset: tuple[float, float, float, float]
+
+
+def from_dark_frames(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
+    """The noise without light, the mean over the frames ``(1, H, W)`` or ``(1, 1, H, W)`` of one camera at one ISO.
+
+    Raises:
+        ValueError: if there is no frame, or one is clipped at black.
+
+    Example:
+        >>> frame = torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0)) * 1e-3
+        >>> dark = from_dark_frames([frame], "RGGB")
+        >>> 0.9e-6 < dark.read_var < 1.1e-6  # for estimate_noise(mosaics, cfa, read_var=dark.read_var)
+        True
+    """
+    if not frames:
+        raise ValueError("no dark frames given")
+    measured = [_measure_dark(pack(frame.reshape(1, *frame.shape[-2:]).double(), cfa)) for frame in frames]
+    read_var, row_var, *offsets = torch.stack(measured).mean(0).tolist()
+    return DarkNoise(read_var, max(row_var, 0.0), (offsets[0], offsets[1], offsets[2], offsets[3]))
+
+
+def _measure_dark(planes: Tensor) -> Tensor:
+    """(read_var, row_var, offsets of R, Gr, Gb, B) of packed ``(4, h, w)``."""
+    lowest = planes == planes.min()
+    if float(lowest.double().mean()) > _PILED_UP:
+        raise ValueError("a dark frame is clipped at black, so its noise cannot be measured")
+    difference = planes.diff(dim=-1)
+    scale = 1.4826 * difference.abs().median()
+    regular = difference.abs() <= _OUTLIER * scale if scale > 0 else torch.ones_like(difference, dtype=torch.bool)
+    read_var = difference[regular].square().mean() / 2
+    # R and Gr share a row of the sensor, Gb and B the next. A median is coarse on digital numbers: cap the outliers.
+    offsets = planes.flatten(1).median(-1).values
+    limit = _OUTLIER * scale if scale > 0 else planes.abs().max()
+    levelled = (planes - offsets[:, None, None]).clamp(-limit, limit)
+    rows = levelled.reshape(2, 2, *planes.shape[1:]).mean((1, 3))
+    row_var = rows.diff(dim=-1).square().mean() / 2 - read_var / (2 * planes.shape[-1])
+    return torch.cat([read_var[None], row_var[None], levelled.mean((1, 2)) + offsets])
 
 
 _CHANNELS = (("R", "tab:red"), ("Gr", "tab:olive"), ("Gb", "tab:green"), ("B", "tab:blue"))

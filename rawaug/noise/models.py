@@ -9,9 +9,8 @@ and never at black: zero-mean noise stays zero-mean in the shadows.
 
 Every model splits in ``sample(batch, generator) -> params`` and a pure ``apply(clean, params)``. The parameters hold
 one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever else is in the
-batch and on any number of threads. The default noise is the same on a CPU and, by a kernel, on a GPU within 1e-6 of
-its standard deviation; everything else, and a GPU without Triton, has a stream for each kind of device, on which a
-replay is exact.
+batch and on any number of threads. On a GPU the default noise is that of the CPU within 1e-6 of its standard deviation;
+all other noise, and any noise on a GPU without Triton, has a stream of its own for each kind of device.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
 from rawaug.kernels.runtime import eager
 from rawaug.noise.levels import NoiseLevels
-from rawaug.noise.poisson import poisson
 from rawaug.seeding import derived_seed, keyed_generator
 
 Params = dict[str, Tensor]
@@ -38,6 +36,9 @@ _NO_SHOT = 1e-30
 """Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
 _GROUP = 2**18
 """Values whose photons are counted together: many small pictures, or one large."""
+INVERSION_LIMIT = 10.0
+"""Rates below it are drawn by summing; from it on the expansion's distribution function is right to 5e-5."""
+_CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
 
 
 class NoiseModel(ABC):
@@ -53,8 +54,7 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        """Draw the parameters of ``batch`` pictures: tensors with leading dimension ``batch``, on the generator's
-        device."""
+        """Parameters of ``batch`` pictures: tensors with leading dimension ``batch``, on the generator's device."""
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -68,10 +68,9 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """The variance map ``(B, 4, h, w)`` of the noise on signal ``clean``, before the clip at white.
+        """The variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white.
 
-        It evaluates the law at whatever signal it is given. In training that may be the clean signal; at test time
-        only the noisy one is known, and it is what UPI's networks are given (Brooks et al. 2019).
+        At test time only the noisy signal is known, which is what UPI's networks are given (Brooks et al. 2019).
         """
 
     @eager
@@ -205,7 +204,7 @@ class ShotReadNoise(ShotReadModel):
 class PoissonGaussianNoise(ShotReadModel):
     """Exact photon statistics: ``shot_var * Poisson(y / shot_var) + N(0, read_var)``, skewed at low counts as light is.
 
-    Signal below black makes no photons and is kept as it is. :mod:`rawaug.noise.poisson` says how counts are drawn.
+    Signal below black makes no photons and is kept as it is. See :func:`poisson`.
     """
 
     @torch.no_grad()
@@ -229,3 +228,40 @@ class PoissonGaussianNoise(ShotReadModel):
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         """Read noise of the shape ``(b, 4, h, w)`` of ``like``, from one generator a picture."""
         return drawn_normals(like, generators).mul_(per_picture(params["read_var"], like).sqrt())
+
+
+def poisson(rate: Tensor, normals: Tensor) -> Tensor:
+    """Poisson counts for expected counts ``rate``, written over ``normals``, contiguous standard normal draws.
+
+    A count is the quantile of its draw, without rejection, on any device; ``torch.poisson`` has poor streams on CUDA
+    and fails at high rates. Below :data:`INVERSION_LIMIT` the distribution function is summed; from there on its
+    inverse is Giles' expansion in ``rate**-0.5`` (Algorithm 955, ACM TOMS 2016), rounded down.
+    """
+    piece = _CACHED if rate.device.type == "cpu" else max(rate.numel(), 1)
+    for part, out in zip(rate.reshape(-1).split(piece), normals.view(-1).split(piece), strict=True):
+        low = part < INVERSION_LIMIT
+        walked = _walked(part[low], out[low]).to(out)
+        out.copy_(_expanded(part, out))
+        out[low] = walked
+    return normals
+
+
+def _expanded(rate: Tensor, w: Tensor) -> Tensor:
+    """Giles' expansion to the order 1 / rate, rounded down."""
+    root = rate.clamp(min=INVERSION_LIMIT).sqrt()
+    w2 = w * w
+    tail = (-8 / 405 + w2 * (7 / 810 + w2 / 270)) / root - w * (1 / 36 + w2 / 72)
+    return (rate + w * root + (1 / 3 + w2 / 6) + tail / root).floor_().clamp_(min=0)
+
+
+def _walked(rate: Tensor, w: Tensor) -> Tensor:
+    """The number of k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
+    rate, u = rate.double(), torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # which the sum does reach
+    term = torch.exp(-rate)
+    total, count, k = term.clone(), torch.zeros_like(rate), 0
+    while (below := total < u).any():
+        k += 1
+        count += below
+        term *= rate / k
+        total += term
+    return count

@@ -1,17 +1,16 @@
 r"""Sensor noise beyond shot and read noise, each effect a model that composes with the others.
 
-Row noise (banding), heavy-tailed read noise, the offset of the black level, the bias of a colour, dead and hot pixels
-and the rounding to digital numbers; after Wei et al., "A physics-based noise formation model for extreme low-light raw
-denoising", 2020. All of it on black-subtracted RAW with white = 1. The heavy tails are those of the Tukey lambda,
+Row and column noise (banding), heavy-tailed read noise, errors of the black level, dead and hot pixels and rounding to
+digital numbers, after Wei et al., "A physics-based noise formation model for extreme low-light raw denoising", 2020; or
+no model but a camera's own dark frames. All of it on black-subtracted RAW with white = 1. The heavy tails are those of
+the Tukey lambda,
 
 .. math:: Q(u) = (u^\lambda - (1 - u)^\lambda) / \lambda, \qquad \lambda > -1/2,
 
 logistic at 0, near the normal at 0.14, heavier the lower the shape (Joiner and Rosenblatt 1971).
 
-Noise models in sequence: y -> model 1 -> model 2 -> ..., and one clip at white at the end.
-
-Variances of independent models add up. The models' parameters lie side by side in one dictionary, with one seed a
-picture from which every model draws its own stream.
+Models in sequence, y -> model 1 -> model 2 -> ..., are clipped at white once, at the end; the variances of independent
+ones add up. Their parameters share one dictionary and one seed a picture, from which each draws its own stream.
 """
 
 from __future__ import annotations
@@ -22,7 +21,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from rawaug.bayer import pack
 from rawaug.noise.cameras import noise_levels
+from rawaug.noise.estimate import from_dark_frames
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform
 from rawaug.noise.models import (
     NoiseModel,
@@ -35,8 +36,7 @@ from rawaug.noise.models import (
 )
 from rawaug.registry import NOISE, require_between
 
-_NO_STEP = 1e-12
-"""Replaces a quantum of 0, where nothing is rounded; too small to affect the picture."""
+_NO_STEP = 1e-12  # replaces a quantum of 0, where nothing is rounded
 
 Range = float | tuple[float, float]
 """One value for all pictures, or the limits between which each picture draws its own."""
@@ -61,11 +61,7 @@ def _normal(generator: torch.Generator, *shape: int) -> Tensor:
 
 
 def tukey_lambda_variance(shape: float) -> float:
-    """The variance of the Tukey lambda distribution of scale 1.
-
-    Raises:
-        ValueError: for a shape of -1/2 or less, where it is infinite.
-    """
+    """The variance of the Tukey lambda distribution of scale 1, infinite for shapes up to -1/2, which are refused."""
     from scipy.stats import tukeylambda
 
     if shape <= -0.5:
@@ -380,6 +376,58 @@ class SensorNoise(Compose):
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         variance = super().variance(clean, params)
         return variance.mul_(per_picture(params["told"], clean)) if "told" in params else variance
+
+
+@NOISE.register("DarkFrames")
+class DarkFrames(PoissonGaussianNoise):
+    """Photons, and read noise cut out of a camera's own dark frames: ``shot_var Poisson(y / shot_var) + dark``.
+
+    Every picture has a patch of a random frame at a random place of the same CFA phase, with all that the sensor does
+    in it: tails, banding, offsets, hot pixels, rounding. At its edges a frame goes on at the other side.
+
+    Args:
+        path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
+        shot_var: of the photons at the frames' ISO, or limits that it is drawn between; by default that of each file's
+            NoiseProfile tag.
+
+    Raises:
+        FileNotFoundError, OSError: if there is no such file, or it cannot be read.
+        ValueError: if there is no RAW file, one is clipped at black, or ``shot_var`` is neither given nor in the tags.
+
+    Example:
+        >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
+    """
+
+    by_plane = True
+
+    def __init__(self, path: str, shot_var: Range | None = None) -> None:
+        from rawaug.data.folders import RawFolder
+        from rawaug.io import read_raw
+
+        frames = [read_raw(file) for file in RawFolder(path).files]
+        untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
+        if untagged:
+            raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
+        self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
+        self.read_var = torch.tensor([from_dark_frames([frame.mosaic], frame.cfa).read_var for frame in frames])
+        self.shot_var = [shot_var or frame.noise_profile[0] for frame in frames]  # type: ignore[index]
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
+        shot = torch.stack([draw(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
+        read = self.read_var.to(generator.device)[frame]
+        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": new_seeds(batch, generator)}
+
+    def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
+        noise = torch.empty_like(like, memory_format=torch.contiguous_format)
+        for picture, index, generator in zip(noise, params["dark_frame"].tolist(), generators, strict=True):
+            planes = self.planes[index].to(like)
+            rows, columns = (
+                (torch.arange(size) + int(torch.randint(side, (), generator=generator, device=like.device))) % side
+                for side, size in zip(planes.shape[-2:], like.shape[-2:], strict=True)
+            )
+            picture.copy_(planes[:, rows[:, None], columns])
+        return noise
 
 
 @NOISE.register("EldNoise")

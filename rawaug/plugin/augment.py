@@ -97,18 +97,17 @@ class RawAugment(nn.Module):
             isp.configure(cfa=str(cfa))
         self.isp = frozen(isp)
         self.baked = frozen(BakedISP(isp))
-        self.register_load_state_dict_pre_hook(_drop_isp)
         self._draw(noise, sampling, strength, seed, exposure, light, tone)
 
     def _draw(
         self,
         noise: NoiseSpec | NoiseModel,
         sampling: Sampling,
-        strength: float,
-        seed: int,
-        exposure: tuple[float, float] | None,
-        light: float | str | None,
-        tone: str | None,
+        strength: float = 0.1,
+        seed: int = 0,
+        exposure: tuple[float, float] | None = None,
+        light: float | str | None = None,
+        tone: str | None = None,
     ) -> None:
         if sampling not in get_args(Sampling):
             raise ValueError(f"sampling {sampling!r} is unknown; use one of {', '.join(get_args(Sampling))}")
@@ -133,22 +132,13 @@ class RawAugment(nn.Module):
         self.tone = None if tone is None else tone_weights(self.isp, tone)
         self._calls = 0
 
-    def redrawn(
-        self,
-        noise: NoiseSpec | NoiseModel,
-        sampling: Sampling = "convex",
-        strength: float = 0.1,
-        seed: int = 0,
-        exposure: tuple[float, float] | None = None,
-        light: float | str | None = None,
-        tone: str | None = None,
-    ) -> RawAugment:
-        """The same ISP and pattern with other draws; both share the baked ISP, so nothing is baked again.
+    def redrawn(self, noise: NoiseSpec | NoiseModel, sampling: Sampling = "convex", **draws: Any) -> RawAugment:
+        """The same ISP and pattern with other draws; nothing is baked again.
 
         Arguments and errors are those of the constructor.
         """
         other = copy(self)
-        other._draw(noise, sampling, strength, seed, exposure, light, tone)
+        other._draw(noise, sampling, **draws)
         return other
 
     @classmethod
@@ -185,14 +175,15 @@ class RawAugment(nn.Module):
             generator: on the CPU; the module's own by default.
             place: ``(B, 5)`` top, left, height, width of the full frames, view; untouched full frames by default.
         """
-        batch = self._batch(srgb)
-        generator = generator or self._own_generator()
-        if place is None:
-            place = torch.tensor([0, 0, *batch.shape[-2:], 0]).repeat(len(batch), 1)
-        with _float32(batch):
-            setting = self._expose(self._sample_isp(batch, generator), generator)
-            params = AugmentParams(setting, self.noise.sample(len(batch), generator), place)
+        params = self._sample(self._batch(srgb), generator or self._own_generator(), place)
         return params.map(lambda t: t[0]) if is_picture(srgb) else params
+
+    def _sample(self, srgb: Tensor, generator: torch.Generator, place: Tensor | None) -> AugmentParams:
+        if place is None:
+            place = torch.tensor([0, 0, *srgb.shape[-2:], 0]).repeat(len(srgb), 1)
+        with _float32(srgb):
+            setting = self._expose(self._sample_isp(srgb, generator), generator)
+            return AugmentParams(setting, self.noise.sample(len(srgb), generator), place)
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
@@ -235,6 +226,13 @@ class RawAugment(nn.Module):
             return self._pair(self._batch(srgb), params.map(lambda t: t[None])).map(lambda t: t[0])
         return self._pair(self._batch(srgb), params)
 
+    @eager
+    @torch.no_grad()
+    def make(self, srgb: Tensor, generator: torch.Generator, place: Tensor | None = None) -> RawPair:
+        """Sample, then apply, of ``(B, 3, H, W)`` that :mod:`rawaug.plugin.pictures` has converted already."""
+        self._require_here(srgb)
+        return self._pair(srgb, self._sample(srgb, generator, place))
+
     def _pair(self, srgb: Tensor, params: AugmentParams) -> RawPair:
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
@@ -242,9 +240,8 @@ class RawAugment(nn.Module):
             clean = self._clean(srgb, params)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
             _require_finite(noisy)
-            if self.pattern is None:
-                return RawPair(noisy, clean, variance, params)
-            noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
+            if self.pattern is not None:
+                noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
             return RawPair(noisy, clean, variance, params)
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
@@ -278,11 +275,11 @@ class RawAugment(nn.Module):
         where = find_picture(batch, key, batched=True)
         pictures = picked(batch, where)
         srgb = self._batch(pictures)
-        pair = self._pair(srgb, self.sample(srgb, generator))
+        pair = self.make(srgb, generator or self._own_generator())
         return replaced(batch, where, pair.map(lambda t: t[0]) if is_picture(pictures) else pair)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RawAugment:
-        """Go where the surrounding network goes, but stay float32, in a network of bfloat16 too."""
+        """Move with the surrounding network, but stay float32."""
 
         def moved(tensor: Tensor) -> Tensor:
             probe = fn(tensor.new_empty(0))
@@ -306,18 +303,20 @@ class RawAugment(nn.Module):
 
     def _batch(self, pictures: Any) -> Tensor:
         """``(B, 3, H, W)`` with even sides; other input is moved to the module's device."""
-        device = self.device
         srgb = even_sided(to_rgb_batch(pictures))
         if not isinstance(pictures, Tensor):
-            return srgb.to(device)
-        if srgb.device != device:
-            raise ValueError(
-                f"the pictures are on {srgb.device} but the augmentation is on {device}; call augment.to(...)"
-            )
+            return srgb.to(self.device)
+        self._require_here(srgb)
         return srgb
 
+    def _require_here(self, srgb: Tensor) -> None:
+        if srgb.device != self.device:
+            raise ValueError(
+                f"the pictures are on {srgb.device} but the augmentation is on {self.device}; call augment.to(...)"
+            )
+
     def _own_generator(self) -> torch.Generator:
-        """A new one for each call; by worker and process too, or all of them would draw the same."""
+        """A new one for each call, worker and process."""
         self._calls += 1
         worker = get_worker_info()
         return keyed_generator(self.seed, "augment", worker.seed if worker else 0, self._calls, *rank_key())
@@ -327,7 +326,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 def frozen(module: M) -> M:
-    """A copy in eval mode whose tensors are buffers outside of ``state_dict``; the module stays as it is."""
+    """A copy in eval mode whose tensors are buffers outside of ``state_dict``."""
     copy = deepcopy(module).eval()
     for part in copy.modules():
         tensors = {**part._parameters, **part._buffers}
@@ -339,22 +338,12 @@ def frozen(module: M) -> M:
 
 
 def tone_weights(isp: DictionaryISP, name: str) -> Tensor:
-    """Weights ``(K,)`` of one tone curve of the ISP, by name.
-
-    Raises:
-        ValueError: if it has no such curve.
-    """
+    """Weights ``(K,)`` of one of the ISP's tone curves."""
     names = list(isp.info.get("tones", []))
     if isp.tone is None or name not in names:
         listed = ", ".join(names) or "none by name: its tone is learned"
         raise ValueError(f"tone {name!r} is no curve of this ISP, which has {listed}{nearest(name, names)}")
     return torch.eye(len(names))[names.index(name)]
-
-
-def _drop_isp(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Checkpoints of version 0.1 hold the ISP."""
-    for name in [name for name in state if name.startswith((f"{prefix}isp.", f"{prefix}baked."))]:
-        del state[name]
 
 
 def _require_finite(raw: Tensor) -> None:
@@ -369,11 +358,7 @@ def _float32(like: Tensor) -> torch.autocast:
 
 
 def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:
-    """The noise model that ``noise`` means for this ISP: ``"camera"`` is the law in its file, at any measured ISO.
-
-    Raises:
-        ValueError: if none were measured, or the name is unknown.
-    """
+    """The noise model that ``noise`` means for this ISP: ``"camera"`` is the law in its file, at any measured ISO."""
     if noise != "camera":
         return noise_model(noise)
     if "noise" not in isp.info:

@@ -1,12 +1,10 @@
 """A Dataset of sRGB pictures as a Dataset of RAW pairs, every draw keyed.
 
-Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone: first its
-crop, then one of eight flips and turns, then camera and noise. So the pairs are the same with any number of workers,
-any start method and any batch size.
+Sample i of epoch e comes from a generator seeded with BLAKE2b(seed, "pairs", e, i) alone: its crop, then one of eight
+flips and turns, then camera and noise. So the pairs do not depend on workers, start method or batch size.
 
-The epoch advances by itself: it is the number of times that picture i was asked for before (:mod:`rawaug.plugin.epochs`
-says why, and how a stream does it). ``set_epoch`` pins it instead: from then on the same index is the same pair, also
-after a resume in the middle of an epoch.
+The epoch advances by itself: it is the number of times that picture i was asked for before
+(:mod:`rawaug.plugin.epochs`). ``set_epoch`` pins it: from then on the same index is the same pair.
 """
 
 from __future__ import annotations
@@ -35,8 +33,8 @@ class RawPairs(Dataset[Any]):
     """Any Dataset of pictures as a Dataset of RAW pairs; of an iterable one it is a :class:`RawPairStream`.
 
     Args:
-        dataset: yields pictures (tensor, NumPy array or PIL picture, HWC or CHW, grey or RGBA too: see
-            :mod:`rawaug.plugin.pictures`), or tuples or mappings that have one. All other fields pass through.
+        dataset: yields pictures in any form that :mod:`rawaug.plugin.pictures` lists, or tuples or mappings that have
+            one. All other fields pass through.
         augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, for a
             :class:`RawAugment` of it with the default settings.
         crop: side of the square crop in pixels, or (height, width), even; None keeps whole pictures (made even by
@@ -139,7 +137,7 @@ class RawPairs(Dataset[Any]):
             raise IndexError(f"there is no picture {index}: the dataset has {len(self)}") from None
 
     def draw(self, index: int, generator: torch.Generator) -> Any:
-        """The pair of picture ``index`` with all that is random taken from ``generator``; counts no epoch."""
+        """The pair of picture ``index``, drawn from ``generator``; counts no epoch."""
         return self._paired(self.dataset[index], index, generator)
 
     def replay(self, index: int, params: AugmentParams) -> RawPair:
@@ -157,8 +155,7 @@ class RawPairs(Dataset[Any]):
         try:
             picture = even_sided(to_rgb_tensor(picked(sample, where)))
             place = random_place(picture, self.crop, self.turns, generator, self.zoom)
-            patch = placed(picture, place, self.crop)[None]
-            batch: RawPair = self.augment.apply(patch, self.augment.sample(patch, generator, place[None]))
+            batch = self.augment.make(placed(picture, place, self.crop)[None], generator, place[None])
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         pair = batch.map(lambda t: t[0])
@@ -234,12 +231,7 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
 
 
 def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment:
-    """A :class:`RawAugment`, or one of an ISP, its name or its path.
-
-    Raises:
-        TypeError: if it is something else.
-        FileNotFoundError: if there is no such ISP.
-    """
+    """The augmentation, or one of an ISP, its name or its path; TypeError for anything else."""
     if isinstance(augment, RawAugment):
         return augment
     if isinstance(augment, (DictionaryISP, str, Path)):
@@ -251,11 +243,7 @@ def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment
 
 
 def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
-    """Height and width of a crop that is given as a side or as both; None are whole pictures.
-
-    Raises:
-        ValueError: if it is odd, or neither.
-    """
+    """Height and width of a crop given as a side or as both; None for whole pictures. ValueError if odd."""
     if crop is None:
         return None
     sides = (crop, crop) if isinstance(crop, SupportsIndex) else tuple(crop) if isinstance(crop, Sequence) else ()
@@ -268,13 +256,7 @@ def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:
 def random_place(
     picture: Tensor, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
 ) -> Tensor:
-    """Position and turn of a crop of ``(3, H, W)``: ``(5,)`` top, left, height, width (H, W) and view.
-
-    With a zoom ``(6,)``: the last are the rows that are enlarged to the crop.
-
-    Raises:
-        ValueError: if the picture is smaller than the crop.
-    """
+    """Place of a crop of ``(3, H, W)``: ``(5,)`` top, left, H, W, view; with a zoom also the rows that are enlarged."""
     height, width = picture.shape[-2:]
     size = crop or (height, width)
     if crop and zoom > 1.0:
@@ -288,11 +270,7 @@ def random_place(
 
 
 def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tensor:
-    """The patch of a whole picture ``(3, H, W)`` at ``place``.
-
-    Raises:
-        ValueError: if the picture does not have the size it was drawn for.
-    """
+    """The patch of a whole picture ``(3, H, W)`` at ``place``; ValueError if the place is of another size."""
     top, left, height, width, view, rows = (*place.tolist(), 0)[:6]
     if picture.shape[-2:] != (height, width):
         raise ValueError(f"the parameters belong to a picture of {height} x {width}, got {tuple(picture.shape[-2:])}")
@@ -303,7 +281,7 @@ def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tens
 
 
 def _region(crop: tuple[int, int], rows: int) -> tuple[int, int]:
-    """Even height and width of what is enlarged to the crop, by its rows; 0 for the crop itself."""
+    """Even height and width of the ``rows`` that are enlarged to the crop; 0 rows for the crop itself."""
     return (rows, math.ceil(crop[1] * rows / crop[0] / 2) * 2) if rows else crop
 
 

@@ -1,21 +1,17 @@
-"""Each process of a distributed run its share of a DataLoader.
+"""Which epoch a draw belongs to, where nobody announces it; and a DataLoader's share of a distributed run.
 
-PyTorch divides nothing by itself, and Lightning and Fabric divide only what is a DataLoader, which a wrapped one is
-not. So the share is taken here, where the loader was left to choose its order: one that is sequential or shuffled over
-the whole dataset gets a ``DistributedSampler`` in its place, as Lightning does.
+A DataLoader does not tell its Dataset that a new pass begins. So draws are counted where they are made:
 
-The epoch that a draw belongs to, where nobody announces it.
-
-A DataLoader does not say to its Dataset that a new pass begins, neither in the main process nor in workers. So draws
-are counted where they are made:
-
-- of a picture with an index, ``epoch = number of earlier visits of this picture`` (:class:`Visits`). In a pass that
-  visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order;
-- of a stream, ``epoch = number of earlier passes``, of which each worker counts its own beginnings (:class:`Passes`).
+- of a picture with an index, the epoch is the number of earlier visits of this picture (:class:`Visits`): in a pass
+  that visits every picture once, visit k is epoch k, however many workers share the pass and in whatever order;
+- of a stream, it is the number of earlier passes, of which each worker counts its own (:class:`Passes`).
 
 The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
-by the one worker that has the picture, so no lock is needed, which no two start methods would share. ``pin`` replaces
-the count by a fixed epoch: a draw is then a pure function of (seed, epoch, index).
+by the one worker that has the picture, so no lock is needed. ``pin`` replaces the count by a fixed epoch: a draw is
+then a pure function of (seed, epoch, index).
+
+PyTorch does not divide a loader by itself, and Lightning and Fabric divide only a DataLoader, which a wrapped one is
+not. :func:`own_share` gives a loader that chose its own order, sequential or shuffled, a ``DistributedSampler``.
 """
 
 from __future__ import annotations
@@ -33,21 +29,13 @@ from rawaug.seeding import rank_key
 
 
 def world_size() -> int:
-    """Processes of the distributed run; 1 without one."""
+    """Number of distributed processes."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     return torch.distributed.get_world_size() if distributed else 1
 
 
 def own_share(loader: Any, seed: int) -> Any:
-    """The loader over the pictures of this process; itself, if it is divided already or cannot be.
-
-    A loader with a sampler or batch sampler that was passed to it, one of an iterable dataset, and what is no
-    DataLoader at all stay as they are.
-
-    Args:
-        loader: any loader.
-        seed: of the shuffled order, the same in every process.
-    """
+    """The loader over this process's pictures; the loader itself if its sampler was chosen or it is no DataLoader."""
     if world_size() == 1 or not isinstance(loader, DataLoader) or not _chose_its_order(loader):
         return loader
     shuffle = isinstance(loader.sampler, RandomSampler)
@@ -72,27 +60,13 @@ def _chose_its_order(loader: DataLoader[Any]) -> bool:
     return type(sampler) is SequentialSampler
 
 
-_COUNTED = -1
-"""The pinned epoch, where none is pinned."""
-
+_COUNTED = -1  # in place of a pinned epoch
 MAX_WORKERS = 128
-"""Workers of a loader whose passes can be counted."""
-
-
-MAX_COUNTED = 2**30
-"""Pictures of a dataset whose visits can be counted."""
+MAX_COUNTED = 2**30  # pictures
 
 
 def checked_epoch(epoch: SupportsIndex) -> int:
-    """An epoch, or the number of a batch, as an integer of 63 bits: what a shared counter holds.
-
-    Raises:
-        ValueError: if it is none.
-
-    Example:
-        >>> checked_epoch(3)
-        3
-    """
+    """The epoch (or batch number) as an int of 63 bits, which is what a shared counter holds."""
     if not isinstance(epoch, SupportsIndex) or not 0 <= index(epoch) < 2**63:
         raise ValueError(f"an epoch is an integer from 0 to 2^63 - 1, got {epoch!r}")
     return index(epoch)
@@ -115,11 +89,7 @@ class _Epochs:
         return None if epoch == _COUNTED else epoch
 
     def pin(self, epoch: int) -> None:
-        """All draws belong to ``epoch`` from now on.
-
-        Raises:
-            ValueError: if it is no epoch.
-        """
+        """All draws belong to ``epoch`` from now on."""
         self._pinned[0] = checked_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
@@ -142,14 +112,11 @@ class _Epochs:
 
 
 class Visits(_Epochs):
-    """Epochs of pictures that are asked for by index.
+    """Epochs of ``size`` pictures that are asked for by index.
 
-    A picture that is drawn with replacement counts each time. Which of two workers is first is then left to chance, and
-    at the same moment both may read the same count. A pass that is broken off counts what its workers had fetched
-    ahead. In a distributed run the processes take turns with a picture, so counted draws also have the rank as a key.
-
-    Args:
-        size: number of pictures.
+    A pass that is broken off counts what its workers had fetched ahead. A picture drawn with replacement counts each
+    time, in the order in which workers come to it. Distributed processes take turns with a picture, so counted draws
+    also have the rank as a key.
 
     Example:
         >>> visits = Visits(3)
@@ -161,7 +128,7 @@ class Visits(_Epochs):
         super().__init__(size)
 
     def key(self, index: int) -> tuple[int, ...]:
-        """Count a visit of picture ``index``; epoch, index and rank, which key its draw."""
+        """Count a visit of picture ``index``; return epoch, index and rank, which key its draw."""
         if self.pinned is not None:
             return (self.pinned, index)
         if index >= len(self._counts):
@@ -173,18 +140,11 @@ class Visits(_Epochs):
         return (visit, index, *self.rank())
 
     def state_dict(self) -> dict[str, Any]:
-        """The pinned epoch, and the visits of each picture.
-
-        Processes of a distributed run share one checkpoint, so there each picture has the number of passes.
-        """
+        """The pinned epoch, and each picture's visits; in a distributed run, which shares one state, the passes."""
         return {"epoch": self.pinned, "visits": self._shared_by_ranks(self._counts.clone())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``.
-
-        Raises:
-            ValueError: if it is none, or that of another number of pictures.
-        """
+        """Go on from ``state``; ValueError if it is not one of as many pictures."""
         visits = torch.as_tensor(state.get("visits", ()))
         if "visits" in state and visits.shape != self._counts.shape:
             raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
@@ -203,8 +163,8 @@ class Visits(_Epochs):
 class Passes(_Epochs):
     """Epochs of a stream: its passes, and where a resumed one goes on.
 
-    Worker w of W has a count of its own, in row W; the passes with other numbers of workers are those that their first
-    worker has begun. Row 0 is the main process.
+    Worker w of W counts in row W, column w; row 0 is the main process. Passes with another number of workers are those
+    that their first worker has begun.
 
     Example:
         >>> passes = Passes()
@@ -218,7 +178,7 @@ class Passes(_Epochs):
         self._running: tuple[int, int] | None = None  # in this process: the pass, and the number of the next sample
 
     def begin(self, workers: int, worker: int) -> tuple[int, int]:
-        """Count a pass of a worker; its epoch, and the number of the first sample."""
+        """Count a pass of a worker; return its epoch and the number of the first sample."""
         if workers > MAX_WORKERS:
             raise ValueError(f"a stream counts the passes of at most {MAX_WORKERS} workers, got {workers}")
         # Other rows alone: a sibling may be counting the same pass in this one.
@@ -231,7 +191,7 @@ class Passes(_Epochs):
         return (started if self.pinned is None else self.pinned), start
 
     def at(self, number: int) -> None:
-        """The sample that comes next in this process."""
+        """Sample ``number`` comes next in this process."""
         if self._running is not None:
             self._running = (self._running[0], number)
 
@@ -240,20 +200,15 @@ class Passes(_Epochs):
         self._running = None
 
     def state_dict(self) -> dict[str, Any]:
-        """The pinned epoch, the passes that are over, and the number of the next sample.
+        """The pinned epoch, the finished passes, and the number of the next sample.
 
-        Within a pass of this process it goes on with that sample. Of a pass that workers are in the middle of, the main
-        process does not know how far it has come: the state is then that of the next one.
+        The main process does not know how far its workers have come in a pass: the state is then that of the next pass.
         """
         started, position = self._running or (int(self._counts[:, 0].sum()), 0)
         return {"epoch": self.pinned, "passes": started, "position": position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``.
-
-        Raises:
-            ValueError: if it is none.
-        """
+        """Go on from ``state``."""
         self._check(state, "passes", "position")
         self._counts.zero_()
         self._counts[0, 0] = state["passes"]

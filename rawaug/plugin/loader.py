@@ -159,9 +159,7 @@ class WrappedLoader:
     def _pair(self, pictures: Any, generator: torch.Generator) -> RawPair:
         whole = even_sided(to_rgb_batch(pictures)) if self.crop is None else None
         srgb, place = (whole, None) if whole is not None else self._crops(pictures, generator)
-        srgb = srgb.to(self.device, non_blocking=True)
-        pair: RawPair = self.augment.apply(srgb, self.augment.sample(srgb, generator, place))
-        return pair
+        return self.augment.make(srgb.to(self.device, non_blocking=True), generator, place)
 
     def _crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """One crop of each picture ``(B, 3, crop, crop)``, and their places ``(B, 5)``."""

@@ -41,11 +41,7 @@ class AugmentParams(NamedTuple):
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
-        """The inverse of :meth:`tensors`.
-
-        Raises:
-            ValueError: if one is missing.
-        """
+        """The inverse of :meth:`tensors`; ValueError if one is missing."""
         missing = {"place", *(f"isp.{name}" for name in ISPParams._fields)} - set(tensors)
         if missing:
             raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
@@ -81,11 +77,7 @@ class RawPair(NamedTuple):
 
 
 def require_keys(keys: Sequence[str] | None) -> tuple[str, ...] | None:
-    """The keys of :meth:`RawPair.under`, checked.
-
-    Raises:
-        ValueError: if they are not 1 to 4 different names.
-    """
+    """The keys of :meth:`RawPair.under`; ValueError if they are not 1 to 4 different names."""
     if keys is None:
         return None
     named = () if isinstance(keys, str) else tuple(keys)

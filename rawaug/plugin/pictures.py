@@ -64,11 +64,7 @@ def to_rgb_batch(pictures: Any) -> Tensor:
 
 
 def stacked(images: Sequence[Tensor]) -> Tensor:
-    """Pictures ``(3, H, W)`` to ``(B, 3, H, W)``; where only some are 8 bits, all become float32.
-
-    Raises:
-        ValueError: if their sizes differ, or the list is empty.
-    """
+    """Pictures ``(3, H, W)`` of one size to ``(B, 3, H, W)``; where only some are 8 bits, all become float32."""
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
         named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
@@ -81,11 +77,7 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
 
 
 def even_sided(image: Tensor) -> Tensor:
-    """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2.
-
-    Raises:
-        ValueError: if nothing would be left.
-    """
+    """``(..., H, W)`` without its last row or column where a side is odd: a Bayer cell is 2 x 2."""
     height, width = image.shape[-2:]
     if min(image.shape[0], height // 2, width // 2) < 1:
         raise ValueError(f"a picture must be at least 2 x 2 and a batch must not be empty, got {tuple(image.shape)}")
@@ -124,7 +116,6 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
 
 def picked(sample: Any, where: Where) -> Any:
-    """The value at ``where``."""
     return sample if where is None else sample[where]
 
 

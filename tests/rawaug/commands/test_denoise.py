@@ -148,7 +148,11 @@ def test_a_tag_that_the_frame_contradicts_gives_way(wrong: float) -> None:
 
 def test_levels_are_estimated_without_a_profile() -> None:
     shot_var, read_var, noise_source = levels_of(gradient())
-    assert noise_source.startswith("estimate, R^2 0.9") and shot_var == pytest.approx(LEVELS[0], rel=0.1) and read_var < 4e-5
+    assert (
+        noise_source.startswith("estimate, R^2 0.9")
+        and shot_var == pytest.approx(LEVELS[0], rel=0.1)
+        and read_var < 4e-5
+    )
 
 
 def gradient() -> RawFrame:

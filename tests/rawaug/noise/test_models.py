@@ -276,4 +276,4 @@ def test_quantised_levels_lie_on_the_grid() -> None:
     noisy = model.apply(flat(32, 32), model.sample(len(LEVELS), generator(0)))
     numbers = noisy * 959
     assert torch.allclose(numbers, numbers.round(), atol=1e-3) and (numbers.round() == -1).any()
-    assert Quantisation(10, 64).quantum == 1 / 959
+    assert Quantisation(10, 64).quanta == [1 / 959]

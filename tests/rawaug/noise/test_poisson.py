@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy import stats
 
-from rawaug.noise.poisson import INVERSION_LIMIT, _walked, poisson
+from rawaug.noise.models import INVERSION_LIMIT, _walked, poisson
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 N = 400_000
