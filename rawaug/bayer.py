@@ -28,8 +28,7 @@ from torch.utils.data import get_worker_info
 
 X = TypeVar("X", bound=Tensor)
 
-N_VIEWS = 8
-"""Number of flips and quarter turns of a picture (the dihedral group of the square)."""
+N_VIEWS = 8  # flips and quarter turns of a picture: the dihedral group of the square
 
 
 class View(IntEnum):
@@ -104,11 +103,7 @@ def _require_channels(image: Tensor, channels: int, what: str) -> None:
 
 
 def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
-    """Mosaic ``(..., 1, H, W)`` to packed planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``.
-
-    Raises:
-        ValueError: if a side is odd, or the shape is not that of a mosaic.
-    """
+    """Mosaic ``(..., 1, H, W)`` to packed planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
     _require_channels(mosaic, 1, "a mosaic")
     _require_even(*mosaic.shape[-2:])
     plane = mosaic[..., 0, :, :]
@@ -171,13 +166,7 @@ def turn_back(image: Tensor, view: int) -> Tensor:
 
 
 def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
-    """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped.
-
-    Example:
-        >>> raw = torch.rand(1, 1, 8, 8)
-        >>> turn_keeping_cfa(raw, "RGGB", 1).shape  # mirrored, two columns fewer, RGGB still
-        torch.Size([1, 1, 8, 6])
-    """
+    """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped."""
     _require_even(*raw.shape[-2:])
     cfa = CFA(cfa)
     rows, columns = cfa.turned(view).shift_to(cfa)
@@ -205,11 +194,7 @@ def turn_packed(packed: Tensor, view: int) -> Tensor:
 
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
-    """Crop ``(..., H, W)`` without moving the pattern.
-
-    Raises:
-        ValueError: if the offset or the size is odd (the pattern would move), or the crop leaves the mosaic.
-    """
+    """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
     if top % 2 or left % 2 or height % 2 or width % 2:
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
     if min(top, left) < 0 or min(height, width) < 1 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
@@ -399,13 +384,8 @@ class Pattern:
         return (self.channels(height, width) == torch.arange(3)[:, None, None]).float()
 
     def mosaic(self, rgb: Tensor) -> Tensor:
-        """Full-colour ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``.
-
-        Raises:
-            ValueError: if the shape is not that of an RGB image.
-        """
-        if rgb.ndim < 3 or rgb.shape[-3] != 3:
-            raise ValueError(f"an RGB image must have shape (..., 3, H, W), got {tuple(rgb.shape)}")
+        """Full-colour ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``."""
+        _require_channels(rgb, 3, "an RGB image")
         index = self.channels(*rgb.shape[-2:]).to(rgb.device)
         return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
 
@@ -419,11 +399,7 @@ class Pattern:
         return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
 
     def crop(self, raw: X, top: int, left: int, height: int, width: int) -> Tensor:
-        """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size.
-
-        Raises:
-            ValueError: if the offset is none of whole cells, or the crop leaves the mosaic.
-        """
+        """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size."""
         if top % self.period or left % self.period:
             raise ValueError(f"offset ({top}, {left}) must be a multiple of {self.period} to keep {self.name}")
         inside = 0 <= top <= top + height <= raw.shape[-2] and 0 <= left <= left + width <= raw.shape[-1]
