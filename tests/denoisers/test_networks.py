@@ -63,7 +63,7 @@ def test_no_picture_depends_on_its_batch(make: Make) -> None:
     noisy, variance = pair(3, 4, 20, 24)
     model = awake(make())
     together = model(noisy, variance)
-    torch.testing.assert_close(model(noisy[1:2], variance[1:2]), together[1:2], rtol=0, atol=1e-5)
+    torch.testing.assert_close(model(noisy[1:2], variance[1:2]), together[1:2], rtol=1e-4, atol=1e-4)
 
 
 def test_the_noise_map_is_required_and_read(make: Make) -> None:
