@@ -1,5 +1,8 @@
-"""A file of weights gives the same network back, whole or not at all, and anything else is refused in one line."""
+"""Files of weights give the same network back; anything else is refused in one line; shipped ones have a card."""
 
+from __future__ import annotations
+
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -8,8 +11,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from denoisers import DENOISERS, build, load, save
-from denoisers.networks import UNet
+from denoisers import DENOISERS, UNet, build, from_pretrained, load, save
+from denoisers import files as pretrained
 
 SMALL: list[tuple[str, dict[str, Any]]] = [
     ("UNet", {"width": 4, "scales": 3, "variance_map": False}),
@@ -144,3 +147,47 @@ def test_the_file_has_the_rights_of_its_neighbours(tmp_path: Path) -> None:
     (tmp_path / "neighbour").write_text("")
     save(UNet(width=4, scales=1), tmp_path / "a.safetensors", {})
     assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "neighbour").stat().st_mode
+
+
+FIELDS = (
+    "Licence",
+    "Architecture",
+    "Training data",
+    "Command",
+    "Commit",
+    "Seed",
+    "SHA-256",
+    "Noise",
+    "Measured",
+    "Not good for",
+)
+"""Rows of the card, as the template in docs/model_card.md has them."""
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_name_or_a_path_gives_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    model = UNet(width=4, scales=2, seed=3)
+    save(model, tmp_path / "tiny.safetensors", {})
+    for name in ("tiny", tmp_path / "tiny.safetensors"):
+        loaded = from_pretrained(name)
+        assert not loaded.training
+        assert all(torch.equal(a, b) for a, b in zip(loaded.parameters(), model.parameters(), strict=True))
+    with pytest.raises(FileNotFoundError, match=r"huge: no such denoiser; give .* a shipped one \(tiny\)"):
+        from_pretrained("huge")
+
+
+@pytest.mark.parametrize("name", pretrained.shipped())
+def test_every_shipped_denoiser_has_its_card(name: str) -> None:
+    weights = pretrained.FOLDER / f"{name}.safetensors"
+    card = weights.with_suffix(".md").read_text(encoding="utf-8")
+    assert [field for field in FIELDS if f"| {field} |" not in card] == []
+    assert hashlib.sha256(weights.read_bytes()).hexdigest() in card
+    assert weights.stat().st_size < 6e6 or name != pretrained.DEFAULT
+    assert "TODO" not in card
+
+
+def test_the_template_has_every_field() -> None:
+    template = (ROOT / "docs/model_card.md").read_text(encoding="utf-8")
+    assert [field for field in FIELDS if f"| {field} |" not in template] == []

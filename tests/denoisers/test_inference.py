@@ -1,0 +1,310 @@
+"""Around a denoiser: tiles are as good as the whole, self-ensemble keeps the CFA, recorrupted copies are averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from denoisers import DnCNN, SelfEnsemble, UNet, tiled
+from denoisers.inference import Recorrupted, _pieces, from_view, to_view
+from rawaug import bayer
+
+
+def pair(*shape: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(shape, generator=generator), torch.rand(shape, generator=generator) * 1e-2
+
+
+def awake(model: DnCNN | UNet) -> DnCNN | UNet:
+    model.initialise(3)
+    return model.eval()
+
+
+@given(
+    size=st.integers(2, 400),
+    stride=st.sampled_from([1, 4, 16]),
+    tile=st.integers(3, 8),
+    overlap=st.integers(0, 3),
+)
+@settings(max_examples=200, deadline=None)
+def test_starts_are_aligned_and_leave_no_gap(size: int, stride: int, tile: int, overlap: int) -> None:
+    tile, overlap = tile * stride, min(overlap, (tile - 1) // 2) * stride
+    starts, side = _pieces(size, tile, overlap, stride)
+    assert side <= tile and side % stride == 0 and side > 2 * overlap
+    assert starts[0] == 0 and all(start % stride == 0 for start in starts)
+    assert starts[-1] + side >= size and (starts == [0] or size - starts[-1] > side - stride)
+    # The part of a tile that is kept begins where the one before still had its context.
+    assert all(b + overlap <= a + side - overlap for a, b in pairwise(starts))
+    assert starts == sorted(set(starts))
+
+
+@pytest.mark.parametrize("size", [(70, 41), (33, 90), (16, 16), (7, 100), (2, 2)])
+def test_convolutions_are_seamless(size: tuple[int, int]) -> None:
+    model = awake(DnCNN(width=6, depth=5, batch_norm=False))
+    noisy, variance = pair(2, 4, *size)
+    whole = model(noisy, variance)
+    assert (tiled(model, noisy, variance, tile=24, overlap=5) - whole).abs().max() < 1e-5
+    assert min(size) < 24 or (tiled(model, noisy, variance, tile=24, overlap=2) - whole).abs().max() > 1e-4
+
+
+def test_no_seam_at_any_size_around_that_of_a_tile() -> None:
+    model = awake(DnCNN(width=4, depth=3, batch_norm=False))
+    with torch.no_grad():
+        for side in range(2, 40):  # tiles of 16 with an overlap of 3: one tile, just more than one, up to four
+            noisy, variance = pair(1, 4, side, 5)
+            for turned in (lambda x: x, lambda x: x.transpose(-1, -2)):
+                whole = model(turned(noisy), turned(variance))
+                pieces = tiled(model, turned(noisy), turned(variance), tile=16, overlap=3)
+                assert (pieces - whole).abs().max() < 1e-5, f"a seam at a side of {side}"
+
+
+@pytest.mark.parametrize("side", [383, 384, 385, 387, 400, 513, 640, 2000])
+def test_equal_tiles_are_no_more_than_needed(side: int) -> None:
+    starts, length = _pieces(side, 384, 64, 16)
+    assert len(starts) == max(1, -(-(side - 128) // 256))
+    assert len(starts) == 1 or len(starts) * (length - 128) - (side - 128) < 16 * len(starts)
+
+
+@pytest.mark.parametrize("size", [(100, 61), (64, 128), (35, 30), (63, 65), (80, 81), (129, 127)])
+def test_pooling_grids_fall_together(size: tuple[int, int]) -> None:
+    model = awake(UNet(width=4, scales=2))  # receptive radius below 24
+    noisy, variance = pair(1, 4, *size)
+    whole = model(noisy, variance)
+    assert (tiled(model, noisy, variance, tile=64, overlap=24) - whole).abs().max() < 1e-5
+
+
+def test_every_piece_is_at_most_a_tile_and_no_gradient_is_kept() -> None:
+    sizes = []
+
+    class Note(nn.Module):
+        def forward(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
+            assert variance is None and not torch.is_grad_enabled()
+            sizes.append(tuple(noisy.shape[-2:]))
+            return noisy
+
+    noisy, _ = pair(1, 4, 300, 130)
+    assert torch.equal(tiled(Note(), noisy.requires_grad_(), tile=64, overlap=8), noisy)
+    assert set(sizes) == {(64, 54)}  # seven equal tiles by three
+
+
+def test_tiles_of_an_ensemble_align_with_its_network() -> None:
+    noisy, variance = pair(1, 4, 40, 56)
+    ensemble = SelfEnsemble(UNet(width=4, scales=3), "RGGB")
+    assert torch.equal(tiled(ensemble, noisy, variance, tile=32, overlap=8), noisy)
+    with pytest.raises(ValueError, match="multiples of the model's stride 4"):
+        tiled(ensemble, noisy, variance, tile=32, overlap=6)
+
+
+def test_a_tile_is_at_least_two_strides() -> None:
+    with pytest.raises(ValueError, match="tile must be at least 16"):
+        tiled(UNet(width=4, scales=4), torch.zeros(1, 4, 17, 17), tile=8, overlap=0)
+
+
+@pytest.mark.parametrize("overlap", [-1, 16, 20])
+def test_an_overlap_that_leaves_nothing_is_refused(overlap: int) -> None:
+    with pytest.raises(ValueError, match="less than half the tile"):
+        tiled(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)
+
+
+def test_tiles_are_gone_through_one_by_one_for_whoever_counts() -> None:
+    seen, noisy = [], torch.rand(1, 4, 100, 60)
+
+    def each(parts: Sequence[Any]) -> Iterator[Any]:
+        for part in parts:
+            yield part
+            seen.append(len(parts))
+
+    assert torch.equal(tiled(lambda y, _: y, noisy, tile=64, overlap=8, each=each), noisy)
+    assert seen == [2, 2]
+    SelfEnsemble(lambda y, _: y, "RGGB", each=each)(noisy)
+    assert len(seen) > 4 and set(seen[2:]) == {len(seen) - 2}
+
+
+CFAS = list(bayer.CFA)
+SIZES = [(6, 6), (5, 8), (2, 3)]
+
+
+def picture(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) - 0.1
+
+
+def identity(noisy: Tensor, variance: Tensor | None) -> Tensor:
+    return noisy
+
+
+@given(
+    cfa=st.sampled_from(CFAS),
+    views=st.sampled_from([4, 8]),
+    height=st.integers(2, 9),
+    width=st.integers(2, 9),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_identity_to_the_last_bit(cfa: bayer.CFA, views: int, height: int, width: int, seed: int) -> None:
+    noisy = picture(2, 4, height, width, seed=seed)
+    assert torch.equal(SelfEnsemble(identity, cfa, views)(noisy), noisy)
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+@pytest.mark.parametrize("view", range(8))
+def test_a_view_shows_the_turned_scene_through_the_same_cfa(cfa: bayer.CFA, view: int) -> None:
+    # A scene whose colours differ in size: red 10, green 20, blue 30, plus small detail.
+    rgb = torch.tensor([10.0, 20.0, 30.0]).reshape(1, 3, 1, 1) + picture(1, 3, 12, 16)
+    seen = to_view(bayer.pack_rgb(rgb, cfa), cfa, view)
+    assert torch.equal((seen / 10).round(), torch.tensor([1.0, 2.0, 2.0, 3.0]).reshape(4, 1, 1).expand_as(seen))
+    # Inside the added lines it is the mosaic of the turned scene.
+    mosaic = bayer.unpack(seen, cfa)
+    turned = bayer.turn(bayer.mosaic(rgb, cfa), view)
+    rows, columns = ((a - b) // 2 for a, b in zip(mosaic.shape[-2:], turned.shape[-2:], strict=True))
+    assert torch.equal(mosaic[..., rows : rows + turned.shape[-2], columns : columns + turned.shape[-1]], turned)
+    # The lines themselves are the second next to the edge: the nearest that has their colours.
+    for added, axis in ((rows, -2), (columns, -1)):
+        lines = [mosaic.select(axis, k) for k in (0, 2, -1, -3)]
+        assert not added or (torch.equal(lines[0], lines[1]) and torch.equal(lines[2], lines[3]))
+    assert torch.equal(from_view(seen, cfa, view), bayer.pack_rgb(rgb, cfa))
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+@pytest.mark.parametrize("size", SIZES)
+def test_planes_are_never_mixed(cfa: bayer.CFA, size: tuple[int, int]) -> None:
+    gains = torch.tensor([2.0, 3.0, 5.0, 7.0]).reshape(4, 1, 1)
+    noisy = picture(2, 4, *size)
+    torch.testing.assert_close(SelfEnsemble(lambda y, _: gains * y, cfa, 4)(noisy), gains * noisy)
+    # A quarter turn makes the green of the red row that of the blue row: half of the eight views use the other's gain.
+    expected = torch.tensor([2.0, 4.0, 4.0, 7.0]).reshape(4, 1, 1) * noisy
+    torch.testing.assert_close(SelfEnsemble(lambda y, _: gains * y, cfa, 8)(noisy), expected)
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+@pytest.mark.parametrize("views", [4, 8])
+def test_a_place_dependent_model_meets_every_turned_place(cfa: bayer.CFA, views: int) -> None:
+    def ramp(y: Tensor, _: Tensor | None) -> Tensor:  # brighter to the right, in lines of the mosaic from the middle
+        mosaic = bayer.unpack(y, cfa)
+        column = torch.arange(mosaic.shape[-1]) - (mosaic.shape[-1] - 1) / 2
+        return bayer.pack(mosaic * column, cfa)
+
+    noisy = picture(1, 4, 5, 5)
+    once = ramp(noisy, None)
+    # Mirrored views see the column with its sign turned, so the mean over the flips vanishes; so does that over turns.
+    assert once.abs().mean() > 0.5
+    torch.testing.assert_close(SelfEnsemble(ramp, cfa, views)(noisy), torch.zeros_like(noisy), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+def test_an_equivariant_model_is_left_unchanged(cfa: bayer.CFA) -> None:
+    def blur(y: Tensor, _: Tensor | None) -> Tensor:  # each site with its four neighbours of the same colour
+        mosaic = nn.functional.pad(bayer.unpack(y, cfa), (2, 2, 2, 2), mode="reflect")
+        cross = mosaic[..., :-4, 2:-2] + mosaic[..., 4:, 2:-2] + mosaic[..., 2:-2, :-4] + mosaic[..., 2:-2, 4:]
+        return bayer.pack(mosaic[..., 2:-2, 2:-2] / 2 + cross / 8, cfa)
+
+    noisy = picture(2, 4, 6, 7)
+    away_from_edges = (..., slice(2, -2), slice(2, -2))
+    mean = SelfEnsemble(blur, cfa)(noisy)
+    torch.testing.assert_close(mean[away_from_edges], blur(noisy, None)[away_from_edges])
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+def test_the_variance_map_is_turned_alike(cfa: bayer.CFA) -> None:
+    noisy, variance = picture(2, 4, 5, 6), picture(2, 4, 5, 6, seed=1)
+
+    def multiply(y: Tensor, v: Tensor | None) -> Tensor:
+        assert v is not None
+        return y * v
+
+    product = SelfEnsemble(multiply, cfa)(noisy, variance)
+    torch.testing.assert_close(product, noisy * variance)
+
+
+@pytest.mark.parametrize("cfa", CFAS)
+@pytest.mark.parametrize("views", [4, 8])
+def test_views_of_one_shape_share_a_batch(cfa: bayer.CFA, views: int) -> None:
+    shapes = []
+
+    def note(y: Tensor, _: Tensor | None) -> Tensor:
+        shapes.append(y.shape)
+        return y
+
+    SelfEnsemble(note, cfa, views)(picture(3, 4, 6, 6))
+    assert len(shapes) == 4  # each side with and without the added lines
+    assert sum(batch[0] for batch in shapes) == 3 * views
+
+
+def test_a_network_with_a_noise_map_passes_and_bad_settings_are_refused() -> None:
+    noisy = picture(1, 4, 9, 12)
+    ensemble = SelfEnsemble(UNet(width=4, scales=2), "GRBG")
+    assert torch.equal(ensemble(noisy, torch.full_like(noisy, 1e-3)), noisy)
+    assert ensemble.stride == 2
+    with pytest.raises(ValueError, match="views must be 4"):
+        SelfEnsemble(identity, "RGGB", views=2)
+    with pytest.raises(ValueError, match="not a Bayer pattern"):
+        SelfEnsemble(identity, "RGBG")
+
+
+SHOT_VAR, READ_VAR, ALPHA = 2e-3, 1e-4, 0.5
+
+
+def frame() -> tuple[Tensor, Tensor]:
+    noisy = 0.2 + 0.3 * torch.rand(1, 4, 64, 64, generator=torch.Generator().manual_seed(0))
+    return noisy, SHOT_VAR * noisy + READ_VAR
+
+
+def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
+    noisy, variance = frame()
+    seen: list[tuple[Tensor, Tensor]] = []
+
+    def network(image: Tensor, noise_map: Tensor | None = None) -> Tensor:
+        assert noise_map is not None
+        seen.append((image, noise_map))
+        return image
+
+    Recorrupted(network, ALPHA, draws=2)(noisy, variance)
+    (whole, whole_map), (first, first_map), (second, _) = seen
+    assert torch.equal(whole, noisy) and torch.equal(whole_map, variance), "the signal, where the noise is drawn"
+    added = (first - noisy) / (ALPHA * variance.sqrt())
+    assert float(added.mean()) == pytest.approx(0.0, abs=0.03) and float(added.std()) == pytest.approx(1.0, abs=0.03)
+    torch.testing.assert_close(first_map, (1 + ALPHA**2) * (SHOT_VAR * first + READ_VAR), rtol=1e-3, atol=1e-7)
+    assert not torch.equal(first, second)
+
+
+def test_the_average_of_many_is_that_of_the_network_over_the_noise() -> None:
+    """Of y^2 it is y^2 plus the variance of what was added, which is that at y^2: one draw is far from it, and the
+    draws are a mean."""
+    noisy, variance = frame()
+    expected = noisy**2 + ALPHA**2 * (SHOT_VAR * noisy**2 + READ_VAR)
+
+    def error(draws: int) -> float:
+        return float((Recorrupted(lambda z, _: z**2, ALPHA, draws)(noisy, variance) - expected).square().mean())
+
+    assert error(64) == pytest.approx(error(1) / 64, rel=0.3)
+
+
+def test_in_shadows_the_extra_noise_does_not_follow_the_noise() -> None:
+    """Drawn with the variance at the noisy value, bright readings would get more of it than dark ones."""
+    clean, shot_var, read_var = torch.full((1, 4, 128, 128), 0.02), 8e-3, 3e-4
+    deviation = (shot_var * 0.02 + read_var) ** 0.5
+    noisy = clean + deviation * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    seen: list[Tensor] = []
+
+    def perfect(image: Tensor, noise_map: Tensor | None) -> Tensor:
+        seen.append(image)
+        return clean
+
+    Recorrupted(perfect, ALPHA, draws=4)(noisy, shot_var * noisy.clamp_min(0.0) + read_var)
+    added = (torch.stack(seen[1:]) - noisy) / (ALPHA * deviation)
+    for side in (noisy > clean, noisy < clean):
+        assert added.square().mean(0)[side].mean().item() == pytest.approx(1.0, abs=0.03)
+
+
+def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
+    noisy, variance = frame()
+    average = Recorrupted(lambda z, _: z, ALPHA, 3)
+    assert torch.equal(average(noisy, variance), average(noisy, variance))
+    with pytest.raises(ValueError, match=r"draws must be at least 1 and alpha positive, got 0 and 0\.5"):
+        Recorrupted(lambda z, _: z, ALPHA, 0)
