@@ -7,7 +7,8 @@ pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture 
 with its own noise. *cycleisp* is its network from sRGB to RAW alone, and *unbaked* the ISP's own reverse pass, each on
 one small crop whose time is scaled by pixels, in the network's favour. *copy* turns bytes into as many floats as are
 made of them, and does no more; *kornia* flips and rotates float pictures, as users of a GPU do anyway; *drawn before*
-is rawaug without the draw of its parameters. All are timed in turn, and the fastest run of each counts.
+is rawaug without the draw of its parameters; *forward* is the way back from demosaiced RAW to sRGB. All are timed in
+turn, and the fastest run of each counts.
 
 The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
 as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
@@ -30,6 +31,7 @@ from torch import Tensor
 from benchmarks.measure import arguments, fastest, finish, memory_used, seconds, sized, start
 from rawaug import bayer
 from rawaug.data.demo.pairs import demo_photographs
+from rawaug.isp.fast import FastForward
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper.baselines.cycleisp import CycleISP
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
@@ -93,6 +95,8 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
     network, ours = network.to(device), augmentations(device)
     augment, floats = ours["rawaug"], batch / 255.0
     drawn = augment.sample(batch)
+    develop, colour = FastForward(isp).to(device), floats.square()
+    own, one = augment.sample(batch[:1]).isp, small[:, 0].numel()
     crop = floats[:1, :, :NETWORK_CROP, :NETWORK_CROP].contiguous()
 
     def unbaked() -> object:
@@ -105,10 +109,12 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
     }
     return runs | {
         "rawaug, drawn before": (lambda: augment.apply(batch, drawn), pixels),
+        "forward": (lambda: develop(colour, drawn.isp), pixels),
+        "forward, unbaked": (lambda: isp.forward_pixels(colour[:1, ..., :UNBAKED_CROP, :UNBAKED_CROP], own), one),
         "copy": (lambda: batch.float(), pixels),
         "kornia": (lambda: turned(floats), pixels),
         "upi": (lambda: [published_upi(picture[None], generator) for picture in floats], pixels),
-        "unbaked": (unbaked, small[:, 0].numel()),
+        "unbaked": (unbaked, one),
         "cycleisp": (lambda: network(crop), crop[:, 0].numel()),
     }
 
@@ -127,7 +133,7 @@ def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, flo
     best = dict.fromkeys(runs, float("inf"))
     for round_ in range(repeats):
         for name, (run, _) in runs.items():
-            if name in ("cycleisp", "unbaked") and round_ >= 3:
+            if name in ("cycleisp", "unbaked", "forward, unbaked") and round_ >= 3:
                 continue
             time.sleep(0.02)  # PyTorch's threads spin on for a while after the method before
             best[name] = min(best[name], seconds(run, batch.device))

@@ -153,7 +153,7 @@ class _Run:
             isp.info["key"] = sha256(weights)
             return isp
         path = self.folder / f"seed{seed}" / "isp.safetensors"
-        settings = {**self.recipe.isp.key(), "seed": seed}
+        settings = {**asdict(self.recipe.isp), "seed": seed}
         measure = self.recipe.noise == "camera"
         key = fingerprint("isp", settings, stamps(self.pairs), measure, self.recipe.self_supervised)
         if path.is_file():

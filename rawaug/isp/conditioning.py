@@ -42,9 +42,6 @@ def with_white_balance(
         params: chosen parameters.
         white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as in the file; scaled to green 1.
         digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
-
-    Raises:
-        ValueError: if a shape is another, or a gain is not positive.
     """
     batch = len(params.gains)
     if white_balance is not None:
@@ -79,7 +76,7 @@ def _in_light(isp: StagedISP, params: ISPParams, balance: Tensor) -> ISPParams:
 def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
     """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
 
-    Readings at or above 0.98 are left out (clipped); a channel without any reading keeps its gain.
+    Clipped readings are left out; a channel without any reading keeps its gain.
 
     Args:
         isp: whose reverse pass is used.
@@ -87,9 +84,6 @@ def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: 
         params: chosen parameters.
         raw_samples: ``(B, K, 3)`` of (row, column, value).
         place: coordinates of the pixels, ``(1 or B, 2, H, W)``.
-
-    Raises:
-        ValueError: if ``raw_samples`` has another shape or a place outside the picture.
     """
     _require_places(raw_samples, x)
     rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
@@ -108,8 +102,7 @@ def with_readings(
 
     Args:
         isp: whose reverse pass is used.
-        pixels: sRGB ``(B, 3, 1, K)``, float.
-        where: their coordinates ``(1 or B, 2, 1, K)``.
+        pixels, where: sRGB ``(B, 3, 1, K)``, float, and its coordinates ``(1 or B, 2, 1, K)``.
         own: ``(B, 3, K)`` 1 in the channel that is read, else 0.
         value: the readings ``(B, K)``.
         params: chosen parameters.

@@ -1,4 +1,4 @@
-r"""The fitted reverse pass as a table and a matrix: the same RAW, dozens of times faster.
+r"""The fitted passes as a table and a matrix each: the same RAW and the same sRGB, dozens of times faster.
 
 ``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``
 
@@ -7,6 +7,9 @@ trilinear interpolation (65 nodes a side: above 75 dB against the network). Colo
 numbers a picture, and the mask is a function of the coordinates. Every site computes its own colour alone, which the
 mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
 has a table of its own.
+
+The forward pass, of camera colour that is demosaiced already, is ``x = T'(sqrt(pinv(C) diag(g) x5 / G(p) A'))``, with
+the forward network and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
 
 The encoders' choice of a setting is made cheap as well. They look at the N images that the atoms make of one picture,
 which are linear in a few maps,
@@ -33,13 +36,15 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, node_colours
-from rawaug.isp.tone import STEPS
+from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest, runtime
-from rawaug.kernels.reference import Camera, look_up, unprocess
+from rawaug.kernels.reference import Camera, Display, look_up, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
+CURVE_NODES = 4097
+"""Nodes of an inverted tone curve, over the root of linear light."""
 
 
 class BakedISP(nn.Module):
@@ -64,10 +69,8 @@ class BakedISP(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
+        _require_usual_order(isp)
         self.config = isp.config
-        if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
-            order = " ".join(self.config.stages)
-            raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
         cube = node_colours(nodes)
         tables = Tables(cube, cube)
@@ -116,18 +119,8 @@ class BakedISP(nn.Module):
         return torch.cat(rgb, dim=1)
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
-        batch, _, height, width = srgb.shape
         table = self.table
-        made = BatchParams(
-            torch.eye(3).to(table).expand(batch, 3, 3),
-            torch.ones(batch, 1, 3).to(table),
-            table.new_zeros(batch, 6),
-            table.new_empty(batch, 0),
-            table.new_empty(0),
-        )
-        for stage in self.stages:
-            made = cast(Stage, stage).adjust(made, params, place, (height, width))
-        matrix, floor, frame, curves, shading = made
+        matrix, floor, frame, curves, shading = _batch_params(self.stages, srgb, params, place, table)
         if curves.numel():
             table = table[:0]
             curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
@@ -135,6 +128,93 @@ class BakedISP(nn.Module):
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
         knee, where = self.config.knee, torch.tensor(sites)
         return Camera(table, curves, self.attention, colour, knee, frame, shading, where)
+
+
+class FastForward(nn.Module):
+    """The forward pass of an ISP as it is now, after demosaicing; later changes of the ISP do not reach it.
+
+    Args:
+        isp: the fitted ISP, its stages in the usual order (any may be left out).
+        nodes: of the table along an axis, where tone is a network.
+
+    Raises:
+        ValueError: if the stages are in another order.
+
+    Example:
+        >>> isp = DictionaryISP.from_pretrained("universal")
+        >>> develop, raw = FastForward(isp), torch.rand(2, 1, 32, 32)
+        >>> setting = isp.draw_setting(2, torch.Generator().manual_seed(0))
+        >>> develop(bayer.demosaic(raw, isp.cfa), setting).shape
+        torch.Size([2, 3, 32, 32])
+    """
+
+    table: Tensor
+    attention: Tensor
+
+    def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
+        super().__init__()
+        _require_usual_order(isp)
+        self.stages = nn.ModuleList(deepcopy(isp.ordered_stages)).requires_grad_(False)
+        cube = node_colours(nodes)
+        tables = Tables(cube, cube.square())
+        with torch.no_grad(), one_thread(), torch.autocast(isp.gain.log_gains.device.type, enabled=False):
+            for stage in reversed(isp.ordered_stages):
+                tables = stage.bake_forward(tables)
+            attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
+        self.register_buffer("table", _as_table(tables.x2, nodes))
+        self.register_buffer("attention", attention)
+
+    def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
+        """Linear camera RGB ``(B, 3, H, W)``, x5, to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
+
+        Light above white is clipped before tone, as RAW developers do; the ISP's own pass clips sRGB alone.
+        Differentiable with respect to ``linear`` and to the matrix and gains of ``params``.
+
+        Args:
+            linear: demosaiced RAW, black 0 and white 1.
+            params: camera settings.
+            place: as :class:`BakedISP` takes it.
+
+        Raises:
+            ValueError: if the shape is not ``(B, 3, H, W)``, or ``params`` are for another batch size.
+        """
+        _require_batch(linear, params, place)
+        display, linear = self._display(linear, params, place), linear.float()
+        learning = linear.requires_grad or display.matrix.requires_grad
+        if linear.device.type != "cpu" or not runtime.has_numba() or (learning and torch.is_grad_enabled()):
+            return render(linear, display)
+        return fastest("render", linear, display, otherwise=lambda: render(linear, display))
+
+    def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
+        matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)
+        table = self.table[:0] if curves.numel() else self.table
+        if curves.numel():
+            light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
+            curves = to_code(light, curves)[:, 0, 0]
+        return Display(table, curves, self.attention, torch.linalg.pinv(matrix) / floor, frame, shading)
+
+
+def _require_usual_order(isp: DictionaryISP) -> None:
+    if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
+        order = " ".join(isp.config.stages)
+        raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
+
+
+def _batch_params(
+    stages: nn.ModuleList, image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
+) -> BatchParams:
+    """What the stages need of the settings of these pictures."""
+    batch, _, height, width = image.shape
+    made = BatchParams(
+        torch.eye(3).to(table).expand(batch, 3, 3),
+        torch.ones(batch, 1, 3).to(table),
+        table.new_zeros(batch, 6),
+        table.new_empty(batch, 0),
+        table.new_empty(0),
+    )
+    for stage in stages:
+        made = cast(Stage, stage).adjust(made, params, place, (height, width))
+    return made
 
 
 def _pass(srgb: Tensor, camera: Camera, white: float) -> Tensor:

@@ -281,7 +281,11 @@ class Stage(nn.Module, ABC):
 
     @abstractmethod
     def bake(self, tables: Tables) -> Tables:
-        """The tables with what this stage does to every picture alike."""
+        """The tables of the reverse pass with what this stage does to every picture alike."""
+
+    def bake_forward(self, tables: Tables) -> Tables:
+        """The tables of the forward pass, whose ``x2`` becomes sRGB, likewise."""
+        return tables._replace(x2=self.forward(tables.x2, None)) if self.makes <= 2 else tables
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         """``batch`` with what this stage does to these pictures.
@@ -465,6 +469,11 @@ class LensShading(Stage):
     def bake(self, tables: Tables) -> Tables:
         return (
             tables if self.reverse_attention is None else tables._replace(attention=self.reverse_attention(tables.cube))
+        )
+
+    def bake_forward(self, tables: Tables) -> Tables:
+        return (
+            tables if self.forward_attention is None else tables._replace(attention=self.forward_attention(tables.cube))
         )
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:

@@ -1,10 +1,10 @@
 """The universal ISP, from published figures alone: ``python -m rawaug.isp.universal --out universal.safetensors``.
 
 Colour atoms are chosen greedily among the published cameras (:mod:`rawaug.isp.dictionary`), so that their hull holds
-as many
-of all of them as it can on the colours of the package's photographs. Tone atoms are the published curves, or as many of
-them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a picture's
-setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and light.
+as many of all of them as it can on the colours of the package's photographs. Tone atoms are the published curves, or
+as many of them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a
+picture's setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and
+light.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera
+from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compiled, over_rows, part
 
 _TILE = 256  # cells of RAW that are worked on at a time
@@ -62,6 +62,21 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     settings = (scale, table, codes, curves, attention, colour, knee, frame, shading, sites, ceiling)
     over_rows(batch * height, width, lambda start, stop: _raw_rows(picture, *settings, out, start, stop))
     return raw
+
+
+def render(linear: Tensor, display: Display) -> Tensor:
+    """Camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
+    srgb = torch.empty_like(linear, memory_format=torch.contiguous_format)
+    batch, _, height, width = linear.shape
+    if not srgb.numel():
+        return srgb
+    x5, out = linear.detach().contiguous().numpy(), srgb.numpy()
+    table, curves, attention, matrix, frame, shading = (
+        value.detach().contiguous().numpy() if value.numel() else None for value in display
+    )
+    settings = (table, curves, attention, matrix, frame, shading)
+    over_rows(batch * height, 3 * width, lambda start, stop: _srgb_rows(x5, *settings, out, start, stop))
+    return srgb
 
 
 def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
@@ -265,6 +280,72 @@ def _raw_rows(  # type: ignore[no-untyped-def]
                     _attend(x4, channel, attention, nodes, shares, attended, white, out)
                 else:
                     _develop(x2[column], colour[b], channel, knee, mask, white, out)
+
+
+@part
+def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
+    """The root of one channel of x2, held to [0, 1], of x4 ``(3, n)``."""
+    for j in range(len(out)):
+        y = c0 * x[0, j] + c1 * x[1, j] + c2 * x[2, j]
+        y = y if y > _ZERO else _ZERO
+        y = y if y < _ONE else _ONE
+        out[j] = np.sqrt(y)
+
+
+@part
+def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
+    """Values of a curve ``(T,)`` at one channel, in [0, 1], of a row."""
+    last = np.int32(len(curve) - 2)
+    scale = np.float32(len(curve) - 1)
+    for j in range(len(out)):
+        nodes[j], shares[j] = _cell_of(root[j], scale, last)
+    for j in range(len(out)):
+        a = np.uint32(nodes[j])
+        out[j] = curve[a] + (curve[a + np.uint32(1)] - curve[a]) * shares[j]
+
+
+@compiled
+def _srgb_rows(  # type: ignore[no-untyped-def]
+    linear, table, curves, attention, matrix, frame, shading, srgb, start, stop,
+):  # fmt: skip
+    """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
+    height, width = linear.shape[2], linear.shape[3]
+    nodes, shares = np.empty(_TILE, np.int32), np.empty((3, _TILE), np.float32)
+    x, root, mask = np.empty((3, _TILE), np.float32), np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
+    found, half = np.empty((2, 3, _TILE), np.float32), np.ones(6, np.float32)
+    half[4:] = np.float32(0.5)  # the mask is made for every second pixel
+    for row in range(start, stop):
+        b, i = divmod(row, height)
+        for first in range(0, width, _TILE):
+            last = min(first + _TILE, width)
+            n = last - first
+            for c in range(3):
+                x[c, :n] = linear[b, c, i, first:last]
+            if shading is not None:
+                _fall_off(frame[b] * half, i, 2 * first, shading, mask[:n])
+                for c in range(3):
+                    for j in range(n):
+                        x[c, j] /= mask[j]
+            if attention is not None:
+                _look_up(
+                    x[0, :n], x[1, :n], x[2, :n], np.float32(len(attention) - 1), attention, nodes, shares, 0, found
+                )
+                for c in range(3):
+                    for j in range(n):
+                        x[c, j] *= found[0, 0, j]
+            for c in range(3):
+                _root(x, matrix[b, c, 0], matrix[b, c, 1], matrix[b, c, 2], root[c, :n])
+            if curves is not None:
+                for c in range(3):
+                    _at_curve(root[c, :n], curves[b], nodes, shares[0], srgb[b, c, i, first:last])
+            if table is not None:
+                scale = np.float32(len(table) - 1)
+                _look_up(root[0, :n], root[1, :n], root[2, :n], scale, table, nodes, shares, 0, found)
+                for c in range(3):
+                    for j in range(n):
+                        y = found[0, c, j]
+                        y = y if y > _ZERO else _ZERO
+                        srgb[b, c, i, first + j] = y if y < _ONE else _ONE
 
 
 @part

@@ -126,6 +126,38 @@ def _take(curves: Tensor, index: Tensor) -> Tensor:
     return torch.stack(taken).reshape(index.shape) if taken else curves.new_empty(index.shape)
 
 
+class Display(NamedTuple):
+    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures.
+
+    Args:
+        table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
+        curves: ``(B, T)`` sRGB code over the root of x2, one curve a picture for all of its channels; or empty.
+        attention: of the same form as ``table``, a gain in the first of the four over the cube of x5; or empty.
+        matrix: ``(B, 3, 3)`` x4 to x2.
+        frame, shading: as of :class:`Camera`.
+    """
+
+    table: Tensor
+    curves: Tensor
+    attention: Tensor
+    matrix: Tensor
+    frame: Tensor
+    shading: Tensor
+
+
+def render(linear: Tensor, display: Display) -> Tensor:
+    """Camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; differentiable."""
+    mask = _fall_off(display, 0, *linear.shape[-2:])
+    x = linear if mask is None else linear / mask
+    if display.attention.numel():
+        x = x * look_up(display.attention, x)[:, :1]
+    # The root spreads the dark tones, where an inverse tone curve is steep, over more of the table's nodes.
+    root = torch.einsum("bij,bjhw->bihw", display.matrix, x).clamp(1e-12, 1.0).sqrt()
+    if display.curves.numel():
+        return through_curves(display.curves, root)
+    return look_up(display.table, root)[:, :3].clamp(0.0, 1.0)
+
+
 def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
     """Rows of pictures from ``top`` on, to ``raw``."""
     x2 = through_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
@@ -149,7 +181,7 @@ def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) 
     return x4 if mask is None else x4.mul_(mask)
 
 
-def _fall_off(camera: Camera, top: int, height: int, width: int) -> Tensor | None:
+def _fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
     """The mask ``(B, 1, H, W)`` of the rows from ``top`` on."""
     if not camera.shading.numel():
         return None

@@ -66,7 +66,7 @@ class Ablation:
 
     def shortest(self) -> Ablation:
         """A few steps on two frames."""
-        return replace(self, count=2, fit=self.fit.smoke())
+        return replace(self, count=2, fit=self.fit.shortest())
 
 
 @EXPERIMENTS.register("ablation")

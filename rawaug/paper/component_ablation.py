@@ -1,4 +1,4 @@
-"""What the learned parts of the ISP are worth: fits that lack one, scored on frames that no stage of them has seen.
+"""What the learned components of an ISP are worth: fits that lack one, scored on frames that no stage has seen.
 
 Encoders, end-to-end training, the loss on the images between the stages and that on the weights' consistency (Conde et
 al., AAAI 2022, "Training") are switched off one by one. Each seed draws its own frames: photographs, cameras in turn,
@@ -31,7 +31,7 @@ from rawaug.isp.fit.descent import cycle_error
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr, worst_and_best_quarter
-from rawaug.paper.synthetic_frames import varied_frames
+from rawaug.paper.frames import synthetic_frames
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
 from rawaug.seeding import keyed_generator
@@ -52,7 +52,7 @@ COLUMNS = {
 
 
 @dataclass
-class LearnedParts:
+class ComponentAblation:
     """What the learned parts are worth.
 
     Args:
@@ -90,10 +90,12 @@ class LearnedParts:
                 raise ValueError(f"variants: {name}: {sorted(unknown)} are no keys of fit that a variant can change")
             replace(self.fit, **changes)
 
-    def shortest(self) -> LearnedParts:
+    def shortest(self) -> ComponentAblation:
         """A few steps of every variant, on two frames."""
         few = {name: changes | {"steps": 2, "joint_steps": 0} for name, changes in self.variants.items()}
-        return replace(self, frames=2, left_out=1, fit=replace(self.fit.smoke(), joint_steps=0), variants=few, seeds=1)
+        return replace(
+            self, frames=2, left_out=1, fit=replace(self.fit.shortest(), joint_steps=0), variants=few, seeds=1
+        )
 
 
 def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
@@ -104,7 +106,7 @@ def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
 
 
 @EXPERIMENTS.register("learned")
-def weigh_parts(learned: LearnedParts, overwrite: bool = False) -> dict[str, dict[str, Any]]:
+def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another of its name."""
     require_free(learned, overwrite)
     pictures = open_pictures(learned.pictures, min_side=min(FRAME))
@@ -112,8 +114,8 @@ def weigh_parts(learned: LearnedParts, overwrite: bool = False) -> dict[str, dic
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in learned.variants}
     for seed in range(learned.seed, learned.seed + learned.seeds):
         chosen = photographs(pictures, learned, seed)
-        frames = varied_frames(chosen[: learned.frames], learned.cameras, seed, "train")
-        left_out = varied_frames(chosen[learned.frames :], learned.cameras, seed, "left-out")
+        frames = synthetic_frames(chosen[: learned.frames], learned.cameras, seed, "train")
+        left_out = synthetic_frames(chosen[learned.frames :], learned.cameras, seed, "left-out")
         for name, changes in progress(learned.variants.items(), label=f"seed {seed}", unit="fit"):
             config = replace(learned.fit, **changes, seed=seed)
             place = folder / f"seed{seed}" / f"{name.replace(' ', '-').replace('/', '_')}.json"
@@ -124,7 +126,7 @@ def weigh_parts(learned: LearnedParts, overwrite: bool = False) -> dict[str, dic
     return rows
 
 
-def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: LearnedParts, seed: int) -> list[Tensor]:
+def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:
     """As many as are needed, in a random order, of those that hold a frame.
 
     Raises:
@@ -144,7 +146,7 @@ def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: LearnedPart
 def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
     """The scores of one fit, from its file where it is there."""
     sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
-    key = fingerprint("learned", config.key(), sums)
+    key = fingerprint("learned", asdict(config), sums)
     if place.is_file() and (known := json.loads(place.read_text())).get("key") == key:
         return dict(known)
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +180,7 @@ def _row(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return means | {"worst25": worst, "joint": [run["joint"] for run in runs], "parameters": runs[0]["parameters"]}
 
 
-def _print(rows: dict[str, dict[str, Any]], learned: LearnedParts) -> None:
+def _print(rows: dict[str, dict[str, Any]], learned: ComponentAblation) -> None:
     first = next(iter(rows.values()))
     cells = []
     for name, row in rows.items():

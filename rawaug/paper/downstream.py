@@ -144,17 +144,14 @@ class MadeCrops:
         noise: NoiseModel,
         crop: int,
     ) -> None:
-        self.pictures, self.make, self.cfa, self.noise, self.crop = pictures, make, cfa, noise, crop
+        self.pictures, self.make, self.cfa, self.noise = pictures, make, cfa, noise
+        self.crop = bayer.RandomCrop(crop)
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> Sample:
         """One crop of a random picture."""
         picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
-        height, width = picture.shape[-2:]
-        top = 2 * int(torch.randint((height - self.crop) // 2 + 1, (), generator=generator))
-        left = 2 * int(torch.randint((width - self.crop) // 2 + 1, (), generator=generator))
-        patch = bayer.crop(picture, top, left, self.crop, self.crop)
-        patch = bayer.turn(patch, int(torch.randint(bayer.N_VIEWS, (), generator=generator)))
+        patch = bayer.RandomTurn(self.cfa, keep_cfa=False)(self.crop(picture, generator), generator)
         clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)
         params = self.noise.sample(1, generator)
         noisy = self.noise.apply(clean, params)

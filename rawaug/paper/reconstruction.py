@@ -34,6 +34,7 @@ from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.downstream import DownstreamConfig, psnr_d
+from rawaug.paper.frames import PERTURBED
 from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
@@ -46,7 +47,6 @@ from rawaug.paper.methods import (
     mosaic_only_psnr,
     score_rows,
 )
-from rawaug.paper.metrics import ALTERED
 from rawaug.plugin.pictures import even_sided
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
@@ -112,8 +112,8 @@ class Comparison:
         patches: random patches of each left-out frame that are scored; null scores all.
         balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
             gamma-compressed RAW.
-        altered: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
-            :mod:`rawaug.paper.metrics`; methods are fitted to frames as they are.
+        perturbed: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
+            :mod:`rawaug.paper.frames`; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
         downstream: PSNR_d; null skips it.
@@ -138,7 +138,7 @@ class Comparison:
     longer_frames: int = 2
     patches: int | None = 8
     balanced: bool = False
-    altered: list[str] = field(default_factory=list)
+    perturbed: list[str] = field(default_factory=list)
     pictures: str = "demo:"
     fit: FitConfig = field(default_factory=FitConfig)
     downstream: DownstreamConfig | None = None
@@ -155,8 +155,8 @@ class Comparison:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
         if self.patches is not None and self.patches < 1:
             raise ValueError(f"patches must be at least 1, or null for all, got {self.patches}")
-        if unknown := [kind for kind in self.altered if kind not in ALTERED]:
-            raise ValueError(f"altered: {unknown}; choose from {', '.join(ALTERED)}")
+        if unknown := [kind for kind in self.perturbed if kind not in PERTURBED]:
+            raise ValueError(f"perturbed: {unknown}; choose from {', '.join(PERTURBED)}")
         if self.noise and any(not method.startswith("dictionary") for method in self.methods):
             raise ValueError("noise: only the dictionary ISP can be fitted to noisy frames; remove the other methods")
 
@@ -164,7 +164,7 @@ class Comparison:
         """One step of every method, on the first frames."""
         few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "longer": 0.0, "seconds": 0.1}
         downstream = self.downstream and self.downstream.shortest()
-        return replace(self, **few, select="first", fit=self.fit.smoke(), downstream=downstream)
+        return replace(self, **few, select="first", fit=self.fit.shortest(), downstream=downstream)
 
 
 @EXPERIMENTS.register("reconstruction")
@@ -275,7 +275,7 @@ class PreparedComparison:
         settings, name = self.settings, names_of(self.scored)[frame]
         seconds = settings.seconds * scale
         budget = (seconds, settings.crop, settings.batch)
-        more = [settings.balanced, settings.altered] if settings.balanced or settings.altered else []
+        more = [settings.balanced, settings.perturbed] if settings.balanced or settings.perturbed else []
         key = fingerprint(family, budget, seed, settings.patches, *self._frames(), *more)
         path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
         if (known := _read(path, key)) is not None:
@@ -289,8 +289,8 @@ class PreparedComparison:
         else:
             fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
         result = score_rows(fitted, pair, settings.patches)
-        for kind in settings.altered:
-            found = score_rows(fitted, ALTERED[kind](pair), settings.patches)["rows"]
+        for kind in settings.perturbed:
+            found = score_rows(fitted, PERTURBED[kind](pair), settings.patches)["rows"]
             result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
         if settings.balanced:
             result["balanced"] = balanced_rows(fitted, pair)
@@ -305,7 +305,7 @@ class PreparedComparison:
         seeds = range(settings.seed, settings.seed + settings.seeds)
         budget = (settings.seconds, settings.crop, settings.batch)
         parts = (
-            self.fit.key(),
+            asdict(self.fit),
             settings.noise,
             downstream and asdict(downstream),
             settings.data,
@@ -328,7 +328,7 @@ class PreparedComparison:
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
         test = [self.settings.test] if self.settings.test else []
-        return self.fit.key(), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs], *test
+        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs], *test
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
@@ -39,17 +39,6 @@ class EncoderTraining:
         for key, least in {"steps": 0, "frames": 1, "pixels": 1, "fewest_frames": 2, "folds": 2}.items():
             require_between(f"encoder_training.{key}", getattr(self, key), least, MOST)
         require_between("encoder_training.learning_rate", self.learning_rate, 0.0, float(MOST))
-
-
-_LATER = {
-    "curve_steps": None,
-    "tone": "learned",
-    "intermediate": 0.1,
-    "consistency": 1.0,
-    "prior_steps": 400,
-    "mse_floor": 1e-5,
-    "encoder_training": asdict(EncoderTraining()),
-}
 
 
 @dataclass(frozen=True)
@@ -116,11 +105,7 @@ class FitConfig:
         """``atoms``, as far as the size allows."""
         return min(self.atoms, SMALL.colour_atoms) if self.size == "small" else self.atoms
 
-    def key(self) -> dict[str, Any]:
-        """What a fit depends on; keys that came later are left out at their default: older fits stay what they are."""
-        return {key: value for key, value in asdict(self).items() if key not in _LATER or value != _LATER[key]}
-
-    def smoke(self) -> FitConfig:
+    def shortest(self) -> FitConfig:
         """The same configuration, reduced to a fit of a second."""
         few = replace(self.encoder_training, steps=4)
         return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)

@@ -1,13 +1,13 @@
-r"""Encoders, last, with tone and dictionaries frozen, and only where frames that were left out say that they help.
+r"""Training of the encoders and of everything at once, each kept only if frames that were left out say that it helps.
 
-``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``: the RAW that the weights of the reverse
+*Encoders* are trained last, with tone and dictionaries frozen:
+``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``, the RAW that the weights of the reverse
 encoders make, the same for the forward encoders', and the consistency of the two (Conde et al., AAAI 2022, "Training").
 Trained together with the rest on few frames, encoders learn the frames by heart and take tone and matrices with them.
-Whether they help is asked of frames that nothing has seen: for every fold curve, tone and atoms are fitted anew without
-its frames, then constants and encoders are compared on these.
+Whether they help is decided on unseen frames: for every fold, curve, tone and atoms are fitted anew without its frames,
+then constants and encoders are compared on these.
 
-End-to-end training, as in the paper, of an ISP that is already fitted.
-
+*End-to-end training*, as in the paper, refines an ISP that is already fitted:
 ``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on random pixels of random
 frames; both passes use the weights that their own encoders choose. A tenth of the frames is left out and watched: the
 parameters come back that served these best, which may be those of the start.
@@ -15,7 +15,7 @@ parameters come back that served these best, which may be those of the start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -29,6 +29,14 @@ Refit = Callable[[Sequence[int], str], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
 
 
+def folds_of(frames: int, folds: int) -> Iterator[tuple[list[int], list[int], str]]:
+    """The frames that each fold leaves out, those that it keeps, and its name."""
+    for fold in range(folds):
+        out = list(range(fold, frames, folds))
+        kept = [k for k in range(frames) if k not in out]
+        yield out, kept, f" without part {fold + 1} of {folds}"
+
+
 def train_encoders(
     isp: DictionaryISP,
     samples: PixelSamples,
@@ -37,7 +45,7 @@ def train_encoders(
     descent: Descent,
     refit: Refit,
 ) -> None:
-    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says; ``isp.info`` records which."""
+    """Train and keep the encoders, or leave the constants, as ``config.encoders`` says."""
     wanted = config.encoders
     isp.use_encoders(False)
     if wanted == "auto" and len(shots) >= config.encoder_training.fewest_frames:
@@ -105,11 +113,8 @@ def _gain_on_frames_left_out(
     samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, refit: Refit
 ) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
-    gain, folds = 0.0, config.encoder_training.folds
-    for fold in range(folds):
-        out = list(range(fold, len(shots), folds))
-        kept = [k for k in range(len(shots)) if k not in out]
-        part = f" without part {fold + 1} of {folds}"
+    gain = 0.0
+    for out, kept, part in folds_of(len(shots), config.encoder_training.folds):
         isp = refit(kept, part)
         isp.use_encoders(False)
         gain -= len(out) * decibels(isp, samples, shots, out)

@@ -1,20 +1,14 @@
-r"""Which tone a fit takes, the network or a curve: that which is better on frames that it has not seen.
-
-For every fold both are fitted without its frames and compared on these, by PSNR_r with the as-shot gains: blind, the
-guess of the gains would decide, which is the same for both.
-
-The stages of a fit, in order.
+r"""The stages of a fit, in order.
 
 1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
    and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
 2. Tone. The tone network starts as that curve and is refined together with all of stage 1; or the curve itself is
-   bent (:mod:`rawaug.isp.stages`), where this is asked for or better (:mod:`rawaug.isp.fit.pipeline`).
+   bent (:mod:`rawaug.isp.tone`). With ``tone="auto"`` both are fitted without some of the frames and compared on these,
+   by PSNR_r with the as-shot gains: blind, the guess of the gains would decide, which is the same for both.
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
 4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
-
-The losses are in :mod:`rawaug.isp.fit.descent`.
 
 Source: the model and losses of Conde et al., AAAI 2022; splitting the fit into a global and a per-frame part is what
 makes it hold up with a handful of frames (``docs/fit.md``).
@@ -38,7 +32,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent, cycle_error, decibels, reading_error
-from rawaug.isp.fit.encoders import train_encoders, train_jointly
+from rawaug.isp.fit.encoders import folds_of, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
@@ -56,16 +50,13 @@ Refit = Callable[[Sequence[int], str, FitConfig], DictionaryISP]
 def with_better_tone(
     samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, refit: Refit
 ) -> tuple[FitConfig, float | None]:
-    """The settings with ``tone`` decided, and by how many dB the curve is better where it was asked for."""
+    """The settings with ``tone`` decided, and the curve's gain in dB if it was compared."""
     if config.tone != "auto":
         return config, None
     if len(shots) < 2:
         return replace(config, tone="learned"), None
-    gain, folds = 0.0, min(FOLDS, len(shots))
-    for fold in range(folds):
-        out = list(range(fold, len(shots), folds))
-        kept = [k for k in range(len(shots)) if k not in out]
-        part = f" without part {fold + 1} of {folds}"
+    gain = 0.0
+    for out, kept, part in folds_of(len(shots), min(FOLDS, len(shots))):
         learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
         curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
         better = decibels(curve, samples, shots, out, True) - decibels(learned, samples, shots, out, True)
@@ -201,7 +192,7 @@ class _Fit:
     # -- stage 1 ----------------------------------------------------------------------------------------------------
 
     def curve(self) -> None:
-        """Stage 1, without the mask and, where the readings fall off towards the corners, with it as well."""
+        """Stage 1: without the mask and, where the readings fall off towards the corners, with it as well."""
         shading = self.isp.find(LensShading)
         wanted = self.config.shading if shading else "off"
         if wanted != "on":

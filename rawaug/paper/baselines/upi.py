@@ -1,24 +1,20 @@
-r"""UPI as published: ``y = mosaic(clip(h(C s^-1(x)^2.2; g)))``.
+r"""UPI (Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019), as published and tuned to pairs.
 
-``s^-1(x) = 1/2 - sin(asin(1 - 2x) / 3)`` undoes the tone curve ``s(x) = 3x^2 - 2x^3``. ``C`` is a random convex
-combination of four cameras' XYZ-to-camera matrices, times sRGB-to-XYZ, rows divided by their sum. The gains ``g`` are a
-digital one, 1 / N(0.8, 0.1), times a red one, U(1.9, 2.4), and a blue one, U(1.5, 1.9); ``h`` divides by them and
-spares highlights. Nothing is learned. Domain: display-referred sRGB in [0, 1] to linear camera colour in [0, 1].
+As published, ``y = mosaic(clip(h(C s^-1(x)^2.2; g)))``. ``s^-1(x) = 1/2 - sin(asin(1 - 2x) / 3)`` undoes the tone curve
+``s(x) = 3x^2 - 2x^3``. ``C`` is a random convex combination of four cameras' XYZ-to-camera matrices, times sRGB-to-XYZ,
+rows divided by their sum. The gains ``g`` are a digital one, 1 / N(0.8, 0.1), times a red one, U(1.9, 2.4), and a blue
+one, U(1.5, 1.9); ``h`` divides by them and spares highlights. Nothing is learned. Domain: display-referred sRGB in
+[0, 1] to linear camera colour in [0, 1].
 
-Source: Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019.
-
-UPI tuned: its fixed tone curve and gamma, with one matrix and one set of gains fitted to pairs.
-
-``y = M s^-1(x)^2.2`` below the highlights, with ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All of a frame's
-mean squared error is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``, so a fit is a few 3 x 3
-systems: the whole is exact and takes well under a second.
+Tuned, as in the paper of the dictionary ISP, it keeps the tone curve and gamma, with one matrix and one set of gains
+fitted to pairs: ``y = M s^-1(x)^2.2`` below the highlights, with ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All
+of a frame's mean squared error is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``, so a fit is
+a few 3 x 3 systems: the whole is exact and takes well under a second.
 
 The frames differ in gains that cannot be guessed. ``mse`` minimises the sum of their errors and follows the brightest;
 ``mean`` takes the mean of the frames' own gains and matrices; ``log`` minimises ``sum_f log(MSE_f + eps)``, since the
 score averages decibels, by weighted least squares with weights ``1 / (MSE_f + eps)``: each round minimises the tangent
 of the concave logarithm, which lies above it, so the loss never rises.
-
-Source: Brooks et al., CVPR 2019, for the stages; the paper of the dictionary ISP compares with UPI "tuned" to its data.
 """
 
 from __future__ import annotations
@@ -33,6 +29,7 @@ from torch import Tensor, nn
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
+from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
 from rawaug.paper.baselines.base import BaselineISP, checked_raw, checked_srgb
@@ -46,12 +43,6 @@ XYZ_TO_CAMERA = (
     ((0.6596, -0.2079, -0.0562), (-0.4782, 1.3016, 0.1933), (-0.0970, 0.1581, 0.5181)),
 )
 """Of the four cameras of the Darmstadt Noise Dataset, as published with UPI."""
-SRGB_TO_XYZ = (
-    (0.4124564, 0.3575761, 0.1804375),
-    (0.2126729, 0.7151522, 0.0721750),
-    (0.0193339, 0.1191920, 0.9503041),
-)
-"""Linear sRGB (D65) to XYZ, IEC 61966-2-1."""
 INVERSE_DIGITAL = (0.8, 0.1)
 """Mean and standard deviation of 1 / digital gain."""
 RED, BLUE = (1.9, 2.4), (1.5, 1.9)
@@ -82,7 +73,7 @@ def inverse_smoothstep(x: Tensor) -> Tensor:
 
 def camera_matrix(weights: Tensor) -> Tensor:
     """Weights ``(B, 4)`` of the cameras, of any positive sum, to linear sRGB-to-camera ``(B, 3, 3)``, rows of sum 1."""
-    cameras = torch.tensor(XYZ_TO_CAMERA).to(weights) @ torch.tensor(SRGB_TO_XYZ).to(weights)
+    cameras = torch.tensor(XYZ_TO_CAMERA).to(weights) @ SRGB_TO_XYZ.to(weights)
     matrix = torch.einsum("bn,nij->bij", weights, cameras)
     return matrix / matrix.sum(dim=2, keepdim=True)
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from rawaug import bayer
-from rawaug.isp.config import POINTWISE_STAGES, ISPConfig
-from rawaug.isp.fast import BakedISP
+from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
+from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
@@ -134,3 +135,67 @@ def test_bytes_and_floats_agree() -> None:
 def test_stages_in_another_order_are_refused() -> None:
     with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
         BakedISP(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
+    with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
+        FastForward(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
+
+
+def forward_curved(**settings: object) -> DictionaryISP:
+    """:func:`curved_isp`, whose forward networks do something as well."""
+    isp, generator = curved_isp(**settings), torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        if tone := isp.find(ToneMap):
+            list(tone.forward_network.parameters())[-2].normal_(std=0.05, generator=generator)
+        if (lens := isp.find(LensShading)) and lens.forward_attention:
+            list(lens.forward_attention.parameters())[-2].normal_(std=0.05, generator=generator)
+    return isp
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("name", ["universal", "canon-powershot", "curved"])
+def test_fast_forward_is_the_isp_above_60_db(name: str) -> None:
+    isp = forward_curved() if name == "curved" else DictionaryISP.from_pretrained(name)
+    isp.requires_grad_(False)
+    generator = torch.Generator().manual_seed(1)
+    srgb = torch.rand(3, 3, 32, 48, generator=generator)
+    drawn = isp.camera_sampler() is not None
+    params = isp.draw_setting(3, generator) if drawn else isp.choose(srgb)
+    raw = isp.reverse(srgb, params).raw
+    x5 = bayer.demosaic(raw + 0.01 * torch.randn(raw.shape, generator=generator), isp.cfa)
+    made = FastForward(isp)(x5, params)
+    assert made.dtype == torch.float32 and made.min() >= 0 and made.max() <= 1
+    assert error_below_white(isp, made, x5, params) > 60.0
+
+
+def error_below_white(isp: DictionaryISP, made: Tensor, x5: Tensor, params: ISPParams) -> float:
+    """PSNR against the exact pass where its linear light is at most white; above, the fast one clips before tone."""
+    seen: dict[str, Tensor] = {}
+    exact = isp.forward_pixels(x5, params, None, seen).clamp(0.0, 1.0)
+    below = (seen["x2"] <= 1.0).all(dim=1, keepdim=True).expand_as(exact)
+    assert below.float().mean() > 0.5
+    return float(-10.0 * (made - exact)[below].square().mean().log10())
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("view", [bayer.View.IDENTITY, bayer.View.TRANSPOSE])
+def test_fast_forward_undoes_the_mask_where_the_crop_was(view: bayer.View) -> None:
+    isp = forward_curved()
+    x5 = 0.3 * torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
+    params = isp.choose(x5)
+    whole = isp.forward_pixels(x5, params).clamp(0.0, 1.0)
+    crop, expected = (bayer.turn(x[..., 6:26, 34:50], view).contiguous() for x in (x5, whole))
+    made = FastForward(isp)(crop, params, torch.tensor([[6, 34, 40, 60, view]]))
+    assert psnr(made, expected).item() > 50.0
+
+
+@pytest.mark.usefixtures("either_way")
+def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
+    isp = DictionaryISP.from_pretrained("universal").requires_grad_(False)
+    params = isp.draw_setting(1, torch.Generator().manual_seed(2))
+    x5 = 0.1 + 0.1 * torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    found = []
+    for forward in (FastForward(isp), isp.forward_pixels):
+        x, gains = x5.clone().requires_grad_(), params.gains.clone().requires_grad_()
+        forward(x, params._replace(gains=gains)).square().sum().backward()
+        found.append((x.grad, gains.grad))
+    for ours, exact in zip(*found, strict=True):
+        torch.testing.assert_close(ours, exact, rtol=0.02, atol=0.02)

@@ -17,7 +17,7 @@ from rawaug.io import write_picture
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper import component_ablation as learned_parts
-from rawaug.paper.component_ablation import LearnedParts, score, weigh_parts
+from rawaug.paper.component_ablation import ComponentAblation, ablate_components, score
 
 FrameOf = Any
 TINY = FitConfig(encoders="on", joint_steps=0, steps=2, curve_steps=5, pixels=256, batch=64)
@@ -55,7 +55,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def settings(folder: Path, **changes: Any) -> LearnedParts:
+def settings(folder: Path, **changes: Any) -> ComponentAblation:
     given: dict[str, Any] = {
         "pictures": str(folder / "pictures"),
         "frames": 4,
@@ -63,13 +63,13 @@ def settings(folder: Path, **changes: Any) -> LearnedParts:
         "fit": TINY,
         "variants": VARIANTS,
     }
-    return LearnedParts(**{**given, "seeds": 2, "out": str(folder), **changes})
+    return ComponentAblation(**{**given, "seeds": 2, "out": str(folder), **changes})
 
 
 def test_every_variant_of_a_seed_has_the_same_frames_and_is_scored_on_others(
     folder: Path, fits: list[tuple[FitConfig, list[str]]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = weigh_parts(settings(folder))
+    rows = ablate_components(settings(folder))
     assert [(config.encoders, config.consistency, config.seed) for config, _ in fits] == [
         ("on", 1.0, 0), ("off", 0.0, 0), ("on", 1.0, 1), ("off", 0.0, 1),
     ]  # fmt: skip
@@ -80,14 +80,14 @@ def test_every_variant_of_a_seed_has_the_same_frames_and_is_scored_on_others(
     assert stored["rows"] == rows and stored["settings"]["frames"] == 4
     said = capsys.readouterr().out
     assert "46.05 ± 0.07" in said and "-1.00 ± 0.00" in said
-    assert weigh_parts(settings(folder)) == rows and len(fits) == 4, "nothing is fitted twice"
-    weigh_parts(settings(folder, fit=FitConfig(encoders="on", joint_steps=0, steps=3)), overwrite=True)
+    assert ablate_components(settings(folder)) == rows and len(fits) == 4, "nothing is fitted twice"
+    ablate_components(settings(folder, fit=FitConfig(encoders="on", joint_steps=0, steps=3)), overwrite=True)
     assert len(fits) == 8
 
 
 def test_too_few_pictures_and_unknown_keys_are_refused(folder: Path, fits: list[Any]) -> None:
     with pytest.raises(ValueError, match=r"has 6 of 288 x 448 or more, but frames and left_out together need 7"):
-        weigh_parts(settings(folder, frames=5))
+        ablate_components(settings(folder, frames=5))
     assert fits == [] and len(PictureFolder(folder / "pictures", 2)) == 7
     for changes in ({"encodres": "on"}, {"seed": 3}):
         with pytest.raises(ValueError, match=r"variants: mine: \['(encodres|seed)'\] are no keys of fit"):

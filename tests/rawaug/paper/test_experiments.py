@@ -13,7 +13,7 @@ from rawaug.experiment.kinds import dry_run
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import ablation, reconstruction
 from rawaug.paper.ablation import Ablation
-from rawaug.paper.component_ablation import LearnedParts
+from rawaug.paper.component_ablation import ComponentAblation
 from rawaug.paper.reconstruction import Comparison
 
 
@@ -31,12 +31,12 @@ def frames(frame_of: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch) -> li
     [
         Comparison(data="mine", methods=["dictionary", "upi"], seeds=3),
         Ablation(data="mine", fit=FitConfig(atoms=3)),
-        LearnedParts(frames=4, variants={"all parts": {}, "without encoders": {"encoders": "off"}}),
+        ComponentAblation(frames=4, variants={"all parts": {}, "without encoders": {"encoders": "off"}}),
     ],
     ids=lambda settings: settings.experiment,
 )
 def test_a_dry_run_tries_everything_once_and_writes_nothing(
-    settings: Comparison | Ablation | LearnedParts,
+    settings: Comparison | Ablation | ComponentAblation,
     frames: list[Pair],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,23 +17,27 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig
+from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import PATCH
 from rawaug.paper import methods
-from rawaug.paper import methods as oracle
 from rawaug.paper.baselines import BASELINES, UPI, InvISP, TunedUPI
 from rawaug.paper.baselines.networks import UNetISP
 from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
     Fitted,
+    balanced_psnr,
     cycle_psnr,
     dictionary_params,
     fit_family,
     is_method,
     mosaic_only_psnr,
+    oracle,
     score_rows,
+    squared_error,
 )
+from rawaug.seeding import keyed_generator
 
 FrameOf = Callable[..., Pair]
 DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
@@ -41,7 +46,7 @@ DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 @pytest.fixture
 def no_oracle(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its row is filled, but it takes no time."""
-    monkeypatch.setattr(oracle, "STEPS", 1)
+    monkeypatch.setattr(methods, "STEPS", 1)
 
 
 @pytest.mark.usefixtures("no_oracle")
@@ -219,3 +224,82 @@ def test_the_ceiling_is_what_interpolation_misses() -> None:
     smooth, hard = mosaic_only_psnr([slope]), mosaic_only_psnr([board])
     assert smooth > 40.0 and hard < 10.0
     assert mosaic_only_psnr([slope, board]) == pytest.approx((smooth + hard) / 2)
+
+
+@pytest.fixture(scope="module")
+def published() -> DictionaryISP:
+    return DictionaryISP.from_pretrained("universal-small")
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(methods, "STEPS", 30)
+    monkeypatch.setattr(methods, "PIXELS", 2048)
+
+
+@pytest.mark.usefixtures("brief")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_row_that_knows_less_is_better(published: DictionaryISP, frame_of: Callable[..., Pair], seed: int) -> None:
+    setting = published.draw_setting(1, keyed_generator(seed))
+    frame = frame_of(f"drawn {seed}")
+    with torch.no_grad():
+        raw = (published.reverse(frame.srgb[None], setting).raw[0] * 1023.0).round() / 1023.0
+    frame = replace(frame, raw=raw, cfa=CFA.RGGB, white_balance=tuple(setting.gains[0].tolist()))
+    rows = dictionary_params(published, frame)
+    pixels, _ = sample_pixels([frame], 4096, seed=7)
+    errors = {row: squared_error(published, pixels, params).item() for row, params in rows.items()}
+    assert errors["oracle"] < 1.02 * min(errors.values()), "on other pixels than those that it was chosen by"
+    assert errors["oracle"] < 1e-5 < errors["blind"], "it finds camera, light and tone at once: 50 dB"
+
+
+@pytest.mark.usefixtures("brief")
+def test_a_better_guess_is_taken(published: DictionaryISP, frame_of: Callable[..., Pair]) -> None:
+    setting = published.draw_setting(1, keyed_generator(5))
+    frame = frame_of("exact")
+    with torch.no_grad():
+        frame = replace(frame, raw=published.reverse(frame.srgb[None], setting).raw[0], cfa=CFA.RGGB)
+    other = published.draw_setting(1, keyed_generator(6))
+    assert torch.equal(oracle(published, frame, [other, setting]).matrix, setting.matrix)
+
+
+BALANCE = (2.0, 1.0, 1.6)
+
+
+def frame(height: int, width: int) -> Pair:
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.rand(1, height, width, generator=generator) * 0.9
+    srgb = (255 * torch.rand(3, height, width, generator=generator)).to(torch.uint8)
+    return Pair("f", srgb, raw, CFA.GRBG, BALANCE)
+
+
+def seen(mosaic: torch.Tensor) -> np.ndarray:
+    colour = bayer.demosaic(mosaic[None, None], CFA.GRBG)[0].numpy()
+    return (colour * np.array([1.0, 0.5, 0.8], np.float32)[:, None, None]) ** (1 / 2.2)
+
+
+def test_it_is_the_mean_over_nine_pieces_of_balanced_compressed_raw() -> None:
+    pair = frame(26, 36)  # thirds at rows 0, 8, 16, 26 and columns 0, 12, 24, 36
+    made = (pair.raw * 0.8 + 0.4).clamp(max=1.5)
+
+    def make(srgb: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+        found = [
+            (top, left)
+            for top in (0, 8, 16)
+            for left in (0, 12, 24)
+            if torch.equal(srgb[0], pair.srgb[:, top : top + srgb.shape[-2], left : left + srgb.shape[-1]])
+        ]
+        ((top, left),) = found
+        assert place.shape[-2:] == srgb.shape[-2:]
+        return made[None, :, top : top + srgb.shape[-2], left : left + srgb.shape[-1]]
+
+    expected = []
+    for rows in (slice(0, 8), slice(8, 16), slice(16, 26)):
+        for columns in (slice(0, 12), slice(12, 24), slice(24, 36)):
+            error = seen(made[0, rows, columns].clamp(max=1.0)) - seen(pair.raw[0, rows, columns])
+            expected.append(-10 * np.log10((error**2).mean()))
+    assert balanced_psnr(make, pair) == pytest.approx(np.mean(expected), abs=1e-3)
+
+
+def test_an_unregistered_pair_is_refused() -> None:
+    with pytest.raises(ValueError, match="f: is not registered pixel by pixel"):
+        balanced_psnr(lambda srgb, place: srgb[:, :1].float(), replace(frame(12, 12), registered=False))

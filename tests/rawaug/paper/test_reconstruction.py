@@ -144,7 +144,7 @@ def test_table_and_file_say_the_same(
     assert f"{stored['mosaic_only_psnr']:.2f} dB (ceiling" in said
 
 
-def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
+def test_perturbed_frames_and_invisps_figure_have_rows_and_a_column(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Altered(Laboratory):
@@ -156,7 +156,7 @@ def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
     laboratory.frames = 3
     pairs = laboratory.pairs = laboratory.open_pairs("", "")
     clean = {pair.name: pair for pair in pairs}
-    rows = compare(settings(tmp_path, balanced=True, altered=["overexposed", "retouched"]))
+    rows = compare(settings(tmp_path, balanced=True, perturbed=["overexposed", "retouched"]))
     bare = ["dictionary", "dictionary, as-shot gains"]
     assert list(rows) == [*bare, *(f"{row}, {kind}" for kind in ("overexposed", "retouched") for row in bare)]
     assert rows["dictionary, as-shot gains, overexposed"]["psnr_r"] == [43.0, 43.0]
@@ -165,8 +165,8 @@ def test_altered_frames_and_invisps_figure_have_rows_and_a_column(
     assert "balanced" in said and "31.00" in said
     plain = compare(settings(tmp_path, name="plain"))
     assert list(plain) == bare and "balanced" not in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"altered: \['blurred'\]; choose from overexposed, retouched"):
-        settings(tmp_path, altered=["blurred"])
+    with pytest.raises(ValueError, match=r"perturbed: \['blurred'\]; choose from overexposed, retouched"):
+        settings(tmp_path, perturbed=["blurred"])
 
 
 def test_networks_and_they_alone_have_a_longer_row(laboratory: Laboratory, tmp_path: Path) -> None:

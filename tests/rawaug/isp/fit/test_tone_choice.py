@@ -84,7 +84,3 @@ def test_frames_are_judged_under_their_own_gains(two_frames: tuple[PixelSamples,
     with torch.no_grad():
         isp.gain.log_gains.fill_(1.0)
     assert decibels(isp, *two_frames, [0, 1], as_shot=True) > decibels(isp, *two_frames, [0, 1]) + 3.0
-
-
-def test_a_later_key_does_not_change_the_key_of_older_fits() -> None:
-    assert "tone" not in FitConfig().key() and FitConfig(tone="curve").key()["tone"] == "curve"

@@ -1,13 +1,22 @@
-r"""Frames of several published cameras in many lights: photographs as scenes before the demo camera's lens and sensor.
+r"""Frames made for a comparison: of published cameras in many lights, and with pictures that the camera did not make.
 
-A frame's colour is ``C = colour_matrix(M)`` and ``wb(M, L)`` of :mod:`rawaug.isp.cameras` for a camera's published
-matrix M and a light L drawn as there; blur, shading, exposure, converter and rendering are those of
-:class:`rawaug.data.DemoCamera`, which shares no code with the ISPs that are fitted to its frames.
+*Synthetic* frames are photographs as scenes before the demo camera's lens and sensor. A frame's colour is
+``C = colour_matrix(M)`` and ``wb(M, L)`` of :mod:`rawaug.isp.cameras` for a camera's published matrix M and a light L
+drawn as there; blur, shading, exposure, converter and rendering are those of :class:`rawaug.data.DemoCamera`, which
+shares no code with the ISPs that are fitted to its frames.
+
+*Perturbed* frames are overexposed: the shot with ``2^s`` times the light, RAW and picture clipped at white,
+
+.. math:: y' = \min(2^s y, 1), \qquad x' = E(\min(2^s D(x), 1))
+
+with the sRGB curve E and its inverse D (IEC 61966-2-1). Or they are retouched: the RAW stays, the picture is given an S
+curve, ``x + c (3 x^2 - 2 x^3 - x)``, and more saturated colour, ``Y + k (x - Y)`` with the luma Y of ITU-R BT.709, as
+after an edit by hand.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -17,14 +26,19 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data import DemoCamera, Pair
 from rawaug.data.demo.pairs import FRAME
+from rawaug.io import decode_srgb, encode_srgb
 from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.dictionary import plausible
 from rawaug.seeding import keyed_generator
 
 LIGHTS_TRIED = 32
+STOPS = 1.0
+CONTRAST = 0.5
+SATURATION = 1.3
+LUMA = (0.2126, 0.7152, 0.0722)
 
 
-def varied_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
+def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
     """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own.
 
     Args:
@@ -70,3 +84,25 @@ def _scene(picture: Tensor, generator: torch.Generator, name: str) -> Tensor:
         for side, size in zip(small.shape[-2:], FRAME, strict=True)
     )
     return bayer.crop(small, top // 2 * 2, left // 2 * 2, *FRAME)
+
+
+def overexposed(pair: Pair) -> Pair:
+    """The frame with :data:`STOPS` more light."""
+    factor = 2.0**STOPS
+    picture = encode_srgb((factor * decode_srgb(pair.srgb.float() / 255.0)).clamp(max=1.0))
+    return replace(pair, srgb=_as_8_bits(picture), raw=(factor * pair.raw).clamp(max=1.0))
+
+
+def retouched(pair: Pair) -> Pair:
+    """The frame with an edited picture."""
+    x = pair.srgb.float() / 255.0
+    x = x + CONTRAST * (3.0 * x**2 - 2.0 * x**3 - x)
+    luma = (torch.tensor(LUMA).reshape(3, 1, 1) * x).sum(0, keepdim=True)
+    return replace(pair, srgb=_as_8_bits((luma + SATURATION * (x - luma)).clamp(0.0, 1.0)))
+
+
+PERTURBED: dict[str, Callable[[Pair], Pair]] = {"overexposed": overexposed, "retouched": retouched}
+
+
+def _as_8_bits(picture: Tensor) -> Tensor:
+    return (255.0 * picture).round().to(torch.uint8)
