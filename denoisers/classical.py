@@ -78,7 +78,7 @@ class Classical(ABC):
     def _one(self, image: Tensor, sigma: float) -> Tensor:
         if sigma == 0:
             return image
-        planes = image.detach().permute(1, 2, 0).to("cpu", torch.float32).numpy() / np.float32(sigma)
+        planes = (image.detach().permute(1, 2, 0).to("cpu", torch.float32) / sigma).numpy()
         clean = np.ascontiguousarray(self.denoise(planes), np.float32) * np.float32(sigma)
         return torch.from_numpy(clean).permute(2, 0, 1).to(image)
 
