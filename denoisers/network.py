@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import reduce
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from denoisers.domains import DOMAINS, levels_of
 from rawaug.registry import require_between
@@ -30,6 +32,9 @@ MOST_FEATURES, MOST_LAYERS, MOST_SCALES = 2**16, 1000, 12
 
 NEAR = 8.0
 """Deviations of the noise within which a network is told of the limits of the signal."""
+
+DEFECT = (5.0, 0.15)
+"""How far a defect pixel is beyond its neighbours at least: deviations of the noise, and a share of their value."""
 
 LEAK = 0.2
 """Negative slope of the leaky ReLUs."""
@@ -81,6 +86,25 @@ def require_bounded(seed: int, **layers: int) -> None:
         require_between(key, number, 0, MOST_LAYERS)
 
 
+def mended(signal: Tensor) -> Tensor:
+    """Packed RAW ``(B, 4, h, w)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
+
+    A defect lies beyond all eight neighbours of its colour, by as much as :data:`DEFECT` says, while the other colours of
+    its cell show nothing of the kind, as they do of a star or a speck.
+    """
+    height, width = signal.shape[-2:]
+    padded = F.pad(signal, (1, 1, 1, 1), mode="reflect")
+    places = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    near = [padded[..., i : i + height, j : j + width] for i, j in places]
+    low, high = reduce(torch.minimum, near), reduce(torch.maximum, near)
+    mean = (reduce(torch.add, near) - low - high) / (len(places) - 2)
+    deviations, share = DEFECT
+    beyond = (signal > high + share * high.abs() + deviations) | (signal < low - share * low.abs() - deviations)
+    departure = (signal - mean).abs()
+    alone = departure > 4.0 * departure.topk(2, dim=1).values[:, 1:]
+    return torch.where(beyond & alone, mean, signal)
+
+
 class Denoiser(nn.Module, ABC):
     """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``.
 
@@ -94,9 +118,10 @@ class Denoiser(nn.Module, ABC):
             ``shot_var max(noisy, 0) + read_var``.
         limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
             at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
+        mend: put :func:`mended` before the network, of packed RAW. Not in the domain ``linear``.
 
     Raises:
-        ValueError: if there is no such domain.
+        ValueError: if there is no such domain, or it does not go with the rest.
     """
 
     tiny: ClassVar[dict[str, Any]] = {}
@@ -111,14 +136,17 @@ class Denoiser(nn.Module, ABC):
         config: dict[str, Any],
         domain: str = "linear",
         limits: bool = False,
+        mend: bool = False,
     ) -> None:
         super().__init__()
-        if limits and domain == "linear":
-            raise ValueError("limits are those of a transformed signal; choose domain ksigma or anscombe")
+        if (limits or mend) and domain == "linear":
+            raise ValueError("limits and mend need a transformed signal; choose domain ksigma or anscombe")
+        if mend and channels != PACKED:
+            raise ValueError(f"mend compares the planes of packed RAW, {PACKED} channels, got {channels}")
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         require_between("channels", channels, 1, MOST_FEATURES)
-        self.domain, self.limits = domain, limits
+        self.domain, self.limits, self.mend = domain, limits, mend
         self.channels = channels
         self.variance_map = variance_map
         self.deviation = deviation
@@ -168,6 +196,7 @@ class Denoiser(nn.Module, ABC):
             return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
+        signal = mended(signal) if self.mend else signal
         maps = [domain.relative_deviation(noisy.float(), variance.float(), *levels)] if self.variance_map else []
         if self.limits:
             white = domain.forward(torch.ones_like(levels[0]), *levels)

@@ -350,6 +350,7 @@ class DRUNet(Denoiser):
         scales: of the pyramid; 4 is published.
         blocks: of each scale, going down and going up; 4 is published.
         limits: feed how near black and white the transformed signal is; not in the domain linear.
+        mend: replace single hot and dead pixels first; not in the domain linear.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -365,6 +366,7 @@ class DRUNet(Denoiser):
         scales: int = 4,
         blocks: int = 4,
         limits: bool = False,
+        mend: bool = False,
         channels: int = PACKED,
         variance_map: bool = True,
         deviation: bool = True,
@@ -374,9 +376,9 @@ class DRUNet(Denoiser):
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
         require_bounded(seed, blocks=blocks)
-        config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits}
+        config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
         stride = max(MEAN_OVER, 2 ** (scales - 1))
-        super().__init__(channels, variance_map, deviation, stride, config, domain, limits)
+        super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend)
         sizes = [width * 2**k for k in range(scales)]
         self.head = conv(self.inputs, width, bias=False)
         self.encoder = nn.ModuleList(_residuals(size, blocks) for size in sizes)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import denoisers
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
-from denoisers.network import pad_to_multiple
+from denoisers.network import mended, pad_to_multiple
 from denoisers.networks import DRUNet, NAFNet
 from denoisers.pmrid import PMRID
 
@@ -191,8 +191,36 @@ def test_limits_tell_a_network_where_the_sensor_clips() -> None:
     black, white = (maps[0, 0, 0, ::16].tolist() for maps in (seen[0][:, 4:8], seen[0][:, 8:]))
     assert black == pytest.approx([2 * 0.375**0.5, 8, 8, 8], abs=0.01)
     assert white == pytest.approx([8, 8, 2 * (1000.375**0.5 - 970.375**0.5), 0], abs=0.01)
-    with pytest.raises(ValueError, match="limits are those of a transformed signal"):
+    with pytest.raises(ValueError, match="limits and mend need a transformed signal"):
         DRUNet(limits=True)
+
+
+def test_single_defects_are_mended_and_nothing_else() -> None:
+    ramp = torch.linspace(10.0, 60.0, 64).expand(1, 4, 64, 64)
+    signal = ramp + torch.randn(1, 4, 64, 64, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(mended(signal), signal), "noise is none"
+    faulty = signal.clone()
+    faulty[0, 0, 20, 30], faulty[0, 3, 40, 50], faulty[0, 1, 0, 0] = 90.0, 1.2, 60.0  # hot, dead, in a corner
+    torch.testing.assert_close(mended(faulty), signal, rtol=0, atol=5.0)
+    assert (mended(faulty) != faulty).sum() == 3
+    scene = signal.clone()
+    scene[0, :, 20, 30] += torch.tensor([30.0, 50.0, 45.0, 25.0])  # a star, in all colours
+    scene[..., 40] += 40.0  # a line
+    assert torch.equal(mended(scene), scene)
+
+
+@torch.no_grad()
+def test_a_network_that_mends_is_not_moved_by_hot_pixels() -> None:
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False, domain="anscombe", mend=True))
+    noisy = pair(1, 4, 32, 32)[0].clamp_min(0.0) * 0.1
+    hot = noisy.clone()
+    hot[0, 2, 10, 11] = 0.9
+    variance = 1e-3 * noisy + 1e-5
+    changed = net(hot, 1e-3 * hot + 1e-5) - net(noisy, variance)
+    assert changed.abs().max() < 0.1
+    assert denoisers.build("DRUNet", **net.config).config == net.config
+    with pytest.raises(ValueError, match="mend compares the planes of packed RAW"):
+        DRUNet(domain="anscombe", mend=True, channels=3)
 
 
 @torch.no_grad()
