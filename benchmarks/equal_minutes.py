@@ -23,8 +23,8 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Remembered
 from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.contestants import published_pmrid
 from rawaug.evaluation.scores import classical_method, frozen_sample, network_method, score_method
-from rawaug.experiment.denoiser_sweep import published_pmrid
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train

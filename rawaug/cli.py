@@ -23,6 +23,7 @@ from rawaug.progress import quiet as without_progress
 
 BAD_INPUT = 2
 COMMANDS = {
+    "benchmark": "Compare denoisers on the same frozen noise over clean references.",
     "denoise": "Denoise a RAW file, or a folder of them, to DNG.",
     "evaluate": "Measure PSNR and SSIM of a denoiser or an ISP.",
     "explore": "Show pictures as RAW of any camera, on a page in the browser.",

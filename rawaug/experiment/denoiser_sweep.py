@@ -24,6 +24,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import each_readable
 from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.contestants import published_pmrid
 from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.scores import (
     Method,
@@ -144,24 +145,6 @@ def _network(model: denoisers.Denoiser, own: CFA, clip: bool) -> Maker:
         return denoised.clamp(0.0, 1.0) if clip else denoised
 
     return lambda noise: method
-
-
-def published_pmrid(path: str) -> denoisers.PMRID:
-    """PMRID with the weights of its authors.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it does not fit the network.
-    """
-    from rawaug.files import read_tensors
-
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"pmrid: {path}: no such file")
-    model = denoisers.PMRID()
-    try:
-        model.load_state_dict(read_tensors(path, "convert the published weights again")[1])
-    except RuntimeError as error:
-        raise ValueError(f"pmrid: {path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
-    return model.eval()
 
 
 def scored(method: Method, pair: Pair, noise: NoiseModel, seed: int, label: str) -> tuple[Score, float]:

@@ -1,0 +1,73 @@
+"""``rawaug benchmark``: denoisers on frozen noise over clean references; see :mod:`rawaug.evaluation.benchmark`."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+from denoisers.files import shipped
+from rawaug.data import open_pairs
+from rawaug.evaluation.benchmark import benchmark, crops, tables
+from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.evaluation.page import Page, Part
+from rawaug.evaluation.tables import print_rows
+from rawaug.files import require_writable, write_json
+from rawaug.kernels.runtime import find_device
+
+ON_PAGE = 4
+
+
+def run(
+    *denoisers: str,
+    data: str = "demo:test",
+    bin: int = 1,
+    count: int = 6,
+    crop: int = 384,
+    seed: int = 0,
+    device: str = "cpu",
+    json: str | None = None,
+    report: str | None = None,
+) -> None:
+    """Compare denoisers on the same frozen noise over clean references.
+
+    The noisy input, NonLocalMeans and the shipped denoisers are always in the table.
+
+    Args:
+        denoisers: names of shipped denoisers or filters, .safetensors files (also the published weights of PMRID and
+            BF-DnCNN), .onnx files, or package.module:function, called with noisy packed RAW and its variance.
+        data: clean RAW frames: a folder, a file, or kind:path.
+        bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
+        count: number of frames.
+        crop: side of the middle of each frame that is used, in pixels of the mosaic.
+        seed: of the noise.
+        device: device for networks: cpu, cuda, ...
+        json: write the result as JSON to this file.
+        report: write an HTML page with tables and crops to this file.
+
+    Raises:
+        FileNotFoundError, ValueError: if a denoiser or a frame cannot be read, or a denoiser fails.
+    """
+    for path in filter(None, (json, report)):
+        require_writable(path)
+    where = find_device(device)
+    contestants: dict[str, Contestant] = {}
+    for spec in dict.fromkeys(("NonLocalMeans", *shipped(), *denoisers)):
+        one = contestant(spec, where)
+        name = one.name if one.name not in contestants else spec
+        contestants[name] = one._replace(name=name)
+    frames = list(islice(open_pairs(data, split="test", bin=bin), count))
+    everyone = list(contestants.values())
+    result = {"data": data, "bin": bin, "crop": crop, **benchmark(everyone, frames, crop, seed)}
+    for title, head, cells in tables(result):
+        print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
+    print("GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development.")
+    print(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
+    if json:
+        write_json(result, json)
+    if report:
+        page = Page(f"Denoisers on {data}, noisy input {result['hash']}")
+        page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
+        for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed):
+            page.add_frame(row, cfa)
+        settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}
+        print(f"page: {page.write(Path(report), settings)}")

@@ -1,0 +1,211 @@
+r"""Denoisers side by side: the same frozen noise on the same clean references, at four strengths.
+
+.. math:: \operatorname{var}(y) = \mathrm{shot\_var}\, y + \mathrm{read\_var}
+
+Each denoiser is told the levels as they are, and once more as they are estimated from the noisy frame, which is what a
+photographer has. A second table has sensors as they are: hot pixels, banding, black levels and colours that are a
+little off, rounding to 12 bits. A reference is the middle of a frame, binned by colour site if it has noise of its own.
+A denoiser is what :func:`rawaug.evaluation.contestants.contestant` finds. The hash of all noisy inputs says whether the
+figures of two people can be compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.contestants import Contestant
+from rawaug.evaluation.scores import compared
+from rawaug.evaluation.tables import METRICS, Row
+from rawaug.noise import FixedLevels, SensorNoise, ShotReadNoise, estimate_noise
+from rawaug.progress import progress
+from rawaug.seeding import keyed_generator
+
+STRENGTHS = {
+    "base ISO": (2e-5, 1e-8),
+    "phone": (1.8e-3, 1.2e-5),
+    "strong": (7e-3, 1.8e-4),
+    "very strong": (2.8e-2, 2.5e-3),
+}
+"""(shot_var, read_var): a large sensor at ISO 100; Google's Pixel at ISO 800 and 3200 by its tags; two stops more."""
+SENSOR: dict[str, Any] = {
+    "row_var": 2e-6,
+    "black_offset_sd": 5e-4,
+    "colour_bias_sd": 5e-4,
+    "hot": 2e-4,
+    "bits": 12,
+    "black_level": 64,
+}
+"""What sensors do besides, at every strength."""
+TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
+
+
+@dataclass
+class Column:
+    """The noisy inputs of one strength under one condition, a sample a frame; frames that cannot be had are None."""
+
+    condition: str
+    strength: str
+    samples: list[Sample | None] = field(default_factory=list)
+
+
+def columns_of(frames: Sequence[Pair], crop: int, seed: int = 0) -> list[Column]:
+    """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
+
+    Noise is put on whole frames, from which the levels are estimated.
+    """
+    columns = {
+        (condition, name): Column(condition, name) for condition in (TOLD, ESTIMATED, REAL) for name in STRENGTHS
+    }
+    for frame in progress(frames, label="noise", unit="frame"):
+        for name in STRENGTHS:
+            told, real = (noisy_sample(frame, name, seed, real) for real in (False, True))
+            for condition, sample in ((TOLD, told), (ESTIMATED, _estimated(told, frame.cfa)), (REAL, real)):
+                columns[condition, name].samples.append(sample and middle_of(sample, crop))
+    return list(columns.values())
+
+
+def noisy_sample(frame: Pair, strength: str, seed: int, real: bool = False) -> Sample:
+    """A whole frame with noise of a strength, ``(1, 4, h, w)``."""
+    shot_var, read_var = STRENGTHS[strength]
+    levels = FixedLevels(shot_var, read_var)
+    noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
+    clean = bayer.pack(frame.raw[None], frame.cfa)
+    params = noise.sample(1, keyed_generator(seed, "benchmark", strength, frame.name))
+    noisy = noise.apply(clean, params)
+    return Sample(noisy, clean, shot_var * noisy.clamp_min(0.0) + read_var)
+
+
+def _estimated(sample: Sample, cfa: CFA) -> Sample | None:
+    try:
+        found = estimate_noise(bayer.unpack(sample.noisy, cfa)[0], cfa)
+    except ValueError:  # too little of the frame is flat
+        return None
+    return Sample(sample.noisy, sample.clean, found.shot_var * sample.noisy.clamp_min(0.0) + found.read_var)
+
+
+def middle_of(sample: Sample, crop: int) -> Sample:
+    """The middle of packed RAW as :meth:`rawaug.data.Pair.middle` takes it, ``crop`` pixels of the mosaic."""
+    top, left = ((2 * side - crop) // 4 if 2 * side > crop else 0 for side in sample.noisy.shape[-2:])
+    side = crop // 2
+    return Sample(*(image[..., top : top + side, left : left + side].contiguous() for image in sample))
+
+
+def hash_of(columns: Sequence[Column]) -> str:
+    """Eight digits of the SHA-256 of all noisy inputs, in steps of 2^-12, which processors do not round differently."""
+    digest = hashlib.sha256()
+    for column in columns:
+        for sample in column.samples:
+            if sample is not None:
+                digest.update((sample.noisy * 4096).round().to(torch.int32).numpy().tobytes())
+    return digest.hexdigest()[:8]
+
+
+def benchmark(contestants: Sequence[Contestant], frames: Sequence[Pair], crop: int, seed: int = 0) -> dict[str, Any]:
+    """Scores of every denoiser, beside those of the noisy input.
+
+    Args:
+        contestants: the denoisers, with names of their own.
+        frames: the references.
+        crop: side of the middle that is scored, in pixels of the mosaic.
+        seed: of the noise.
+
+    Returns:
+        ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
+        condition and strength, means of :data:`rawaug.evaluation.tables.METRICS`.
+
+    Raises:
+        ValueError: if a denoiser fails, or its result is not finite or of another shape.
+    """
+    columns = columns_of(frames, crop, seed)
+    frames = [frame.middle(crop) for frame in frames]
+    inputs = Contestant("noisy input", lambda noisy, variance, cfa: noisy)
+    rows = {one.name: _row(one, frames, columns) for one in (inputs, *contestants)}
+    rows["noisy input"] |= {"gmac": None, "seconds": None}
+    return {"frames": [frame.name for frame in frames], "seed": seed, "hash": hash_of(columns), "rows": rows}
+
+
+def _row(one: Contestant, frames: Sequence[Pair], columns: Sequence[Column]) -> dict[str, Any]:
+    first = next(sample for sample in columns[0].samples if sample is not None)
+    megapixels = first.noisy.numel() / 1e6
+    with FlopCounterMode(display=False) as counter:  # of what PyTorch computes; it warms up, too
+        denoised_by(one, first, frames[0].cfa)
+    gmac = counter.get_total_flops() / 2e9 / megapixels
+    scores: dict[str, dict[str, dict[str, float]]] = {}
+    seconds: list[float] = []
+    for column in progress(columns, label=one.name, unit="column"):
+        found = []
+        for frame, sample in zip(frames, column.samples, strict=True):
+            if sample is None:
+                continue
+            start = time.perf_counter()
+            denoised = denoised_by(one, sample, frame.cfa)
+            seconds.append((time.perf_counter() - start) / (sample.noisy.numel() / 1e6))
+            found.append(compared(denoised, sample.clean, frame.cfa, frame))
+        means: dict[str, float] = dict(zip(METRICS, map(fmean, zip(*found, strict=True)), strict=True)) if found else {}
+        scores.setdefault(column.condition, {})[column.strength] = means | {"frames": len(found)}
+    return {"gmac": round(gmac, 2) or None, "seconds": round(fmean(seconds), 3), "scores": scores}
+
+
+def denoised_by(one: Contestant, sample: Sample, cfa: CFA) -> Tensor:
+    """The denoiser's result, checked.
+
+    Raises:
+        ValueError: naming the denoiser, if it fails, or its result is not finite or of another shape.
+    """
+    try:
+        with torch.inference_mode():
+            denoised = one.run(sample.noisy.clone(), sample.variance.clone(), cfa)
+    except Exception as error:  # anybody's function
+        raise ValueError(f"{one.name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+    if denoised.shape != sample.noisy.shape or not denoised.isfinite().all():
+        shape = f"{tuple(denoised.shape)} for {tuple(sample.noisy.shape)}"
+        raise ValueError(f"{one.name}: the result is not finite, or of another shape: {shape}")
+    return denoised.float()
+
+
+def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
+    """Title, columns and cells of each condition's table; of frames whose levels cannot be estimated there are none."""
+    for condition in (TOLD, ESTIMATED, REAL):
+        scored = {name: at["frames"] for name, at in result["rows"]["noisy input"]["scores"][condition].items()}
+        count = len(result["frames"])
+        head = [name if n == count else f"{name} ({n} of {count} frames)" for name, n in scored.items()]
+        head += ["SSIM, strong", "GMAC", "s"] if condition == TOLD else []
+        cells = {}
+        for name, row in result["rows"].items():
+            scores = row["scores"][condition]
+            cells[name] = [_both(scores[strength]) for strength in STRENGTHS]
+            if condition == TOLD:
+                costs = ["" if row[key] is None else f"{row[key]:.2f}" for key in ("gmac", "seconds")]
+                cells[name] += [f"{scores['strong']['ssim']:.4f} / {scores['strong']['ssim_srgb']:.4f}", *costs]
+        yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frames", head, cells
+
+
+def _both(scores: Mapping[str, float]) -> str:
+    return f"{scores['psnr']:.2f} / {scores['psnr_srgb']:.2f}" if scores["frames"] else "-"
+
+
+def crops(
+    contestants: Sequence[Contestant], frames: Sequence[Pair], crop: int, seed: int = 0
+) -> Iterator[tuple[Row, CFA]]:
+    """Pictures for the page: each frame with strong noise, by every denoiser, and clean."""
+    for frame in frames:
+        sample = middle_of(noisy_sample(frame, "strong", seed), crop)
+        row = Row(frame.middle(crop), {"noisy": sample.noisy}, {})
+        for one in contestants:
+            row.panels[one.name] = denoised_by(one, sample, frame.cfa)
+        row.panels["clean"] = sample.clean
+        for name, panel in row.panels.items():
+            row.captions[name] = f"{compared(panel, sample.clean, frame.cfa, row.pair)[0]:.2f} dB"
+        yield row, frame.cfa

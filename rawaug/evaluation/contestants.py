@@ -1,0 +1,191 @@
+"""What :mod:`rawaug.evaluation.benchmark` compares: anything that makes clean RAW of noisy RAW, by one string.
+
+A shipped denoiser or a classical filter by its name; a ``.safetensors`` of rawaug, of PMRID's authors or of BF-DnCNN;
+an ``.onnx``; or ``package.module:function``, a function of noisy packed RAW ``(1, 4, h, w)``, R, Gr, Gb, B, white at 1,
+and of its noise variance, or of noisy RAW alone.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+import denoisers
+from denoisers.classical import Stabilised
+from denoisers.domains import levels_of
+from denoisers.files import find, shipped
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Sample
+from rawaug.errors import extra
+from rawaug.evaluation.scores import denoise
+from rawaug.files import read_tensors
+from rawaug.noise import anscombe
+from rawaug.registry import FILTERS, nearest
+
+_AGAIN = "download or convert it again"
+
+
+class Contestant(NamedTuple):
+    """A denoiser: its name in tables, and ``run(noisy, variance, cfa) -> clean``, packed RAW ``(1, 4, h, w)``."""
+
+    name: str
+    run: Callable[[Tensor, Tensor, CFA], Tensor]
+
+
+def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
+    """The denoiser that a string names; see the module.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is none such, or its file is damaged; in one line.
+    """
+    path = Path(spec)
+    if path.suffix == ".onnx":
+        return Contestant(path.stem, _of_onnx(path))
+    if path.suffix == ".safetensors" and path.is_file():
+        return _of_weights(path, torch.device(device))
+    if ":" in spec:
+        return Contestant(spec, _of_function(spec))
+    if spec in shipped() or path.suffix:
+        return _of_network(spec, *_loaded(find(spec)), torch.device(device))
+    if spec in FILTERS:
+        return Contestant(spec, _of_filter(spec))
+    known = [*shipped(), *FILTERS]
+    raise ValueError(
+        f"{spec}: no such denoiser{nearest(spec, known)}; give one of {', '.join(known)}, a .safetensors, an .onnx, or "
+        "package.module:function"
+    )
+
+
+def published_pmrid(path: str | Path) -> denoisers.PMRID:
+    """PMRID with the weights of its authors.
+
+    Raises:
+        FileNotFoundError, ValueError: if there is no such file, or it does not fit the network.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"pmrid: {path}: no such file")
+    model = denoisers.PMRID()
+    try:
+        model.load_state_dict(read_tensors(path, _AGAIN)[1])
+    except RuntimeError as error:
+        raise ValueError(f"pmrid: {path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
+    return model.eval()
+
+
+def bf_dncnn(weights: Mapping[str, Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+    r"""Bias-free DnCNN for white noise, on each plane of RAW in Anscombe's domain: ``run(noisy, variance)``.
+
+    .. math:: u = (z - z(0)) / (z(1) - z(0)), \qquad u' = u - f(u), \qquad y' = z^{-1}(u' (z(1) - z(0)) + z(0))
+
+    with twenty 3 x 3 convolutions f without biases, normalisations folded in, and the exact unbiased inverse. Source:
+    S. Mohan, Z. Kadkhodaie, E. P. Simoncelli, C. Fernandez-Granda, "Robust and interpretable blind image denoising via
+    bias-free convolutional neural networks", ICLR 2020.
+
+    Args:
+        weights: ``conv00`` to ``conv19``, each ``(out, in, 3, 3)``.
+    """
+    *layers, last = (weights[name] for name in sorted(weights))
+
+    def grey(u: Tensor) -> Tensor:
+        features = u
+        for layer in layers:
+            features = F.conv2d(features, layer, padding=1).relu_()
+        return u - F.conv2d(features, last, padding=1)
+
+    def run(noisy: Tensor, variance: Tensor) -> Tensor:
+        shot, read = (level.flatten() for level in levels_of(noisy, variance))
+        black, white = (anscombe.forward(noisy.new_full((1, 1, 1, 1), y), shot, read) for y in (0.0, 1.0))
+        u = (anscombe.forward(noisy, shot, read) - black) / (white - black)
+        planes = grey(u.flatten(0, 1)[:, None]).reshape(noisy.shape)
+        return anscombe.inverse(planes * (white - black) + black, shot, read)
+
+    return run
+
+
+def _loaded(path: Path) -> tuple[denoisers.Denoiser, CFA]:
+    model, info = denoisers.load(path)
+    return model, CFA(info.get("cfa", "RGGB"))
+
+
+def _of_weights(path: Path, device: torch.device) -> Contestant:
+    """Of rawaug, PMRID's authors or BF-DnCNN: the tensors say which."""
+    metadata, tensors = read_tensors(path, _AGAIN)
+    if metadata.get("format") == "rawaug":
+        return _of_network(path.stem, *_loaded(path), device)
+    if "conv00" in tensors:
+        run = bf_dncnn({name: tensor.to(device) for name, tensor in tensors.items()})
+        return Contestant("BF-DnCNN", lambda noisy, variance, _: run(noisy.to(device), variance.to(device)).cpu())
+    if "conv0.conv.weight" in tensors:
+        return _of_network("PMRID, published weights", published_pmrid(path), CFA.RGGB, device)
+    raise ValueError(f"{path}: weights of no known denoiser; give its function as package.module:function")
+
+
+def _of_network(name: str, model: denoisers.Denoiser, own: CFA, device: torch.device) -> Contestant:
+    model = model.to(device)
+    return Contestant(name, lambda noisy, variance, cfa: denoise(model, Sample(noisy, noisy, variance), cfa, own=own))
+
+
+def _of_filter(name: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
+    if reason := FILTERS.make(name).missing():
+        raise ValueError(f"{name}: {reason}")
+    stabilised = Stabilised(FILTERS.make(name), anscombe)
+
+    def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
+        shot, read = (level.flatten() for level in levels_of(noisy, variance))
+        return stabilised(noisy, shot_var=shot, read_var=read)
+
+    return run
+
+
+def _of_onnx(path: Path) -> Callable[[Tensor, Tensor, CFA], Tensor]:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with extra("export"):
+        import onnxruntime
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime has a class of its own for each reason
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    names = [value.name for value in session.get_inputs()]
+    if not 1 <= len(names) <= 2:
+        raise ValueError(f"{path}: takes {', '.join(names)}; a denoiser takes noisy RAW, or noisy RAW and its variance")
+
+    def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
+        images = zip(names, (noisy.numpy(), variance.numpy()), strict=False)
+        return torch.from_numpy(session.run(None, dict(images))[0])
+
+    return run
+
+
+def _of_function(spec: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
+    module, _, name = spec.partition(":")
+    sys.path.insert(0, str(Path.cwd()))  # as python -m does
+    try:
+        function = getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{spec}: cannot be imported: {error}") from None
+    finally:
+        sys.path.pop(0)
+    reads_variance = _positional(function) > 1
+
+    def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
+        return torch.as_tensor(function(noisy, variance) if reads_variance else function(noisy)).to(noisy)
+
+    return run
+
+
+def _positional(function: Callable[..., Any]) -> int:
+    """How many arguments a function takes by place, without those that have a default."""
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    parameters = inspect.signature(function).parameters.values()
+    return sum(one.kind in kinds and one.default is one.empty for one in parameters)
