@@ -22,6 +22,7 @@ from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.pairs import Binned, LazyPairs, Pair
 from rawaug.data.published import Rawir, Rgb2Raw, Zurich, fivek_pairs
+from rawaug.data.real import RealFrames
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission, write_submission
 from rawaug.data.sidd.frames import SiddFrames
 from rawaug.io.pictures import MAX_PIXELS
@@ -38,6 +39,7 @@ __all__ = [
     "PictureFolder",
     "RawFolder",
     "Rawir",
+    "RealFrames",
     "Rgb2Raw",
     "Shapes",
     "SiddBenchmark",

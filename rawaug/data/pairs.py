@@ -54,6 +54,7 @@ class Pair:
         noisy_srgb: the camera's picture of ``noisy``, like ``srgb``, where there is one.
         levels_from_clean: whether ``shot_var`` and ``read_var`` were measured against ``raw``, which a denoiser that is
             tested must not know.
+        own_noise: (shot_var, read_var) of the noise that ``raw`` itself has, where it was measured.
         color_known: whether ``white_balance`` and ``color_matrix`` are the camera's; without them no ISP can be fitted.
 
     Raises:
@@ -76,6 +77,7 @@ class Pair:
     levels_from_clean: bool = False
     color_known: bool = True
     iso: float | None = None
+    own_noise: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cfa", CFA(self.cfa))  # or its name
@@ -152,6 +154,8 @@ class Pair:
             changed[key] = bin_mosaic(cut, self.cfa, factor) if len(cut) == 1 else _bin_picture(cut, factor)
         if self.shot_var is not None and self.read_var is not None:
             changed |= {"shot_var": self.shot_var / factor**2, "read_var": self.read_var / factor**2}
+        if self.own_noise is not None:
+            changed["own_noise"] = (self.own_noise[0] / factor**2, self.own_noise[1] / factor**2)
         return replace(self, **changed)
 
     def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:

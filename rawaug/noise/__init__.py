@@ -19,6 +19,8 @@ from rawaug.noise.estimate import (
     NoisePoints,
     estimate_noise,
     from_dark_frames,
+    own_noise,
+    own_noise_share,
     plot_noise,
 )
 from rawaug.noise.levels import EldLevels, FixedLevels, NoiseLevels, PmridLevels, Preset, SiddLevels
@@ -43,5 +45,6 @@ __all__ = [
     "NoiseEstimate", "NoiseLevels", "NoiseModel", "NoisePoints", "NoiseSpec", "Params", "PmridLevels",
     "PoissonGaussianNoise", "Preset", "Quantisation", "RowNoise", "ScaledLevels", "SensorNoise", "ShotReadModel",
     "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise", "camera_law", "camera_names", "estimate_noise",
-    "from_dark_frames", "noise_levels", "noise_model", "noise_names", "plot_noise",
+    "from_dark_frames", "noise_levels", "noise_model", "noise_names", "own_noise", "own_noise_share",
+    "plot_noise",
 ]  # fmt: skip

@@ -37,6 +37,8 @@ from rawaug.errors import extra, printable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from rawaug.data.pairs import Pair
+
 
 BLOCK = 8
 _order = torch.arange(BLOCK)[:, None] + torch.arange(BLOCK)
@@ -55,6 +57,7 @@ _CLIP_MARGIN = 4.0  # in standard deviations of a pixel
 _MIN_BLOCKS = 30  # a level's
 _MIN_POINTS = 6
 _ROUNDS = 10
+_WORST_FIT = 0.5  # R^2 below which the points follow no line
 
 _OUTLIER = 8.0  # in robust standard deviations: hot pixels, not tails
 _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can be measured
@@ -262,6 +265,41 @@ def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) ->
 def _r2(points: NoisePoints, shot_var: float, read_var: float) -> float:
     x, y = points.signal[points.used], points.variance[points.used]
     return float(1 - (y - shot_var * x - read_var).square().sum() / (y - y.mean()).square().sum())
+
+
+def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
+    """(shot_var, read_var) of the noise that a reference has itself; None where neither stated nor measurable.
+
+    Binned frames are measured before they are binned, where enough flat blocks are left.
+
+    Example:
+        >>> from rawaug.data import open_pairs
+        >>> own_noise(open_pairs("real:test", bin=2), 0)  # doctest: +ELLIPSIS
+        (1.9...e-06, 1.0...e-08)
+    """
+    from rawaug.data.pairs import Binned  # late: measuring noise needs no datasets
+
+    pair = pairs[index]
+    if pair.own_noise is not None:
+        return pair.own_noise
+    whole, factor = (pairs.pairs[index], pairs.factor) if isinstance(pairs, Binned) else (pair, 1)
+    try:
+        estimate = estimate_noise(whole.raw, whole.cfa)
+    except ValueError:
+        return None
+    return None if estimate.r2 < _WORST_FIT else (estimate.shot_var / factor**2, estimate.read_var / factor**2)
+
+
+def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:
+    """The part of a mean squared error that the own noise of the reference makes up: a denoiser that leaves none has 1.
+
+    Args:
+        levels: of :func:`own_noise`.
+        reference: RAW of any shape, black 0, white 1.
+        squared_error: the mean over the reference, on this scale.
+    """
+    shot_var, read_var = levels
+    return (shot_var * float(reference.mean()) + read_var) / squared_error
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""Make the frames of ``real:`` from the camera files that they come from.
+
+    python -m benchmarks.real_frames CAMERA_FILES [--out rawaug/data/real_frames]
+
+CAMERA_FILES is a folder with ``raw/canon/*.crw`` and ``raw_jpeg/gopro/hero7_*.dng``, all CC0. Every frame is binned
+4 x 4 by colour site, which leaves a sixteenth of its own noise, and stored in 14 of 16 bits as a PNG of its planes R,
+Gr, Gb, B from top to bottom; ``frames.json`` says what else is known. The own noise is measured on the whole frame and
+divided by 16.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from rawaug.bayer import bin_mosaic, pack
+from rawaug.data.real import BLACK, FACTOR, FRAMES, WHITE
+from rawaug.io import RawFrame, read_raw
+from rawaug.noise import estimate_noise
+
+SPLITS = {
+    "train": ("raw/canon/s40_0101.crw", "raw/canon/s40_0104.crw", "raw/canon/s40_0112.crw"),
+    "validation": ("raw/canon/g2_0304.crw", "raw/canon/g2_0313.crw"),
+    "test": (
+        *("raw/canon/s40_0117.crw", "raw/canon/s40_0119.crw"),
+        *("raw_jpeg/gopro/hero7_8508.dng", "raw_jpeg/gopro/hero7_8513.dng"),
+    ),
+}
+"""No scene of a camera is in two splits; validation, and half of the test, are of cameras that no other split has."""
+
+
+def numbers_of(frame: RawFrame) -> np.ndarray:
+    """The binned planes as digital numbers, uint16 ``(4 h, w)``."""
+    height, width = (side // (2 * FACTOR) * 2 * FACTOR for side in frame.mosaic.shape[-2:])
+    binned = bin_mosaic(frame.mosaic[:, :height, :width].double(), frame.cfa, FACTOR)
+    planes = pack(binned * (WHITE - BLACK) + BLACK, frame.cfa).round()
+    if not 0 <= planes.min() <= planes.max() <= WHITE:
+        raise ValueError(f"{frame.name}: has numbers from {planes.min():g} to {planes.max():g}, outside 0 to {WHITE}")
+    return planes.reshape(-1, planes.shape[-1]).numpy().astype(np.uint16)
+
+
+def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
+    """What ``frames.json`` says of a frame."""
+    estimate = estimate_noise(frame.mosaic, frame.cfa)
+    return {
+        "split": split,
+        "camera": frame.camera,
+        "iso": frame.iso,
+        "cfa": str(frame.cfa),
+        "white_balance": frame.white_balance,
+        "color_matrix": frame.color_matrix.tolist(),
+        "own_noise": [estimate.shot_var / FACTOR**2, estimate.read_var / FACTOR**2],
+        "source": file.name,
+        "source_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("camera_files", type=Path)
+    parser.add_argument("--out", type=Path, default=Path(str(FRAMES)))
+    args = parser.parse_args(arguments)
+    args.out.mkdir(parents=True, exist_ok=True)
+    frames = {}
+    for split, names in SPLITS.items():
+        for name in names:
+            file = args.camera_files / name
+            frame = read_raw(file)
+            Image.fromarray(numbers_of(frame)).save(args.out / f"{file.stem}.png", optimize=True)
+            frames[file.stem] = described(file, frame, split)
+    (args.out / "frames.json").write_text(json.dumps(frames, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""The frames that travel with the package: where they come from, and that the splits share nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rawaug.data import open_pairs
+from rawaug.data.real import FACTOR, FRAMES
+from rawaug.io import read_raw
+from rawaug.noise import own_noise
+
+
+def test_every_split_is_read_and_states_what_is_known() -> None:
+    splits = {split: open_pairs(f"real:{split}") for split in ("train", "validation", "test")}
+    assert [len(pairs) for pairs in splits.values()] == [3, 2, 4]
+    assert len({name for pairs in splits.values() for name in pairs.names}) == 9  # type: ignore[attr-defined]
+    cameras = {split: {pair.camera for pair in pairs} for split, pairs in splits.items()}
+    assert not cameras["validation"] & (cameras["train"] | cameras["test"])
+    for pair in (pair for pairs in splits.values() for pair in pairs):
+        assert pair.color_known and pair.balance_known and pair.iso and pair.noisy is None
+        assert -0.01 < pair.raw.min() < 0.02 and pair.raw.max() <= 1.0 and pair.srgb.float().std() > 10
+        assert pair.own_noise is not None and 1e-7 < pair.own_noise[0] * pair.raw.mean() + pair.own_noise[1] < 3e-6
+    with pytest.raises(ValueError, match="real:all: unknown split; use one of train, validation, test"):
+        open_pairs("real:all")
+
+
+def test_they_stay_small_and_have_their_licence() -> None:
+    folder = Path(str(FRAMES))
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
+    assert "CC0 1.0" in (folder / "LICENCE.md").read_text()
+
+
+def test_the_maker_makes_them_of_the_camera_files(camera_files: Path, tmp_path: Path) -> None:
+    from benchmarks.real_frames import SPLITS, described, numbers_of
+
+    for split, name in (("test", "raw/canon/s40_0117.crw"), ("train", "raw/canon/s40_0112.crw")):
+        file = camera_files / name
+        assert name in SPLITS[split]
+        frame = read_raw(file)
+        assert np.array_equal(np.array(Image.open(Path(str(FRAMES)) / f"{file.stem}.png")), numbers_of(frame))
+        said = json.loads(json.dumps(described(file, frame, split)))
+        kept = json.loads((Path(str(FRAMES)) / "frames.json").read_text())[file.stem]
+        assert said.pop("own_noise") == pytest.approx(kept.pop("own_noise"), rel=1e-3) and said == kept
+
+
+def test_binning_leaves_a_sixteenth_of_the_noise(camera_files: Path) -> None:
+    """Measured on what is left: the difference of the two greens of a flat part of a chart."""
+    (pair,) = (pair for pair in open_pairs("real:train") if pair.name == "s40_0101")
+    levels = own_noise([pair], 0)
+    assert levels is not None
+    flat = pair.raw[0, 380:396, 250:300]  # of the patch of neutral grey
+    gr, gb = flat[0::2, 1::2], flat[1::2, 0::2]
+    expected = levels[0] * flat.mean().item() + levels[1]
+    assert ((gr - gb).var() / 2).item() == pytest.approx(expected, rel=0.5) and FACTOR == 4
