@@ -134,16 +134,67 @@ def mosaic(rgb: Tensor, cfa: CFA | str) -> Tensor:
     return unpack(pack_rgb(rgb, cfa), cfa)
 
 
-def demosaic(raw: Tensor, cfa: CFA | str) -> Tensor:
-    """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)`` by bilinear interpolation: stage f6."""
-    # kornia names the cell by its second row and column, as OpenCV does: BG is RGGB. Imported late: it is slow to load.
-    from kornia.color import CFA as KorniaCFA
-    from kornia.color import raw_to_rgb
+# A colour that a site lacks, from its surroundings, in eighths: green at red or blue; a colour at a green whose
+# neighbours along the row have it (turned, along the column); red at blue or blue at red.
+STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
+    "bilinear": (
+        torch.tensor([[0.0, 2, 0], [2, 0, 2], [0, 2, 0]]),
+        torch.tensor([[0.0, 0, 0], [4, 0, 4], [0, 0, 0]]),
+        torch.tensor([[2.0, 0, 2], [0, 0, 0], [2, 0, 2]]),
+    ),
+    "malvar": (
+        torch.tensor([[0.0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]),
+        torch.tensor([[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]]),
+        torch.tensor([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]]),
+    ),
+}
 
+
+def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
+    """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``: stage f6; each site keeps the colour that it measured.
+
+    Args:
+        raw: sides even, and at least 4 for ``malvar``.
+        cfa: its pattern.
+        method: ``bilinear``, or ``malvar``: the missing colour follows its neighbours, corrected by the Laplacian of
+            the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
+            Bayer-patterned color images", ICASSP 2004).
+    """
     _require_channels(raw, 1, "a mosaic")
     _require_even(*raw.shape[-2:])
-    names = {CFA.RGGB: KorniaCFA.BG, CFA.BGGR: KorniaCFA.RG, CFA.GRBG: KorniaCFA.GB, CFA.GBRG: KorniaCFA.GR}
-    return raw_to_rgb(raw, names[CFA(cfa)])
+    stencils, kinds = demosaicing(cfa, method)
+    edge = stencils.shape[-1] // 2
+    padded = F.pad(raw, (edge, edge, edge, edge), mode="reflect")  # about the border sites: the pattern stays
+    found = torch.cat([raw, F.conv2d(padded, stencils[:, None].to(raw))], dim=1)
+    rgb = raw.new_empty(len(raw), 3, *raw.shape[-2:])
+    for channel, rows in enumerate(kinds):
+        for i, row in enumerate(rows):
+            for j, kind in enumerate(row):
+                rgb[:, channel, i::2, j::2] = found[:, kind, i::2, j::2]
+    return rgb
+
+
+@lru_cache
+def demosaicing(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
+    """Four stencils ``(4, K, K)``, and which one makes a colour at a site: ``kinds[colour][row][column]``, 0 for none.
+
+    Raises:
+        ValueError: if the method is unknown.
+    """
+    if method not in STENCILS:
+        raise ValueError(f"demosaicing {method!r} is unknown; use one of {', '.join(STENCILS)}")
+    cross, along_row, diagonal = STENCILS[method]
+    own = CFA(cfa).channels
+
+    def kind(colour: int, i: int, j: int) -> int:
+        if own[i][j] == colour:
+            return 0
+        if own[i][j] == 1:
+            return 2 if own[i][1 - j] == colour else 3
+        return 1 if colour == 1 else 4
+
+    kinds = [[[kind(colour, i, j) for j in (0, 1)] for i in (0, 1)] for colour in range(3)]
+    return torch.stack([cross, along_row, along_row.T, diagonal]) / 8, kinds
 
 
 def turn(image: Tensor, view: int) -> Tensor:

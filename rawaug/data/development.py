@@ -6,22 +6,16 @@ with X from XYZ to the camera (DNG's ColorMatrix) and S from linear sRGB to XYZ 
 white balance is the inverse of DNG's AsShotNeutral. There is no tone curve but sRGB's, as in SIDD's pictures
 (A. Abdelhamed, S. Lin, M. S. Brown, CVPR 2018).
 
-Pictures of pairs are demosaiced by gradient-corrected linear interpolation,
-
-    c^(i, j) = bilinear c(i, j) + alpha_c Laplacian of the colour known at (i, j),    alpha = 1/2, 5/8, 3/4
-
-as 5 x 5 kernels: the missing colour follows its neighbours, corrected by how the known colour bends there. Source:
-H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned color images",
-ICASSP 2004. Scores and figures take bilinear interpolation, which treats all denoisers alike.
+Pictures of pairs are demosaiced by Malvar, He and Cutler's interpolation; scores and figures take bilinear
+interpolation, which treats all denoisers alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
@@ -71,7 +65,7 @@ def developed(
         cfa: its pattern.
         gains: multipliers of R, G, B.
         matrix: ``(3, 3)``, white-balanced camera colour to linear sRGB.
-        demosaicing: a name of :data:`DEMOSAICINGS`.
+        demosaicing: of :func:`rawaug.bayer.demosaic`.
         exposure: a factor on all colours.
         least: camera colour is clipped at; None keeps the zero-mean noise of shadows until it is sRGB.
 
@@ -79,7 +73,7 @@ def developed(
         >>> developed(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
         0.735...
     """
-    rgb = DEMOSAICINGS[demosaicing](raw, cfa)
+    rgb = bayer.demosaic(raw[None], cfa, demosaicing)[0]
     balanced = (rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)).clamp(least, 1)
     return encode_srgb(torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1))
 
@@ -100,54 +94,3 @@ def exposure_of(packed: Tensor, pair: Pair) -> float:
     green = packed[:, 1:3].flatten()
     stride = max(1, green.numel() // 1_000_000)
     return float(0.9 / torch.quantile(green[::stride], 0.99).clamp_min(1e-3)) / max(1.0, min(pair.white_balance))
-
-
-_GREEN_AT_RED_OR_BLUE = (
-    (0, 0, -1, 0, 0),
-    (0, 0, 2, 0, 0),
-    (-1, 2, 4, 2, -1),
-    (0, 0, 2, 0, 0),
-    (0, 0, -1, 0, 0),
-)
-_AT_GREEN_ALONG_ROW = (
-    (0, 0, 0.5, 0, 0),
-    (0, -1, 0, -1, 0),
-    (-1, 4, 5, 4, -1),
-    (0, -1, 0, -1, 0),
-    (0, 0, 0.5, 0, 0),
-)
-_RED_AT_BLUE = (
-    (0, 0, -1.5, 0, 0),
-    (0, 2, 0, 2, 0),
-    (-1.5, 0, 6, 0, -1.5),
-    (0, 2, 0, 2, 0),
-    (0, 0, -1.5, 0, 0),
-)
-
-
-def demosaic_malvar(raw: Tensor, cfa: CFA | str) -> Tensor:
-    """Mosaic ``(1, H, W)`` to ``(3, H, W)``, float32, sides even and at least 4; sites keep their own colour."""
-    along_row = torch.tensor(_AT_GREEN_ALONG_ROW)
-    kernels = torch.stack([torch.tensor(_GREEN_AT_RED_OR_BLUE), along_row, along_row.T, torch.tensor(_RED_AT_BLUE)])
-    # reflection about the border sites keeps the pattern
-    padded = F.pad(raw[None], (2, 2, 2, 2), mode="reflect")
-    green, row, column, opposite = F.conv2d(padded, kernels[:, None].to(raw) / 8)[0]
-    known = raw[0]
-    colours_at = {  # (R, G, B) at the sites R, Gr, Gb, B
-        0: (known, green, opposite),
-        1: (row, known, column),
-        2: (column, known, row),
-        3: (opposite, green, known),
-    }
-    rgb = raw.new_empty(3, *raw.shape[-2:])
-    for site, (i, j) in enumerate(CFA(cfa).sites):
-        for channel, plane in enumerate(colours_at[site]):
-            rgb[channel, i::2, j::2] = plane[i::2, j::2]
-    return rgb
-
-
-DEMOSAICINGS: dict[str, Callable[[Tensor, CFA | str], Tensor]] = {
-    "bilinear": lambda raw, cfa: bayer.demosaic(raw[None], cfa)[0],
-    "malvar": demosaic_malvar,
-}
-"""Mosaic ``(1, H, W)`` to ``(3, H, W)``."""

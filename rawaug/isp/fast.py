@@ -31,6 +31,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from rawaug import bayer
 from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
@@ -144,7 +145,7 @@ class FastForward(nn.Module):
         >>> isp = DictionaryISP.from_pretrained("universal")
         >>> develop, raw = FastForward(isp), torch.rand(2, 1, 32, 32)
         >>> setting = isp.draw_setting(2, torch.Generator().manual_seed(0))
-        >>> develop(bayer.demosaic(raw, isp.cfa), setting).shape
+        >>> develop(demosaic(raw, isp.cfa, "malvar"), setting).shape
         torch.Size([2, 3, 32, 32])
     """
 
@@ -192,6 +193,13 @@ class FastForward(nn.Module):
             light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
             curves = to_code(light, curves)[:, 0, 0]
         return Display(table, curves, self.attention, torch.linalg.pinv(matrix) / floor, frame, shading)
+
+
+def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
+    """:func:`rawaug.bayer.demosaic` by compiled loops where it can; float32 ``(B, 1, H, W)`` to ``(B, 3, H, W)``."""
+    if raw.device.type != "cpu" or not runtime.has_numba() or (raw.requires_grad and torch.is_grad_enabled()):
+        return bayer.demosaic(raw, cfa, method)
+    return fastest("demosaic", raw, cfa, method, otherwise=lambda: bayer.demosaic(raw, cfa, method))
 
 
 def _require_usual_order(isp: DictionaryISP) -> None:

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from llvmlite import ir
 from numba import types
 from numba.core.typing.templates import Signature
@@ -18,6 +19,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
+from rawaug.bayer import CFA, demosaicing
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compiled, over_rows, part
 
@@ -77,6 +79,18 @@ def render(linear: Tensor, display: Display) -> Tensor:
     settings = (table, curves, attention, matrix, frame, shading)
     over_rows(batch * height, 3 * width, lambda start, stop: _srgb_rows(x5, *settings, out, start, stop))
     return srgb
+
+
+def demosaic(raw: Tensor, cfa: CFA | str, method: str) -> Tensor:
+    """:func:`rawaug.bayer.demosaic` of a mosaic ``(B, 1, H, W)``, float32 on the CPU."""
+    batch, _, height, width = raw.shape
+    rgb = torch.empty(batch, 3, height, width, dtype=torch.float32)
+    stencils, kinds = demosaicing(cfa, method)
+    edge = stencils.shape[-1] // 2
+    source = F.pad(raw.detach(), (edge, edge, edge, edge), mode="reflect")[:, 0].numpy()
+    settings = (source, stencils.numpy(), np.array(kinds), rgb.numpy())
+    over_rows(batch * height, 3 * width, lambda start, stop: _demosaiced_rows(*settings, start, stop))
+    return rgb
 
 
 def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
@@ -280,6 +294,37 @@ def _raw_rows(  # type: ignore[no-untyped-def]
                     _attend(x4, channel, attention, nodes, shares, attended, white, out)
                 else:
                     _develop(x2[column], colour[b], channel, knee, mask, white, out)
+
+
+@compiled
+def _demosaiced_rows(source, stencils, kinds, rgb, start, stop):  # type: ignore[no-untyped-def]
+    """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
+    height, width = rgb.shape[2], rgb.shape[3]
+    size = stencils.shape[1]
+    found = np.empty((5, _TILE), np.float32)
+    for row in range(start, stop):
+        b, i = divmod(row, height)
+        for first in range(0, width, _TILE):
+            count = min(_TILE, width - first)
+            found[0, :count] = source[b, i + size // 2, first + size // 2 : first + size // 2 + count]
+            for k in range(4):
+                made = found[k + 1, :count]
+                made[:] = _ZERO
+                for y in range(size):
+                    for x in range(size):
+                        weight = stencils[k, y, x]
+                        if weight != _ZERO:
+                            line = source[b, i + y, first + x : first + x + count]
+                            for j in range(count):
+                                made[j] += weight * line[j]
+            for c in range(3):
+                even, odd, out = (
+                    found[kinds[c, i % 2, 0]],
+                    found[kinds[c, i % 2, 1]],
+                    rgb[b, c, i, first : first + count],
+                )
+                for j in range(count // 2):
+                    out[2 * j], out[2 * j + 1] = even[2 * j], odd[2 * j + 1]
 
 
 @part

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA, mosaic
-from rawaug.data.development import demosaic_malvar
+from rawaug.bayer import CFA, demosaic, mosaic
 from rawaug.data.pairs import Pair
 from rawaug.io import decode_srgb, encode_srgb
 
@@ -134,7 +133,8 @@ class DemoCamera:
 
     def _render(self, raw: Tensor, shot: Shot) -> Tensor:
         """The camera's own picture, uint8 ``(3, H, W)``."""
-        camera = demosaic_malvar(raw / _shading(*raw.shape[-2:]), self.cfa) * _column(shot.white_balance)
+        flat = raw / _shading(*raw.shape[-2:])
+        camera = demosaic(flat[None], self.cfa, "malvar")[0] * _column(shot.white_balance)
         linear = torch.einsum("ij,jhw->ihw", torch.tensor(self.color_matrix), camera.clamp(0, 1)).clamp(0, 1)
         return (_tone(linear) * 255).round().to(torch.uint8)
 

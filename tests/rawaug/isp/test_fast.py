@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
-from rawaug.isp.fast import BakedISP, FastForward
+from rawaug.isp.fast import BakedISP, FastForward, demosaic
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
@@ -199,3 +199,12 @@ def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
         found.append((x.grad, gains.grad))
     for ours, exact in zip(*found, strict=True):
         torch.testing.assert_close(ours, exact, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("method", bayer.STENCILS)
+@pytest.mark.parametrize("cfa", list(bayer.CFA))
+def test_compiled_demosaicing_is_the_same(cfa: bayer.CFA, method: str) -> None:
+    raw = torch.rand(2, 1, 6, 530, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(demosaic(raw, cfa, method), bayer.demosaic(raw, cfa, method), atol=1e-6, rtol=0)
+    learned = raw.requires_grad_()
+    assert demosaic(learned, cfa, method).requires_grad
