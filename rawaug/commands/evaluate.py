@@ -17,7 +17,8 @@ from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Binned, Pair
+from rawaug.evaluation.own_noise import own_noise, own_noise_note, with_own_noise
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
@@ -51,6 +52,7 @@ def run(
     views: Literal[4, 8] | None = None,
     noise: Annotated[NoiseSpec | None, YAML] = None,
     seed: int = 0,
+    bin: int = 1,
     classical: Annotated[list[Spec] | None, YAML] = None,
     device: str = "cpu",
     report: str | None = None,
@@ -67,6 +69,7 @@ def run(
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
             {name, settings}.
         seed: seed of that noise.
+        bin: K bins the frames K x K by colour site first: clean references of real photographs (denoisers).
         classical: classical filters to score on the same noise: NonLocalMeans, Wavelet, TotalVariation, BM3D.
         device: device for a denoiser: cpu, cuda, ...
         report: write an HTML page with a denoiser's scores and crops to this file.
@@ -85,9 +88,11 @@ def run(
 
     if json:
         require_writable(json)
-    more = {"first": written, **vars(settings or PairSettings())}
+    more = {"first": written, "bin": bin, **vars(settings or PairSettings())}
     result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **more)
     written(result)
+    if note := own_noise_note({"the denoiser": result, **result.get("classical", {})}):
+        print(note)
     if report:
         print(f"page: {report}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
@@ -104,6 +109,7 @@ def evaluate(
     report: str | Path | None = None,
     views: Literal[4, 8] | None = None,
     first: Callable[[dict[str, Any]], None] | None = None,
+    bin: int = 1,
     **settings: Any,
 ) -> dict[str, Any]:
     """The JSON object that ``rawaug evaluate --json`` writes; arguments as in :func:`run`.
@@ -111,6 +117,7 @@ def evaluate(
     Args:
         data: as in the command, or pairs.
         first: called with the result without self-ensemble and classical denoisers where these are still to come.
+        bin: of the frames, by colour site, see :func:`rawaug.data.open_pairs`; for denoisers.
         settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
     """
     require_classical(classical)
@@ -119,27 +126,30 @@ def evaluate(
         require_writable(report)
     weights = find_weights(weights, FOLDER)
     kind = read_header(weights)["kind"]
-    pairs = Readable(open_pairs(data, split="test", **settings))
+    frames = open_pairs(data, split="test", **settings)
+    pairs = Readable(frames if bin == 1 else Binned(frames, bin))
     data = data if isinstance(data, str) else f"{len(pairs)} pairs"
     about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
-        if self_ensemble or views or noise is not None or classical or report is not None:
-            raise ValueError(
-                f"{weights}: is an ISP; --self-ensemble, --views, --noise, --classical and --report are for denoisers"
-            )
+        if self_ensemble or views or noise is not None or classical or report is not None or bin != 1:
+            options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
+            raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
         isp = DictionaryISP.from_pretrained(weights)
         frames = progress(pairs, label="evaluate", unit="image")
         result = summary([_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames])
     else:
         scoring = _Scoring(weights, pairs, noise, seed, where)
-        result = scoring.plain()
+        result = scoring.plain() | ({} if bin == 1 else {"bin": bin})
+        own = own_noise(frames, pairs.kept(), scoring.levels, seed, bin)
+        result = with_own_noise(result, own)
         ensemble = views or (8 if self_ensemble else 1)
         if first is not None and (ensemble > 1 or classical):
             first({**about[0], **result, **about[1]})
         if ensemble > 1:
-            result = scoring.with_views(ensemble, result)
+            result = with_own_noise(scoring.with_views(ensemble, result), own)
         if classical:
-            result["classical"] = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
+            found = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
+            result["classical"] = {name: with_own_noise(scores, own) for name, scores in found.items()}
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
             page = Page.of_scores(f"{weights.stem} on {data}", {weights.stem: [runs]}, result.get("classical", {}))

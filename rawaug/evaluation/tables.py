@@ -86,8 +86,9 @@ COLUMNS = {
     "SSIM, self-ensemble": ("self_ensemble", "ssim"),
     "PSNR, sRGB": ("plain", "psnr_srgb"),
     "SSIM, sRGB": ("plain", "ssim_srgb"),
+    "own noise": ("plain", "own_noise"),
 }
-"""Columns of the table: which summary and which figure."""
+"""Columns of the table: which summary and which figure; the last one is the references' share of the squared error."""
 
 QUARTERS = {
     f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")
@@ -118,7 +119,10 @@ def table_rows(
         cells = []
         for kind, key in columns.values():
             values = [run[kind][key] for run in runs if key in run.get(kind, {})]
-            cells.append(mean_and_spread(values, 2 if "psnr" in key else 4) if values else "")
+            if key == "own_noise":
+                cells.append(f"{statistics.fmean(values):.0%}" if values else "")
+            else:
+                cells.append(mean_and_spread(values, 2 if "psnr" in key else 4) if values else "")
         rows[method] = cells
     return rows
 
@@ -152,7 +156,10 @@ def levels_note(summary: Mapping[str, Any]) -> str:
 def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
     rows = [[method, *cells] for method, cells in table_rows(results, classical, COLUMNS).items()]
-    print_rows(title, ["arm", *COLUMNS], rows)
+    columns = list(COLUMNS)
+    if not any(row[-1] for row in rows):  # of no reference the noise could be measured
+        columns, rows = columns[:-1], [row[:-1] for row in rows]
+    print_rows(title, ["arm", *columns], rows)
     if note := levels_note(next(iter(results.values()))[0]["plain"]):
         print(note)
 
@@ -160,8 +167,8 @@ def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, 
 def print_scores(result: Mapping[str, Any]) -> None:
     """The table of ``rawaug evaluate``."""
     denoiser = result["kind"] == "denoiser"
-    head = ["PSNR (dB)", "SSIM", "PSNR, sRGB", "SSIM, sRGB"][: None if denoiser else 1]
-    metrics = METRICS[: len(head)]
+    head = ["PSNR (dB)", "SSIM", "PSNR, sRGB", "SSIM, sRGB", "own noise"]
+    metrics = (*METRICS, "own_noise")[: (5 if "own_noise" in result else 4) if denoiser else 1]
     images = [[_name_of(image), *_cells(image, "{}", metrics)] for image in result["images"]]
     shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
     means = [[name, *_cells(result, key, metrics)] for name, key in shown.items() if key.format("psnr") in result]
@@ -169,7 +176,7 @@ def print_scores(result: Mapping[str, Any]) -> None:
     others |= result.get("classical", {})
     means += [[name, *_cells(scores, "{}", metrics)] for name, scores in others.items()]
     title = "PSNR_d, RAW denoising" if denoiser else "PSNR_r, RAW reconstruction"
-    print_rows(f"{title}: {result['data']}", ["image", *head], images, means)
+    print_rows(f"{title}: {result['data']}", ["image", *head[: len(metrics)]], images, means)
     if note := levels_note(result):
         print(note)
 
@@ -181,4 +188,5 @@ def _name_of(image: Mapping[str, Any]) -> str:
 
 def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:
     found = [(metric, result.get(key.format(metric))) for metric in metrics]
-    return ["" if value is None else f"{value:.{2 if 'psnr' in metric else 4}f}" for metric, value in found]
+    formats = {"psnr": ".2f", "psnr_srgb": ".2f", "own_noise": ".0%"}
+    return ["" if value is None else f"{value:{formats.get(metric, '.4f')}}" for metric, value in found]

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import torch
@@ -25,6 +24,7 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import each_readable
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import published_pmrid
+from rawaug.evaluation.own_noise import OwnNoise, own_noise, own_noise_note, with_own_noise
 from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.scores import (
     Method,
@@ -34,6 +34,7 @@ from rawaug.evaluation.scores import (
     installed_classical,
     label_of,
     score_method,
+    summary,
 )
 from rawaug.evaluation.tables import METRICS, print_rows
 from rawaug.experiment.plan import some
@@ -57,6 +58,7 @@ class DenoiserSweep:
         data: frames of clean RAW: folders, files, or ``kind:path``.
         count: how many frames of each are used; all if null.
         crop: side of the middle of each frame that is scored; null for the whole frame.
+        bin: K bins frames K x K by colour site first: clean references of real photographs.
         camera: whose noise is added, see :mod:`rawaug.noise.cameras`.
         isos: the ISOs, each within what was measured for that camera.
         denoisers: names of shipped ones, or files of ``rawaug run``.
@@ -72,6 +74,7 @@ class DenoiserSweep:
     data: list[str] = field(default_factory=lambda: ["demo:test"])
     count: int | None = None
     crop: int | None = None
+    bin: int = 1
     camera: str = "Sony ILCE-7M3"
     isos: list[int] = field(default_factory=lambda: [100, 400, 1600, 6400, 25600])
     denoisers: list[str] = field(default_factory=lambda: [DEFAULT])
@@ -102,10 +105,13 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     """
     require_free(settings, overwrite)
     noises = {iso: noise_model(settings.camera, iso=iso) for iso in settings.isos}
-    makers, frames = _makers(settings), list[Pair]()
-    for spec in settings.data:
-        chosen = some(open_pairs(spec, split="test"), settings.count, settings.crop)
-        frames += [replace(p, noisy=None, shot_var=None, read_var=None) for p in each_readable(chosen, spec)]
+    makers, frames, own = _makers(settings), list[Pair](), dict[str, OwnNoise]()
+    opened = {spec: open_pairs(spec, split="test") for spec in settings.data}
+    for spec, pairs in opened.items():
+        chosen = some(pairs, settings.count, settings.crop, settings.bin)
+        clean = [replace(p, noisy=None, shot_var=None, read_var=None) for p in each_readable(chosen, spec)]
+        own |= own_noise(pairs, clean, noises[settings.isos[0]], settings.seed, settings.bin)
+        frames += clean
     claim(settings, overwrite)
     megapixels = sum(pair.raw.numel() / 1e6 for pair in frames)
     rows: dict[str, Any] = {}
@@ -113,7 +119,8 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
         took, rows[name] = 0.0, {"iso": {}}
         for iso, noise in noises.items():
             found = [scored(make(noise), pair, noise, settings.seed, f"{name}, ISO {iso}") for pair in frames]
-            rows[name]["iso"][str(iso)] = {key: fmean(getattr(score, key) for score, _ in found) for key in METRICS}
+            scores = with_own_noise(summary([score for score, _ in found]), own)
+            rows[name]["iso"][str(iso)] = {key: scores[key] for key in (*METRICS, "own_noise") if key in scores}
             took += sum(seconds for _, seconds in found)
         rows[name]["seconds_per_megapixel"] = took / len(noises) / megapixels
     result = {"settings": asdict(settings), "threads": torch.get_num_threads(), "frames": len(frames), "rows": rows}
@@ -182,6 +189,9 @@ def _report(result: dict[str, Any], settings: DenoiserSweep) -> None:
     page.parts.append(Part(head=head, rows=cells))
     written = page.write(folder / "report.html", asdict(settings))
     print_rows(f"{title}; threads: {result['threads']}", head, [[name, *row] for name, row in cells.items()])
+    by_iso = {f"{name} at ISO {iso}": at for name, row in rows.items() for iso, at in row["iso"].items()}
+    if note := own_noise_note(by_iso):
+        print(note)
     print(f"table: {folder / 'table.json'}\nfigure: {folder / 'figure.png'}\npage: {written}")
 
 

@@ -20,6 +20,7 @@ from rawaug.bayer import CFA
 from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.errors import extra
+from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise, own_noise_note, with_own_noise
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -105,10 +106,12 @@ class _Run:
         plan, self.unreadable = plan.read()
         _say(*self.unreadable)
         self.pairs, self.validation, self.test = list(plan.pairs), plan.validation, plan.test
+        self.references = plan.references
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
         self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
         self.frames: dict[str, Sequence[Any]] = {}
+        self.own: dict[str, OwnNoise] = {}
         require_usable(recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
@@ -121,6 +124,9 @@ class _Run:
         for seed in self.seeds:
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
+            if _leads() and not models:
+                self.own = own_noise(self.references, self.test, noise, 0, self.data.bin)
+                _say(*filter(None, [added_noise_note(self.own)]))
             if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
                 parts = {"pairs": self.pairs, "validation": self.validation}
                 self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
@@ -218,7 +224,8 @@ class _Run:
         """Plain and self-ensemble scores on the test frames."""
         path = self.place(arm, seed) / "evaluation.json"
         digest = sha256(path.with_name("denoiser.safetensors"))
-        key = fingerprint(digest, self.data.test, self.data.test_crop, stamps(self.test), self.recipe.views)
+        frames = self.data.test, self.data.test_crop, self.data.bin, stamps(self.test)
+        key = fingerprint(digest, *frames, self.recipe.views)
         known = json.loads(path.read_text()) if path.is_file() else {}
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
         missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
@@ -227,7 +234,7 @@ class _Run:
         for kind in missing:
             method = self.method(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
-            result[kind] = summary([score for score, *_ in scored])
+            result[kind] = with_own_noise(summary([score for score, *_ in scored]), self.own)
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
@@ -256,13 +263,16 @@ class _Run:
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         write_json(everything, self.folder / "results.json")
         for name, method in others.items():
-            classical[name] = summary([score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)])
+            scores = [score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)]
+            classical[name] = with_own_noise(summary(scores), self.own)
             write_json(everything, self.folder / "results.json")
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
         methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
         picture = self.pictured(Page.of_scores(title, results, classical), methods, noise, cfa)
         print_table(results, title, classical)
+        methods_scores = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+        _say(*filter(None, [own_noise_note(methods_scores)]))
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")
         searched = [
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())

@@ -9,7 +9,17 @@ from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, Remembered, left_out
-from rawaug.data.pairs import OWN_PICTURES, Middles, Pair, PairPictures, SomePairs, names_of, selected, shared_frame
+from rawaug.data.pairs import (
+    OWN_PICTURES,
+    Binned,
+    Middles,
+    Pair,
+    PairPictures,
+    SomePairs,
+    names_of,
+    selected,
+    shared_frame,
+)
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
@@ -31,6 +41,7 @@ class Plan:
         pairs: what is fitted and trained on.
         validation: what chooses the weights; empty for RAW made from the pictures.
         test: what the result is scored on.
+        references: the test frames as they are read, before they are binned and cropped.
         pictures: sRGB, to augment with.
         available: number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
         held_out: whether ``validation`` is a part of the user's own pairs.
@@ -39,6 +50,7 @@ class Plan:
     pairs: Sequence[Pair]
     validation: Sequence[Pair]
     test: Sequence[Pair]
+    references: Sequence[Pair]
     pictures: Any
     available: tuple[int, int, int]
     held_out: bool
@@ -138,18 +150,20 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
     return Plan(
         pairs=chosen,
-        validation=some(validation, data.validation_count, data.validation_crop),
-        test=some(test, data.test_count, data.test_crop),
+        validation=some(validation, data.validation_count, data.validation_crop, data.bin),
+        test=some(test, data.test_count, data.test_crop, data.bin),
+        references=test,
         pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
     )
 
 
-def some(pairs: Sequence[Pair], count: int | None, crop: int | None) -> Sequence[Pair]:
-    """The first ``count`` pairs, and the middle of each; all of them, or whole, where these are None."""
+def some(pairs: Sequence[Pair], count: int | None, crop: int | None, factor: int = 1) -> Sequence[Pair]:
+    """The first ``count`` pairs, binned by ``factor``, the middle of each; None for all of them, or whole frames."""
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
-    return chosen if crop is None else Middles(chosen, crop)
+    binned = chosen if factor == 1 else Binned(chosen, factor)
+    return binned if crop is None else Middles(binned, crop)
 
 
 def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:

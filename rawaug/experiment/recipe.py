@@ -25,6 +25,7 @@ MOST_BYTES = 2**16
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("count", "validation_count", "test_count"), (1, MOST)),
     **dict.fromkeys(("validation_crop", "test_crop"), (32, MOST)),
+    "bin": (1, 16),
     "max_pixels": (4, 2**40),
 }
 
@@ -51,6 +52,8 @@ class DataConfig(PairSettings):
         test: test pairs; no earlier stage sees them.
         test_count: number of pairs to use; null for all.
         test_crop: side of the central crop used of each test frame; null for the whole frame.
+        bin: K bins validation and test frames K x K by colour site before noise is added: clean references of real
+            photographs, which then have 1 / K^2 of their own noise.
     """
 
     pairs: str | None = "demo:train"
@@ -61,10 +64,11 @@ class DataConfig(PairSettings):
     max_pixels: int | None = None
     validation: str | None = "demo:validation"
     validation_count: int | None = None
-    validation_crop: int | None = None
+    validation_crop: int | None = 512
     test: str = "demo:test"
     test_count: int | None = None
-    test_crop: int | None = None
+    test_crop: int | None = 1024
+    bin: int = 1
 
     def __post_init__(self) -> None:
         for key, (least, most) in _BOUNDS.items():

@@ -1,0 +1,71 @@
+"""The references' own noise: measured as it was made, less of it in binned ones, and said where it is much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Binned, Middles, Pair
+from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise, own_noise_note, with_own_noise
+from rawaug.evaluation.scores import score_method, summary
+from rawaug.noise import noise_model
+
+SHOT, READ = 1e-4, 2e-6
+
+
+def scene(size: int = 1024) -> torch.Tensor:
+    """A mosaic of flat patches of many levels."""
+    levels = torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(0)) * 0.5 + 0.02
+    return F.interpolate(levels, (size, size))[0]
+
+
+@pytest.fixture(scope="module")
+def reference() -> Pair:
+    clean = scene()
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    raw = clean + noise * bayer.noise_variance(clean, SHOT, READ).sqrt()
+    return Pair("reference", torch.zeros(3, *clean.shape[1:], dtype=torch.uint8), raw, CFA.GRBG)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4])
+def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
+    noise = noise_model((1e-2, 1e-4))
+    scored = Middles(Binned([reference], factor), 256)
+    found = own_noise([reference], scored, noise, factor=factor)
+    middle = Middles(Binned([replace(reference, raw=scene())], factor), 256)[0]
+    truth = bayer.pack(middle.raw[None], CFA.GRBG)
+    scores = [score for score, *_ in score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")]
+    result = with_own_noise(summary(scores), found)
+    assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
+    assert own_noise_note({"perfect": result}).startswith("the references' own noise is part of the squared error: ")
+    added = bayer.noise_variance(middle.raw, 1e-2, 1e-4).mean().item()
+    assert found["reference"].added == pytest.approx(added, rel=0.1)
+
+
+def test_shares_are_of_the_squared_error() -> None:
+    images = [{"name": "a", "psnr": 40.0}, {"name": "b", "psnr": 30.0}, {"name": "unmeasured", "psnr": 10.0}]
+    found = {"a": OwnNoise(5e-5, 1e-2), "b": OwnNoise(1e-4, 1e-2)}
+    result = with_own_noise({"images": images}, found)
+    assert [image.get("own_noise") for image in result["images"]] == [pytest.approx(0.5), pytest.approx(0.1), None]
+    assert result["own_noise"] == pytest.approx(1.5e-4 / 1.1e-3)
+    assert "14% of mine's" in own_noise_note({"mine": result, "theirs": {"own_noise": 0.09}, "none": {}})
+    assert own_noise_note({"theirs": {"own_noise": 0.09}}) == "" and "own_noise" not in with_own_noise(
+        {"images": []}, {}
+    )
+
+
+def test_noise_as_weak_as_the_references_own_is_said() -> None:
+    assert added_noise_note({}) == added_noise_note({"a": OwnNoise(1e-5, 1e-3)}) == ""
+    said = added_noise_note({"a": OwnNoise(2e-5, 2e-5)})
+    assert "100% of the variance" in said and "would score 47.0 dB" in said
+
+
+def test_frames_without_flat_regions_have_no_figure() -> None:
+    raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
+    pair = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
+    assert own_noise([pair], [pair], noise_model((1e-3, 1e-5))) == {}
