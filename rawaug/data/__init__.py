@@ -21,7 +21,7 @@ from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submis
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
 from rawaug.data.pairs import Binned, LazyPairs, Pair
-from rawaug.data.published import Rawir, Rgb2Raw, Zurich, fivek_pairs
+from rawaug.data.published import RawBench, Rawir, Rgb2Raw, Zurich, fivek_pairs
 from rawaug.data.real import RealFrames
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission, write_submission
 from rawaug.data.sidd.frames import SiddFrames
@@ -37,6 +37,7 @@ __all__ = [
     "Pair",
     "PairFolder",
     "PictureFolder",
+    "RawBench",
     "RawFolder",
     "Rawir",
     "RealFrames",
@@ -166,7 +167,7 @@ def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Cal
 def _kind_and_path(spec: str) -> tuple[str | None, str]:
     """``"kind:path"`` taken apart; the kind of a bare path (``C:\\shots`` too) is None."""
     kind, colon, path = spec.partition(":")
-    return (kind, path) if colon and len(kind) > 1 and kind.isidentifier() else (None, spec)
+    return (kind, path) if colon and len(kind) > 1 and kind.replace("-", "").isidentifier() else (None, spec)
 
 
 def _path_and_split(path: str) -> tuple[str, str | None]:

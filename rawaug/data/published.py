@@ -1,4 +1,4 @@
-r"""Published sets of DNGs or RAW crops with their pictures: MIT-Adobe FiveK, RAWIR, RGB2RAW and Zurich RAW to RGB.
+r"""Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich RAW to RGB and RawBench.
 
 *FiveK* (Canon EOS 5D and Nikon D700, split as for InvISP): each DNG is developed by LibRaw with the camera's white
 balance and without automatic brightness. ``fivek.json`` beside this file lists the numbers of the splits: 650 and 127
@@ -26,6 +26,9 @@ ISP leads from one to the other. There is no white balance. Source: A. Ignatov, 
 mobile camera ISP with a single deep learning model", CVPR workshops 2020, whose loader divides by 1020 and leaves black
 in; the black level is that of Z. Zhang et al., "Learning RAW-to-sRGB mappings with inaccurately aligned supervision",
 ICCV 2021.
+
+*RawBench*: 15 scenes at ISO 200 to 51,200 with shots at ISO 100, CC BY-SA 4.0. Source:
+<https://huggingface.co/datasets/AyedaOk/rawbench-dataset>.
 """
 
 from __future__ import annotations
@@ -42,10 +45,11 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
-from rawaug.data.folders import RawFolder, files_below
+from rawaug.data.development import develop_mosaic
+from rawaug.data.folders import RAW_EXTENSIONS, RawFolder, files_below
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair
-from rawaug.io import read_picture
+from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
@@ -335,4 +339,67 @@ class Zurich(LazyPairs):
             color_matrix=torch.eye(3),
             camera="Huawei P20 (picture: Canon 5D Mark IV)",
             registered=False,
+        )
+
+
+_NOISY_SHOT = re.compile(r"(Scene_\d+)_ISO\d+(?:_\d+)?", re.IGNORECASE)
+_UNCLIPPED = 0.9
+
+
+@DATASETS.register("rawbench")
+class RawBench(LazyPairs):
+    """Shots of a Sony A7C II, ``Scene_0001/Scene_0001_ISO3200_1.ARW``, and their mean at ISO 100 in ``gt`` beside them.
+
+    Settings were held but for the ISO, so the clean frame is brought to the noisy one's exposure: it is multiplied by
+    the ratio of their means, where neither is clipped, and has noise of its own that this ratio amplifies. The picture
+    is a plain development of it.
+
+    Args:
+        path: contains the folders of the scenes.
+        split: is ignored: the dataset has no splits.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or a scene has no ``gt``.
+        ValueError: if it holds no scene.
+
+    Example:
+        >>> RawBench("rawbench")[0].name  # doctest: +SKIP
+        'Scene_0001_ISO200_1'
+    """
+
+    def __init__(self, path: str | Path, split: str = "test") -> None:
+        if not Path(path).is_dir():
+            raise FileNotFoundError(f"{path}: no such folder of RawBench")
+        files = sorted(files_below(path, RAW_EXTENSIONS))
+        self.files = [file for file in files if file.parent.name != "gt" and _NOISY_SHOT.fullmatch(file.stem)]
+        if not self.files:
+            raise ValueError(f"{path}: contains no RAW file named as Scene_0001_ISO3200_1.ARW")
+        self.clean = {file.parent: sorted(files_below(file.parent / "gt", RAW_EXTENSIONS)) for file in self.files}
+        missing = next((folder for folder, clean in self.clean.items() if not clean), None)
+        if missing is not None:
+            raise FileNotFoundError(f"{missing / 'gt'}: has no RAW file at ISO 100; download it too")
+        super().__init__([file.stem for file in self.files])
+
+    def files_of(self, index: int) -> Sequence[Path]:
+        return (self.files[index], *self.clean[self.files[index].parent])
+
+    def read(self, index: int) -> Pair:
+        noisy, *clean = (read_raw(file) for file in self.files_of(index))
+        if any(frame.mosaic.shape != noisy.mosaic.shape or frame.cfa != noisy.cfa for frame in clean):
+            raise ValueError(f"{self.files[index]}: differs in size or pattern from its gt")
+        dark = torch.stack([frame.mosaic for frame in clean]).mean(0)
+        whole = (noisy.mosaic < _UNCLIPPED) & (dark < _UNCLIPPED)
+        ratio = noisy.mosaic[whole].mean() / dark[whole].mean().clamp_min(1e-6)
+        raw = (dark * ratio).clamp(max=1.0)
+        return Pair(
+            name=self.names[index],
+            srgb=develop_mosaic(raw, noisy.cfa, noisy.white_balance, noisy.color_matrix),
+            raw=raw,
+            cfa=noisy.cfa,
+            white_balance=noisy.white_balance,
+            color_matrix=noisy.color_matrix,
+            noisy=noisy.mosaic,
+            camera=noisy.camera,
+            color_known=noisy.color_known,
+            iso=noisy.iso,
         )

@@ -303,6 +303,20 @@ def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
     )
 
 
+@DATASETS.register("sidd-cc")
+def sidd_cc_pairs(path: str, split: str) -> Sequence[Pair]:
+    """SIDD-CC, SIDD with its clean RAW estimated anew: the full frames of its ``train``, in the layout of SIDD Medium.
+
+    Its split is its own, so that nothing is left out. Source: <https://huggingface.co/datasets/MhdMohammadi/SIDD-CC>.
+
+    Raises:
+        ValueError: if ``split`` is another.
+    """
+    if split != "train":
+        raise ValueError(f"sidd-cc:{path}: no split {split}; use train; its test blocks are not read")
+    return SiddFrames(path, left_out=())
+
+
 @DATASETS.register("siddplus")
 def siddplus_pairs(path: str, split: str) -> Sequence[Pair]:
     """The validation blocks of SIDD+, whatever the split."""

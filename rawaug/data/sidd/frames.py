@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,7 +113,8 @@ class SiddFrames(LazyPairs):
     developed as the dataset's makers did; its ``NOISY_SRGB`` picture is read where there is one.
 
     Args:
-        path: contains the folders of the scene instances, at any depth. Those of validation and benchmark are left out.
+        path: contains the folders of the scene instances, at any depth.
+        left_out: scene instances that are not taken, by default those of validation and benchmark.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -124,12 +126,12 @@ class SiddFrames(LazyPairs):
         ('0001_001_S6_00100_00060_3200_L_010', <CFA.GRBG: 'GRBG'>, torch.Size([1, 3000, 5328]))
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, left_out: Sequence[str] = HELD_BACK) -> None:
         self.path = Path(path)
         self.shots = [
             (SiddScene.parse(scene), number, files)
             for (scene, number), files in sorted(indexed(self.path).items())
-            if "NOISY_RAW" in files and scene not in HELD_BACK
+            if "NOISY_RAW" in files and scene not in left_out
         ]
         for scene, number, files in self.shots:
             missing = {"GT_RAW", "METADATA_RAW"} - set(files)

@@ -148,6 +148,16 @@ def test_small_has_no_number_in_its_names_and_what_is_held_back_is_left_out(tmp_
     assert SiddFrames(tmp_path).names == ["0001_001_IP_00100_00060_3200_L_010"]
 
 
+def test_sidd_cc_has_its_own_split_and_is_not_clipped_at_black(tmp_path: Path, mat73: Writer) -> None:
+    for name in ("0001_001_S6_00100_00060_3200_L", HELD_BACK[0]):
+        write_scene(tmp_path / "Raw" / "train" / "Data", mat73, name)
+    pairs = open_pairs(f"sidd-cc:{tmp_path}:train")
+    assert {pair.name.rpartition("_")[0] for pair in pairs} == {"0001_001_S6_00100_00060_3200_L", HELD_BACK[0]}
+    assert len(pairs) == 4 and len(SiddFrames(tmp_path)) == 2
+    with pytest.raises(ValueError, match="no split test; use train"):
+        open_pairs(f"sidd-cc:{tmp_path}:test")
+
+
 def test_incomplete_and_damaged_frames_are_reported(tmp_path: Path, mat73: Writer) -> None:
     name = "0001_001_IP_00100_00060_3200_L"
     write_scene(tmp_path, mat73, name, ("010",))
