@@ -135,9 +135,9 @@ def test_a_package_index_gets_absolute_links_and_urls() -> None:
     release, url = script("release"), "https://host/owner/name"
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     places = re.findall(r"\]\(([^)]+)\)", release.absolute(readme, url))
-    assert len(places) > 10 and all(place.startswith(("https://", "#")) for place in places)
+    assert len(places) > 5 and all(place.startswith(("https://", "#")) for place in places)
     for place in re.findall(r"\]\((?!http|#)([^)]+)\)", readme):
-        assert (ROOT / place).is_file(), f"README.md: {place} is not there"
+        assert (ROOT / place.partition("#")[0]).is_file(), f"README.md: {place} is not there"
     setup = ConfigParser()
     setup.read_string(release.with_urls((ROOT / "setup.cfg").read_text(encoding="utf-8"), url))
     assert f"Homepage = {url}" in setup["metadata"]["project_urls"] and setup["metadata"]["name"] == "rawaug"
