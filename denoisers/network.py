@@ -89,8 +89,8 @@ def require_bounded(seed: int, **layers: int) -> None:
 def mended(signal: Tensor) -> Tensor:
     """Packed RAW ``(B, 4, h, w)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
 
-    A defect lies beyond all eight neighbours of its colour, by as much as :data:`DEFECT` says, while the other colours of
-    its cell show nothing of the kind, as they do of a star or a speck.
+    A defect lies beyond all eight neighbours of its colour, by :data:`DEFECT`, while the other colours of its cell show
+    nothing of the kind, as they do of a star or a speck.
     """
     height, width = signal.shape[-2:]
     padded = F.pad(signal, (1, 1, 1, 1), mode="reflect")
