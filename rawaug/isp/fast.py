@@ -36,7 +36,7 @@ from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
-from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, node_colours
+from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, highlight_rise, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest, runtime
 from rawaug.kernels.reference import Camera, Display, look_up, render, unprocess
@@ -125,10 +125,10 @@ class BakedISP(nn.Module):
         if curves.numel():
             table = table[:0]
             curves = curves[:, ::STEPS] if srgb.dtype == torch.uint8 else curves
-        colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, (1.0 - floor).clamp_min(0.0)], dim=1)
+        knee, rise = self.config.knee, highlight_rise(floor, self.config.knee)
+        colour = torch.cat([matrix, matrix.mean(dim=1, keepdim=True), floor, rise], dim=1)
         sites = [(i, j, c) for c, (i, j) in zip((0, 1, 1, 2), CFA(self.config.cfa).sites, strict=True)]
-        knee, where = self.config.knee, torch.tensor(sites)
-        return Camera(table, curves, self.attention, colour, knee, frame, shading, where)
+        return Camera(table, curves, self.attention, colour, knee or 0.0, frame, shading, torch.tensor(sites))
 
 
 class FastForward(nn.Module):
@@ -252,16 +252,15 @@ class _Chooser(nn.Module):
 
     def __init__(self, isp: DictionaryISP) -> None:
         super().__init__()
-        self.knee = isp.config.knee
+        self.knee = isp.config.knee or 0.0
         self.colour, self.gain = deepcopy(isp.colour), deepcopy(isp.gain)
         self.register_buffer("tone_weights", isp.typical_tones().clone())
         encoders = isp.reverse_encoders
         with torch.no_grad():
             self.colour_encoder = _folded(encoders.colour, [isp.colour.atoms()])
             floor = 1.0 / isp.gain.channel_gains()
-            self.gain_encoder = _folded(
-                encoders.gain, [torch.diag_embed(floor), torch.diag_embed((1.0 - floor).clamp_min(0.0))]
-            )
+            factors = (floor, highlight_rise(floor, isp.config.knee))
+            self.gain_encoder = _folded(encoders.gain, [torch.diag_embed(factor) for factor in factors])
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, table: Tensor) -> ISPParams:

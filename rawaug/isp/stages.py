@@ -137,6 +137,11 @@ def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE)
     return x * torch.maximum(mask + (1.0 - mask) * inverse, inverse)
 
 
+def highlight_rise(floor: Tensor, knee: float | None) -> Tensor:
+    """What sparing a highlight adds to ``floor``, one over the gains, where the mask is 1."""
+    return torch.zeros_like(floor) if knee is None else (1.0 - floor).clamp_min(0.0)
+
+
 def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
     """f4: multiply by ``gains`` ``(B, 3)``."""
     return x * gains[:, :, None, None]

@@ -71,6 +71,7 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
             stages=TONE_AND_CAMERAS,
             tone_atoms=len(tone.atoms),
             cameras=len(distinct),
+            knee=None,  # a sensor clips each channel at its own white
         )
     )
     assert isinstance(isp.colour, CameraDictionary) and isp.tone is not None

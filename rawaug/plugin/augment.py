@@ -57,7 +57,7 @@ class RawAugment(nn.Module):
         seed: of the module's own draws, where no generator is passed. They are counted from its construction: to
             resume, pass a generator, or use RawPairs or wrap.
         exposure: lowest and highest exposure, in stops, that the RAW is drawn at, uniformly. ``(0, 0)``, the
-            default of a fitted camera, is that of its frames. Published cameras have ``(-1, 0.2)``, for their headroom
+            default of a fitted camera, is that of its frames. Published cameras have ``(-0.5, 1)``, for their headroom
             above their pictures' white is not known. To train for other cameras than the fitted one, use (-1.5, 0).
         cfa: pattern of the RAW, by default the ISP's: another Bayer pattern, ``"XTRANS"``, or ``"QUAD-RGGB"`` and the
             like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.bayer`.

@@ -10,6 +10,7 @@ from rawaug.isp.cameras import (
     D65,
     LAMPS,
     Array,
+    LightRange,
     colour_matrix,
     daylight,
     off_locus,
@@ -123,6 +124,13 @@ def test_both_loci_and_lamps_are_drawn() -> None:
     assert (abs(above) < abs(below)).mean() == pytest.approx(0.5, abs=0.1)
     warm = sample_lights(4000, generator, (2000.0, 2000.0), lamps=0.25)
     assert (warm[:, 2] > 0.24).mean() == pytest.approx(0.25, abs=0.03)  # no 2000 K light is so blue
+
+
+def test_most_photographs_are_lit_by_day() -> None:
+    white = sample_lights(20_000, torch.Generator().manual_seed(0), *LightRange())
+    kelvins = mccamy(white[:, :2] / white.sum(axis=1, keepdims=True))
+    assert 0.75 < ((kelvins > 4000) & (kelvins < 6800)).mean() < 0.9
+    assert (kelvins < 2857).mean() < 0.08 and kelvins.min() < 2300 and kelvins.max() > 8500
 
 
 def test_a_temperature_out_of_range_is_refused() -> None:

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rawaug.data import demo_pictures
 from rawaug.isp.cameras import (
     D65,
     LightRange,
@@ -32,9 +33,12 @@ from rawaug.isp.dictionary import (
     second_moment,
     sparse_weights,
 )
+from rawaug.isp.fast import BakedISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
 from rawaug.isp.universal import of_cameras
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.dataset import RawPairs
 
 
 def test_colour_atoms_have_rows_of_l1_norm_one() -> None:
@@ -174,14 +178,34 @@ def test_the_same_seed_draws_the_same_bits(universal: DictionaryISP) -> None:
     assert not torch.equal(first.gains, other.gains)
 
 
-def test_white_fills_the_sensor_and_grey_is_divided_by_the_gains(universal: DictionaryISP) -> None:
+def test_white_and_grey_are_divided_by_the_gains(universal: DictionaryISP) -> None:
     setting = universal.draw_setting(8, generator())
-    white = universal.reverse_pixels(torch.ones(8, 3, 2, 2), setting)
-    torch.testing.assert_close(white, torch.ones_like(white), atol=1e-5, rtol=0)
-    grey = universal.reverse_pixels(torch.full((8, 3, 2, 2), 100 / 255), setting)[:, :, 0, 0]
     assert universal.tone is not None
     curve = universal.tone.combine(setting.tone_weights)
-    torch.testing.assert_close(grey * setting.gains, curve[:, 100 * STEPS, None].expand(8, 3), atol=1e-5, rtol=0)
+    for code in (100, 255):
+        picture = torch.full((8, 3, 2, 2), code / 255)
+        made = universal.reverse_pixels(picture, setting)[:, :, 0, 0]
+        torch.testing.assert_close(made * setting.gains, curve[:, code * STEPS, None].expand(8, 3), atol=1e-5, rtol=0)
+        baked = BakedISP(universal)(picture, setting)[:, [0, 1, 3], 0, 0]  # R, Gr and B of the packed RAW
+        torch.testing.assert_close(baked, made, atol=1e-5, rtol=0)
+
+
+def test_each_channel_clips_at_its_own_white() -> None:
+    """As in a sensor: where green is clipped red mostly has room, and neither is the picture's white always clipped."""
+    augment = RawAugment.from_pretrained("universal")
+    white = augment(torch.full((2000, 3, 2, 2), 255, dtype=torch.uint8), generator()).clean[:, :, 0, 0]
+    red, green, blue = (white[:, c] for c in (0, 1, 3))
+    assert white.max() == 1.0 and 0.5 < (green >= 0.99).float().mean() < 0.8
+    clipped = green >= 0.99
+    assert 0.45 < (red[clipped] < 0.9).float().mean() < 0.7 and 0.4 < (blue[clipped] < 0.9).float().mean() < 0.65
+    assert (white >= 0.99).all(dim=1).float().mean() < 0.2
+
+
+def test_raw_is_as_bright_as_cameras() -> None:
+    """Of real frames the mean RAW is about 0.136; the built-in photographs are darker than most."""
+    pairs = RawPairs(demo_pictures(), "universal", crop=128)
+    means = [pairs.draw(k % len(pairs), generator(k)).clean.mean().item() for k in range(256)]
+    assert 0.08 < sum(means) / len(means) < 0.16
 
 
 def test_settings_are_of_cameras_that_can_be(universal: DictionaryISP) -> None:
