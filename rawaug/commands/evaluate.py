@@ -18,7 +18,7 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned, Pair
-from rawaug.evaluation.own_noise import own_noise, own_noise_note, with_own_noise
+from rawaug.evaluation.own_noise import own_noise_note, own_variances, with_own_noise
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.scores import (
@@ -140,7 +140,7 @@ def evaluate(
     else:
         scoring = _Scoring(weights, pairs, noise, seed, where)
         result = scoring.plain() | ({} if bin == 1 else {"bin": bin})
-        own = own_noise(frames, pairs.kept(), scoring.levels, seed, bin)
+        own = own_variances(frames, pairs.kept(), scoring.levels, seed, bin)
         result = with_own_noise(result, own)
         ensemble = views or (8 if self_ensemble else 1)
         if first is not None and (ensemble > 1 or classical):

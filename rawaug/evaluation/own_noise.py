@@ -13,9 +13,9 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 from rawaug.bayer import noise_variance
-from rawaug.data.pairs import Pair, names_of
+from rawaug.data.pairs import Binned, Pair
 from rawaug.evaluation.scores import frozen_sample
-from rawaug.noise import NoiseModel, estimate_noise
+from rawaug.noise import NoiseModel, own_noise
 from rawaug.progress import progress
 
 MUCH = 0.1
@@ -33,27 +33,23 @@ class OwnNoise(NamedTuple):
     added: float
 
 
-def own_noise(
+def own_variances(
     whole: Sequence[Pair], scored: Sequence[Pair], noise: NoiseModel, seed: int = 0, factor: int = 1
 ) -> dict[str, OwnNoise]:
-    """The own noise of references, by name, where it can be measured (:func:`rawaug.noise.estimate_noise`).
+    """The own noise of references, by name, where it is stated or can be measured (:func:`rawaug.noise.own_noise`).
 
     Args:
         whole: the frames as they were read.
         scored: the same frames, binned by ``factor`` and cropped; some may be missing.
         noise, seed: of the test, see :func:`rawaug.evaluation.scores.frozen_sample`.
     """
-    found, frames = {}, {name: k for k, name in enumerate(names_of(whole))}
+    found, binned = {}, Binned(whole, factor)
     count = min(MOST_MEASURED, len(scored))
     chosen = [scored[k * len(scored) // count] for k in range(count)]
     for pair in progress(chosen, label="own noise of the references", unit="frame"):
-        frame = whole[frames[pair.name]]
-        try:
-            levels = estimate_noise(frame.raw, frame.cfa)
-        except ValueError:  # no flat regions
-            continue
-        own = noise_variance(pair.raw, levels.shot_var, levels.read_var).mean().item() / factor**2
-        found[pair.name] = OwnNoise(own, frozen_sample(pair, noise, pair.cfa, seed).variance.mean().item())
+        if (levels := own_noise(binned, binned.names.index(pair.name))) is not None:
+            own = noise_variance(pair.raw, *levels).mean().item()
+            found[pair.name] = OwnNoise(own, frozen_sample(pair, noise, pair.cfa, seed).variance.mean().item())
     return found
 
 

@@ -24,7 +24,7 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import each_readable
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import published_pmrid
-from rawaug.evaluation.own_noise import OwnNoise, own_noise, own_noise_note, with_own_noise
+from rawaug.evaluation.own_noise import OwnNoise, own_noise_note, own_variances, with_own_noise
 from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.scores import (
     Method,
@@ -110,7 +110,7 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     for spec, pairs in opened.items():
         chosen = some(pairs, settings.count, settings.crop, settings.bin)
         clean = [replace(p, noisy=None, shot_var=None, read_var=None) for p in each_readable(chosen, spec)]
-        own |= own_noise(pairs, clean, noises[settings.isos[0]], settings.seed, settings.bin)
+        own |= own_variances(pairs, clean, noises[settings.isos[0]], settings.seed, settings.bin)
         frames += clean
     claim(settings, overwrite)
     megapixels = sum(pair.raw.numel() / 1e6 for pair in frames)

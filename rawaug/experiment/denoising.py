@@ -20,7 +20,7 @@ from rawaug.bayer import CFA
 from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.errors import extra
-from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise, own_noise_note, with_own_noise
+from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise_note, own_variances, with_own_noise
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import (
     Method,
@@ -125,7 +125,7 @@ class _Run:
             isp = self.fitted_isp(seed)
             noise = noise_for(isp, recipe.noise)
             if _leads() and not models:
-                self.own = own_noise(self.references, self.test, noise, 0, self.data.bin)
+                self.own = own_variances(self.references, self.test, noise, 0, self.data.bin)
                 _say(*filter(None, [added_noise_note(self.own)]))
             if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
                 parts = {"pairs": self.pairs, "validation": self.validation}

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
-from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise, own_noise_note, with_own_noise
+from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise_note, own_variances, with_own_noise
 from rawaug.evaluation.scores import score_method, summary
 from rawaug.noise import noise_model
 
@@ -36,7 +36,7 @@ def reference() -> Pair:
 def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
     noise = noise_model((1e-2, 1e-4))
     scored = Middles(Binned([reference], factor), 256)
-    found = own_noise([reference], scored, noise, factor=factor)
+    found = own_variances([reference], scored, noise, factor=factor)
     middle = Middles(Binned([replace(reference, raw=scene())], factor), 256)[0]
     truth = bayer.pack(middle.raw[None], CFA.GRBG)
     scores = [score for score, *_ in score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")]
@@ -68,4 +68,4 @@ def test_noise_as_weak_as_the_references_own_is_said() -> None:
 def test_frames_without_flat_regions_have_no_figure() -> None:
     raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
     pair = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
-    assert own_noise([pair], [pair], noise_model((1e-3, 1e-5))) == {}
+    assert own_variances([pair], [pair], noise_model((1e-3, 1e-5))) == {}

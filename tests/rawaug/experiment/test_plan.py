@@ -122,7 +122,7 @@ def test_a_single_pair_is_trained_on_and_nothing_is_held_out(data: DataConfig) -
 
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
     pairs, test = demo_pairs("train"), demo_pairs("test", count=2)
-    recipe = Recipe(arms=ARMS, data=replace(data, count=None, test_count=1))
+    recipe = Recipe(arms=ARMS, data=replace(data, count=None, test_count=1, validation_crop=None, test_crop=None))
     plan = plan_of(recipe, pairs=pairs, test=test)
     assert list(plan.pairs) == pairs[:4] and list(plan.validation) == pairs[4:] and list(plan.test) == test[:1]
     other = replace(pairs[4], raw=pairs[4].raw * 0.5)
