@@ -239,11 +239,10 @@ def full_disk(folder: Path, name: str) -> str | None:
 
 
 def stop_at_work(folder: Path, child: Child) -> None:
-    """Stop a command once it has the lock of its output folder, and has written who it is."""
-    while time.monotonic() - child.start < PATIENCE:
-        if any(file.stat().st_size for file in folder.rglob("*.lock")):
-            break
+    """Stop a command once it has the lock of its output folder."""
+    while time.monotonic() - child.start < PATIENCE and not any(folder.rglob("[!.]*.lock")):  # not a file's
         time.sleep(0.002)
+    time.sleep(0.01)  # from the file's being there to its being locked
     child.send(signal.SIGSTOP)
 
 
@@ -253,7 +252,7 @@ def two_at_once(folder: Path, name: str) -> str | None:
     first = Child(fresh(folder), COMMANDS[name])
     stop_at_work(folder, first)
     first.log = first.log.rename(folder / "first.txt")
-    wrong = one_line(Child(folder, COMMANDS[name]), "in use by process", str(first.pid))
+    wrong = one_line(Child(folder, COMMANDS[name]), "in use by another run")
     first.send(signal.SIGCONT)
     if status := first.wait():
         return f"the first: status {status}: {first.said()}"
