@@ -39,7 +39,7 @@ def costs(folder: Path, formats: Sequence[str], repeats: int) -> dict[str, dict[
         return run
 
     ways: dict[str, Callable[[], object]] = {
-        "decode": lambda: [read_picture(folder / name).shape for name in pictures.names],
+        "decode": lambda: [read_picture(pictures.file(k)).shape for k in range(len(pictures))],
         "online": lambda: [pairs[k].noisy.shape for k in range(len(pictures))],
         **{form: written(form) for form in formats},
     }
