@@ -50,7 +50,7 @@ def tiled(
         variance: the noise variance of each value, shape of ``noisy``.
         tile: side of a piece in packed pixels, overlap included.
         overlap: context on each inner side, dropped from the result.
-        each: goes through the tiles, and may show how far it is, as ``tqdm`` does.
+        each: iterates over the tiles; may show progress, as ``tqdm`` does.
 
     Raises:
         ValueError: if the overlap leaves nothing of a tile, tile or overlap are no multiples of the model's stride, or
@@ -110,7 +110,7 @@ class SelfEnsemble(nn.Module):
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
         cfa: pattern of the mosaics that it will be given.
         views: 4, the flips, or 8, the flips with and without a quarter turn (the full set).
-        each: goes through the groups of views of one shape, and may show how far it is, as ``tqdm`` does.
+        each: iterates over the groups of views of one shape; may show progress, as ``tqdm`` does.
 
     Views of one shape share a batch. Large pictures: ``SelfEnsemble(partial(tiled, model), cfa)`` tiles every view.
 

@@ -256,7 +256,7 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
-    """Make known what summaries had to leave out, once all else is printed and written.
+    """Report scores that summaries omitted, once all else is printed and written.
 
     Raises:
         ValueError: if a frame could not be read, or a score is no number.

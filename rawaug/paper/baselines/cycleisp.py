@@ -26,7 +26,7 @@ from rawaug.seeding import derived_seed, initialised_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
-"""Below it the loss of logarithms looks away: at 12 bits it is four levels above black."""
+"""Below it the log loss is flat: at 12 bits it is four levels above black."""
 
 
 class RGB2RAW(Trunk):
