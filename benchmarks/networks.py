@@ -40,6 +40,7 @@ SIZES: dict[str, dict[str, Any]] = {
     "DnCNN": {"width": 32, "depth": 12},
     "PMRID": {"variance_map": True},
     "NAFNet": {"width": 16, "encoder": [1, 1, 2], "middle": 4, "decoder": [1, 1, 1]},
+    "DRUNet": {"width": 32, "blocks": 1, "limits": True, "variance_map": False, "domain": "anscombe"},
 }
 """The networks in sizes for a CPU."""
 GPU_SIZES: dict[str, dict[str, Any]] = {
@@ -48,6 +49,7 @@ GPU_SIZES: dict[str, dict[str, Any]] = {
     "DnCNN": {"width": 64, "depth": 17},
     "PMRID": {"variance_map": True},
     "NAFNet": {},
+    "DRUNet": {},
 }
 """The networks in their published sizes, the U-Net's included."""
 
@@ -170,6 +172,7 @@ def main() -> None:
     modes = ("default", "reduce-overhead", "max-autotune")
     parser.add_argument("--compile", nargs="*", choices=modes, default=[], help="also train under torch.compile")
     parser.add_argument("--minutes", type=float, default=0.0, help="train each for so long, and score it")
+    parser.add_argument("--precision", default="32-true", help="of --minutes, such as bf16-mixed")
     parser.add_argument("--pictures", default="demo:", help="sRGB pictures of --minutes")
     parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
     parser.add_argument("--pmrid", help="file of PMRID's published weights, to be scored beside --minutes")

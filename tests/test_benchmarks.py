@@ -106,7 +106,14 @@ def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filte
     monkeypatch.setattr(equal_minutes, "PROBE", 2)
     monkeypatch.setattr(equal_minutes, "MIDDLE", 64)
     args = argparse.Namespace(
-        pictures="demo:", validation="demo:validation", batch=2, crop=32, minutes=0.0, device=CPU, pmrid=None
+        pictures="demo:",
+        validation="demo:validation",
+        batch=2,
+        crop=32,
+        minutes=0.0,
+        device=CPU,
+        precision="32-true",
+        pmrid=None,
     )
     row = equal_minutes.trained("DnCNN", {"width": 4, "depth": 3}, args)
     assert row["steps"] == 2, "no fewer than the probe's"
