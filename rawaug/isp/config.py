@@ -15,8 +15,8 @@ from rawaug.registry import require_between
 HIGHLIGHT_KNEE = 0.9
 """Mean linear value above which Brooks' inverse gains bend towards 1."""
 
+# More are refused before anything is built: a few bytes of a file can ask for any amount of memory.
 MOST_ATOMS, MOST_CAMERAS, MOST_FEATURES, MOST_STAGES = 2048, 2**16, 1024, 32
-"""More are refused before anything is built: a few bytes of a file can ask for any size."""
 
 POINTWISE_STAGES = ("tone", "gamma", "colour", "gains", "shading")
 """The stages of the paper between sRGB and the mosaic, in reverse order; the k-th makes x_k."""

@@ -71,8 +71,8 @@ def l1_normalised(matrices: Tensor) -> Tensor:
 class ColourDictionary(nn.Module):
     """N colour correction matrices, sRGB to camera, rows l1-normalised.
 
-    Each atom stores the light it was seen in, so that a known white balance can choose among them, as a DNG's
-    two illuminants do.
+    Each atom stores the light it was seen in, so that a known white balance can choose among them, as with a DNG's
+    two illuminants.
 
     Attributes:
         matrices: ``(N, 3, 3)``, normalised on use.
@@ -209,11 +209,9 @@ def perturb(weights: Tensor, strength: float, generator: torch.Generator) -> Ten
 
 
 def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor:
-    """Weights ``(batch, atoms)`` uniform on the simplex: dictionary augmentation without encoders.
-
-    Normalised exponentials are the flat Dirichlet distribution. Uniform weights do not fill the hull evenly: the more
-    atoms, the more of the mixtures are near its middle.
-    """
+    """Weights ``(batch, atoms)`` uniform on the simplex: dictionary augmentation without encoders."""
+    # Normalised exponentials follow the flat Dirichlet distribution. They do not fill the hull evenly: with more atoms,
+    # more of the mixtures are near its middle.
     uniform = torch.rand(batch, atoms, generator=generator, device=generator.device, dtype=torch.float32)
     exponential = -torch.log1p(-uniform)
     return exponential / exponential.sum(dim=1, keepdim=True)
@@ -226,10 +224,8 @@ def sparse_weights(batch: int, atoms: int, mixed: int, generator: torch.Generato
 
 
 def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Indices of atoms ``(batch, mixed)``, drawn with replacement, and their shares, float64: Dirichlet(1/2).
-
-    Squares of normals divided by their sum: they crowd the corners and edges of a hull.
-    """
+    """Indices of atoms ``(batch, mixed)``, drawn with replacement, and their shares, float64: Dirichlet(1/2)."""
+    # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
     chosen = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
     return chosen, squares / squares.sum(dim=1, keepdim=True)
@@ -274,11 +270,9 @@ def psnr(squared_error: Tensor) -> Tensor:
 
 
 def greedy_atoms(points: Tensor, count: int, decibel: float = 45.0) -> list[int]:
-    """Indices of ``count`` points ``(P, D)`` whose hull reaches as many of all of them as possible.
-
-    The first is the point farthest from the mean. Each next one is, among the 24 that are farthest from the hull so
-    far, that which leaves the least squared error in sum over the points not within ``decibel``.
-    """
+    """Indices of ``count`` points ``(P, D)`` whose hull reaches as many of all of them as possible."""
+    # The first is the point farthest from the mean. Each next one is, among the 24 farthest from the hull so far, the
+    # one that leaves the least total squared error over the points not within ``decibel``.
     chosen = [int((points - points.mean(dim=0)).square().sum(dim=1).argmax())]
     while len(chosen) < min(count, len(points)):
         errors = nearest_in_hull(points, points[chosen])[1]
@@ -303,15 +297,12 @@ class CameraSampler:
     """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU.
 
     Args:
-        cameras: the atoms of colour.
-        tone_atoms: number of tone curves; 0 where the tone is learned.
+        cameras: the colour atoms.
+        tone_atoms: number of tone curves; 0 if the tone is learned.
         cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
         lights: what the light is drawn from.
-        consistent: gains follow from the camera and its light; if not, they are those of another draw, as where colour
-            and gains are drawn one by one.
-
-    Raises:
-        ValueError: if fewer than one is to be mixed.
+        consistent: gains follow from the camera and its light; otherwise they belong to another draw, as if colour and
+            gains were drawn independently.
     """
 
     def __init__(
@@ -352,7 +343,7 @@ class CameraSampler:
         return ISPParams(colour_weights, none, matrices, channel_gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
-        """Weights ``(B, N)`` and balances ``(B, 3)``; draws with gains beyond what is plausible are drawn again."""
+        """Weights ``(B, N)`` and balances ``(B, 3)``; implausible gains are drawn again."""
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
         open_ = np.arange(batch)
         for _ in range(_ROUNDS):

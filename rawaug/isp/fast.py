@@ -98,7 +98,7 @@ class BakedISP(nn.Module):
             params: camera settings.
             place: ``(B, 4)`` top, left, height, width of the full frames, or ``(B, 5)`` with the view that the crop was
                 turned to (:func:`rawaug.bayer.turn`); untouched full frames by default.
-            white: where the sensor saturates; nowhere by default.
+            white: where the sensor saturates; it does not by default.
 
         Raises:
             ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.

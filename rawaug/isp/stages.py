@@ -125,11 +125,12 @@ def correct_colour(x: Tensor, matrix: Tensor) -> Tensor:
 
 
 def inverse_gains(x: Tensor, gains: Tensor, knee: float | None = HIGHLIGHT_KNEE) -> Tensor:
-    """f4 reversed: divide by ``gains`` ``(B, 3)``, sparing highlights.
+    """f4 reversed: divide by ``gains`` ``(B, 3)``, sparing highlights; ``knee=None`` divides plainly.
 
-    ``m = clip((mean(x) - knee) / (1 - knee), 0)^2`` and the factor is ``max(m + (1 - m) / g, 1 / g)``: where a gain is
-    above 1, clipped sRGB comes back as saturated RAW, not as a coloured grey. ``knee=None`` divides plainly.
+    ``m = clip((mean(x) - knee) / (1 - knee), 0)^2`` and the factor is ``max(m + (1 - m) / g, 1 / g)``.
     """
+    # Where a gain is above 1, clipped sRGB must come back as saturated RAW, not as a coloured grey; where it is below
+    # 1, bending its factor towards 1 would darken highlights, hence the maximum.
     inverse = (1.0 / gains)[:, :, None, None]
     if knee is None:
         return x * inverse
@@ -165,7 +166,7 @@ def place_in_frame(
 
 
 def placed(x: Tensor, place: Tensor | None) -> Tensor:
-    """``place``, or that of a full frame, in the type of the image ``x``."""
+    """``place``, or that of a full frame, in the dtype of the image ``x``."""
     return (place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
 
 
@@ -293,13 +294,9 @@ class Stage(nn.Module, ABC):
         return tables._replace(x2=self.forward(tables.x2, None)) if self.makes <= 2 else tables
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
-        """``batch`` with what this stage does to these pictures.
+        """``batch`` with what this stage does to these pictures, of height and width ``size``.
 
-        Args:
-            batch: as the stages before left it.
-            params: the pictures' settings.
-            place: ``(B, 4 to 6)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
-            size: height and width of the pictures.
+        ``place`` is ``(B, 4 to 6)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
         """
         return batch
 
@@ -314,7 +311,7 @@ class Stage(nn.Module, ABC):
         return {}
 
     def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        """The reverse pass in a few numbers, from which a fit starts; the identity where each frame has its own."""
+        """The reverse pass in a few numbers, from which a fit starts; the identity if each frame has its own."""
         return x
 
     def start_coarse(self, gamma: float, toe: float) -> None:
@@ -453,7 +450,7 @@ class WhiteBalance(Stage):
 
 @STAGES.register("shading")
 class LensShading(Stage):
-    """f5: a Gaussian mask over the frame and, if the settings say so, an attention mask for each direction."""
+    """f5: a Gaussian mask over the frame and, with ``ISPConfig.attention``, an attention mask for each direction."""
 
     name, makes = "shading", 5
 
@@ -472,14 +469,10 @@ class LensShading(Stage):
         return x if self.forward_attention is None else x * self.forward_attention(x)
 
     def bake(self, tables: Tables) -> Tables:
-        return (
-            tables if self.reverse_attention is None else tables._replace(attention=self.reverse_attention(tables.cube))
-        )
+        return tables if self.reverse_attention is None else _attended(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
-        return (
-            tables if self.forward_attention is None else tables._replace(attention=self.forward_attention(tables.cube))
-        )
+        return tables if self.forward_attention is None else _attended(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
@@ -500,8 +493,12 @@ class LensShading(Stage):
         return x * self.mask(placed(x, place))
 
 
+def _attended(tables: Tables, mask: AttentionMask) -> Tables:
+    return tables._replace(attention=mask(tables.cube))
+
+
 def chosen(params: ISPParams | None) -> ISPParams:
-    """``params``, which a stage after x2 cannot do without."""
+    """``params``, which every stage after x2 needs."""
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")
     return params

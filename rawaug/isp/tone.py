@@ -98,11 +98,11 @@ def _inverse_smoothstep(code: Tensor) -> Tensor:
 
 
 def _through(points: Sequence[Sequence[float]]) -> Callable[[np.ndarray], np.ndarray]:
-    """The monotone cubic through ``points`` (camera, display), from black: a measured one may start at an offset."""
+    """The monotone cubic through ``points`` (camera, display)."""
     from scipy.interpolate import PchipInterpolator  # slow to import, and needed by nothing else
 
     light, display = np.array(points).T
-    display[0] = 0.0
+    display[0] = 0.0  # a measured curve may start at an offset
     curve: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(light, display)
     return curve
 
@@ -140,10 +140,8 @@ class ToneDictionary(nn.Module):
         return table
 
     def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms.
-
-        Weights of 0 are left out on a CPU, where it costs nothing to look at them, unless they are being fitted.
-        """
+        """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms."""
+        # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it.
         if weights.is_cuda or weights.requires_grad:
             yield from zip(weights.unbind(1), self.curves, strict=True)
             return

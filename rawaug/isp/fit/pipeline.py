@@ -135,7 +135,7 @@ def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[FrameSummary]
 
 
 def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
-    """An ISP of the size that the frames call for, drawn from the seed."""
+    """An ISP of the size that these frames need, drawn from the seed."""
     patterns = {shot.cfa for shot in shots}
     count = min(config.most_atoms, len(shots))
     more = REACH_ATOMS if config.reach > 1.0 else 0
@@ -156,7 +156,7 @@ def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
 
 
 class _Fit:
-    """The ISP under way, with every frame's own colour; ``part`` ends the names of its stages."""
+    """The ISP being fitted, with every frame's own colour; ``part`` ends the names of its stages."""
 
     def __init__(
         self, samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, part: str = ""

@@ -1,9 +1,9 @@
-"""Pixels for the fit: what a pair of RAW and sRGB says, as small tensors, without the pictures.
+"""Random pixels of RAW-sRGB pairs, on which an ISP is fitted.
 
 Given its parameters the ISP is pointwise up to the mosaic, so a random subset of pixels stands for a frame. A mosaic
-site knows its own colour alone: ``target`` holds its reading and ``known`` says in which channel. The 2 x 2 cell around
-it, averaged, gives the forward pass all three colours. Pairs whose RAW and sRGB do not meet pixel for pixel (a camera's
-own JPEG) are compared as averages over blocks instead, where every channel is known.
+site has one colour: ``target`` holds its reading and ``known`` says in which channel. The 2 x 2 cell around it,
+averaged, gives the forward pass all three colours. Pairs that are not registered pixel by pixel (a camera's own JPEG)
+are compared as averages over blocks instead, where every channel is known.
 """
 
 from __future__ import annotations
@@ -100,16 +100,10 @@ class PixelSamples(NamedTuple):
 def sample_pixels(
     pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False
 ) -> tuple[PixelSamples, list[FrameSummary]]:
-    """Draw ``pixels`` a frame, keyed by ``seed`` and the frame's name, and note what else the fit needs of the frames.
-
-    Args:
-        pairs: frames; read one at a time, once.
-        pixels: P; drawn with replacement.
-        noisy: take the captured noisy RAW (and never the clean one).
+    """Draw ``pixels`` from each frame with replacement, keyed by ``seed`` and its name; the frames are read once.
 
     Raises:
-        ValueError: if there is no pair, one's colours are unknown, or a noisy RAW is asked for and
-            absent.
+        ValueError: if there is no pair, a frame's colours are unknown, or ``noisy`` is given and it has no noisy RAW.
     """
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
@@ -194,13 +188,7 @@ class Blocks(NamedTuple):
 
 
 def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA, block: int = BLOCK) -> Blocks:
-    """Average a pair over blocks of the RAW and the blocks of the sRGB that show the same, their shift removed.
-
-    Args:
-        srgb, raw: ``(3, H, W)`` and ``(1, H, W)``.
-        cfa: of ``raw``.
-        block: side, even.
-    """
+    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks of even side, their shift removed."""
     height, width = raw.shape[-2:]
     dy, dx = find_shift(srgb, raw, cfa)
     top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
@@ -215,10 +203,7 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA, block: int = BLOCK) -> B
 
 
 def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:
-    """How far, in pixels down and right, the sRGB of an unregistered pair lies from its RAW.
-
-    By phase correlation of the green, at half the resolution; the nearest integer to a quarter of a pixel there.
-    """
+    """How far, in pixels down and right, the sRGB of an unregistered pair is shifted against its RAW."""
     with extra("raw"):
         from skimage.registration import phase_cross_correlation
 

@@ -94,11 +94,7 @@ class Tie:
 
 @torch.no_grad()
 def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
-    """``M_f`` ``(F, 3, 3)`` that takes ``linear`` ``(F, 3, 1, P)`` to the readings, from the normal equations.
-
-    Raises:
-        ValueError: if a frame has too few unclipped pixels.
-    """
+    """``M_f`` ``(F, 3, 3)`` that takes ``linear`` ``(F, 3, 1, P)`` to the readings, from the normal equations."""
     x = linear[:, :, 0].double()
     y, known = samples.target[:, :, 0].double(), samples.known[:, :, 0].double()
     if (known.sum(2) < FEWEST_PIXELS).any():
@@ -112,10 +108,8 @@ def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
 
 @torch.no_grad()
 def fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean ``(2,)`` and precision ``(2, 2)`` of the Gaussian that best explains log(reading / prediction).
-
-    A quadratic in the place, with one offset a frame and channel that takes up what the mask does to the matrices.
-    """
+    """Mean ``(2,)`` and precision ``(2, 2)`` of the Gaussian that best explains log(reading / prediction)."""
+    # A quadratic in the place; an offset for each frame and channel takes up what the mask does to the matrices.
     predicted = stages.correct_colour(linear, product)
     bright = (samples.known * (samples.target > 0.02) * (predicted > 0.02))[:, :, 0].double()
     ratio = (samples.target.clamp_min(1e-3) / predicted.clamp_min(1e-3)).log()[:, :, 0].double()
@@ -165,10 +159,7 @@ def reach_atoms(count: int, reach: float) -> Tensor:
 
 
 def _groups(points: Tensor, count: int, seed: int) -> Tensor:
-    """``(count, F)`` averaging matrix: of the points themselves if there are as many, else of k-means clusters.
-
-    An empty cluster is the mean of all points.
-    """
+    """``(count, F)`` averaging matrix: the identity if there are as many points, else of k-means clusters."""
     if len(points) == count:
         return torch.eye(count)
     from scipy.cluster.vq import kmeans2
@@ -178,6 +169,7 @@ def _groups(points: Tensor, count: int, seed: int) -> Tensor:
         _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derived_seed(seed, "atoms") % 2**32)
     member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
     used = member.sum(1, keepdim=True)
+    # An empty cluster becomes the mean of all points.
     return torch.where(used > 0, member / used.clamp_min(1.0), torch.full_like(member, 1.0 / len(points)))
 
 
