@@ -68,9 +68,9 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
     """A line on scores that the references' own noise makes up much of; empty if there are none."""
     shares = {name: scores.get("own_noise", 0.0) for name, scores in summaries.items()}
     much = sorted((name for name, share in shares.items() if share > MUCH), key=lambda name: -shares[name])
-    named = ", ".join(f"{shares[name]:.0%} of {name}'s" for name in much[:SHOWN])
+    named = ", ".join(f"{name} {shares[name]:.0%}" for name in much[:SHOWN])
     kept = " (more than 100%: it keeps that noise)" if any(shares[name] > 1.0 for name in much) else ""
-    return f"the references' own noise is part of the squared error: {named}{kept}; {ADVICE}" if much else ""
+    return f"own noise of the references as a share of the squared error: {named}{kept}; {ADVICE}" if much else ""
 
 
 def added_noise_note(found: Mapping[str, OwnNoise]) -> str:

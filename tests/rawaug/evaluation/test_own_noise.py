@@ -42,7 +42,7 @@ def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pai
     scores = [score for score, *_ in score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")]
     result = with_own_noise(summary(scores), found)
     assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
-    assert own_noise_note({"perfect": result}).startswith("the references' own noise is part of the squared error: ")
+    assert own_noise_note({"perfect": result}).startswith("own noise of the references as a share of")
     added = bayer.noise_variance(middle.raw, 1e-2, 1e-4).mean().item()
     assert found["reference"].added == pytest.approx(added, rel=0.1)
 
@@ -53,7 +53,7 @@ def test_shares_are_of_the_squared_error() -> None:
     result = with_own_noise({"images": images}, found)
     assert [image.get("own_noise") for image in result["images"]] == [pytest.approx(0.5), pytest.approx(0.1), None]
     assert result["own_noise"] == pytest.approx(1.5e-4 / 1.1e-3)
-    assert "14% of mine's" in own_noise_note({"mine": result, "theirs": {"own_noise": 0.09}, "none": {}})
+    assert ": mine 14%; " in own_noise_note({"mine": result, "theirs": {"own_noise": 0.09}, "none": {}})
     assert own_noise_note({"theirs": {"own_noise": 0.09}}) == "" and "own_noise" not in with_own_noise(
         {"images": []}, {}
     )
