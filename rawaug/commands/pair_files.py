@@ -12,14 +12,13 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, replayed
+from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, Task, replayed
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, read_header, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
@@ -35,35 +34,14 @@ _BLACK_STEP = 256
 _SHADING_NODES = (25, 33)
 
 
-@dataclass(frozen=True)
-class PictureTask:
-    """A picture, its name as the key of its draws, where its pairs go, and the numbers that are missing and wanted."""
+class PictureTask(Task):
+    """A picture, its name as the key of its draws, where its pairs go, and the numbers of those that are missing."""
 
-    picture: Path
-    key: str
-    stem: Path
-    numbers: tuple[int, ...]
-    per_image: int
-
-    @property
-    def pictures(self) -> int:
-        """It is about one."""
-        return 1
-
-    @property
-    def broken(self) -> dict[str, str]:
-        """None: what cannot be read is tried again."""
-        return {}
-
-    @property
-    def existing(self) -> int:
-        """Pairs that are there already."""
-        return self.per_image - len(self.numbers)
-
-    @property
-    def todo(self) -> bool:
-        """Whether one is missing."""
-        return bool(self.numbers)
+    def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
+        self.picture, self.key, self.stem = picture, key, stem
+        self.numbers = [k for k in range(per_image) if not params_file(_numbered(stem, k)).exists()]
+        self.pictures, self.existing, self.todo = 1, per_image - len(self.numbers), bool(self.numbers)
+        self.broken = {}  # what cannot be read is tried again
 
     def make(self, maker: PairMaker) -> Outcome:
         """Write the missing pairs."""
@@ -77,11 +55,7 @@ class PictureTask:
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
-    """One a picture. Pictures that differ in their extension alone keep it in the names of their pairs.
-
-    Raises:
-        ValueError: if the pairs of two pictures would have the same names.
-    """
+    """One a picture. Pictures that differ in their extension alone keep it in the names of their pairs."""
     stems = Counter(picture.with_suffix("") for picture in pictures)
     taken: dict[Path, Path] = {}
     for picture in pictures:
@@ -92,8 +66,7 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
                 f"{picture}: its pairs would have the same names as those of {taken[own].name}; rename one"
             )
         stem = out / own.relative_to(source).with_name(_short(own.name))
-        missing = (k for k in range(per_image) if not params_file(_numbered(stem, k)).exists())
-        yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, tuple(missing), per_image)
+        yield PictureTask(picture, picture.relative_to(source).as_posix(), stem, per_image)
 
 
 def _short(name: str) -> str:
@@ -194,11 +167,9 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
 
 
 def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, float], Tensor, float]:
-    """White balance, the matrix from white-balanced camera colour to linear sRGB, and the stops of underexposure.
-
-    With raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
-    white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse.
-    """
+    """White balance, the matrix from white-balanced camera colour to linear sRGB, and the stops of underexposure."""
+    # with raw = C x / gains for linear sRGB x, grey is s / gains in the camera, where s are the sums of C's rows: the
+    # white balance is gains / s, whose green is the exposure, and C with its rows over s is the matrix's inverse
     isp = pair.params.isp
     matrix = isp.matrix if augment.isp.find(ColorCorrection) else torch.eye(3)
     grey = matrix.sum(1)

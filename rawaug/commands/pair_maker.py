@@ -7,10 +7,11 @@ made with are kept in it, so that it never holds files of two settings.
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from rawaug import __version__
 from rawaug.files import find_weights, sha256, write_json
@@ -24,11 +25,7 @@ from rawaug.registry import Spec
 
 
 def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``.
-
-    Raises:
-        ValueError: if the existing files were made with other settings.
-    """
+    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``."""
     if path.is_file() and not overwrite:
         try:
             known = json.loads(path.read_text())
@@ -79,7 +76,7 @@ class Outcome(NamedTuple):
     broken: dict[str, str]
 
 
-class Task(Protocol):
+class Task(ABC):
     """What one process makes at a time.
 
     Attributes:
@@ -89,14 +86,12 @@ class Task(Protocol):
         todo: whether anything is missing.
     """
 
-    @property
-    def pictures(self) -> int: ...
-    @property
-    def existing(self) -> int: ...
-    @property
-    def broken(self) -> Mapping[str, str]: ...
-    @property
-    def todo(self) -> bool: ...
+    pictures: int
+    existing: int
+    broken: Mapping[str, str]
+    todo: bool
+
+    @abstractmethod
     def make(self, maker: PairMaker) -> Outcome:
         """Write what is missing."""
 
@@ -115,16 +110,7 @@ class PairMaker:
         return Origin(str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa)
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
-        """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers.
-
-        Args:
-            picture: the file.
-            key: its name in its folder.
-            numbers: of the pairs.
-
-        Raises:
-            OSError, ValueError: if it cannot be read, or changes meanwhile, here and not on iteration.
-        """
+        """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers."""
         before, content = picture.stat(), sha256(picture)
         srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()
@@ -142,19 +128,7 @@ class PairMaker:
 def replayed(
     drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
 ) -> RawPair:
-    """The pair ``(4, h, w)`` of these parameters, bit for bit.
-
-    Args:
-        drawn: the parameters.
-        origin: what the pair was made from.
-        label: names the pair in messages.
-        picture: the sRGB picture, if it has moved since.
-        isp: the ISP's file, if it has moved since.
-
-    Raises:
-        FileNotFoundError: if picture or ISP are not there.
-        ValueError: if they have changed since.
-    """
+    """The pair ``(4, h, w)`` of these parameters, bit for bit."""
     augment = RawAugment.from_pretrained(str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa)
     found = Path(picture or origin.picture)
     if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:

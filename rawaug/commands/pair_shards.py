@@ -22,8 +22,6 @@ import json
 import os
 import tarfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, replayed
+from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, replayed
 from rawaug.files import parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 
@@ -42,50 +40,24 @@ PER_SHARD = 500
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 
 
-@dataclass(frozen=True)
-class ShardTask:
-    """One shard: its path, the number of its first picture, and its pictures by name."""
+class ShardTask(Task):
+    """One shard: its path, the number of its first picture, and its pictures by name; ``known`` is its record."""
 
-    path: Path
-    first: int
-    source: Path
-    names: tuple[str, ...]
-    per_image: int
+    def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
+        self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
+        self.record = path.parent / ".shards" / f"{path.stem}.json"
+        known = self.known()
+        self.pictures, self.existing = len(names), int(known.get("nsamples", 0))
+        self.broken, self.todo = dict(known.get("broken", {})), not known
 
-    @property
-    def pictures(self) -> int:
-        """How many it should have the pairs of."""
-        return len(self.names)
-
-    @property
-    def record(self) -> Path:
-        """The file that says that the shard is whole."""
-        return self.path.parent / ".shards" / f"{self.path.stem}.json"
-
-    @cached_property
     def known(self) -> dict[str, Any]:
-        """The record of an earlier run; empty without one."""
+        """What says that the shard is whole; empty without it."""
         if not self.record.is_file():
             return {}
         try:
             return parse_object(self.record.read_text())
         except ValueError as error:
             raise ValueError(f"{self.record}: {error}; delete it to make the shard again") from None
-
-    @property
-    def existing(self) -> int:
-        """Pairs that are there already."""
-        return int(self.known.get("nsamples", 0))
-
-    @property
-    def broken(self) -> Mapping[str, str]:
-        """The pictures that could not be read when the shard was made."""
-        return dict(self.known.get("broken", {}))
-
-    @property
-    def todo(self) -> bool:
-        """Whether it has to be made."""
-        return not self.known
 
     def make(self, maker: PairMaker) -> Outcome:
         """Write the shard and its record."""
@@ -109,11 +81,7 @@ class ShardTask:
 def shard_tasks(
     pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
 ) -> list[ShardTask]:
-    """One a shard.
-
-    Raises:
-        ValueError: if ``per_shard`` is less than 1.
-    """
+    """One a shard."""
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)
@@ -191,7 +159,7 @@ def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
     """Write index and card, if all shards are there, whoever made them; whether they are."""
     if not all(task.record.is_file() for task in tasks):
         return False
-    records = [replace(task).known for task in tasks]  # as they are now
+    records = [task.known() for task in tasks]
     shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")

@@ -26,11 +26,7 @@ from rawaug.io.raw import XYZ_FROM_SRGB
 
 
 def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
-    """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1.
-
-    Raises:
-        ValueError: if X has no such M.
-    """
+    """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1."""
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
         raise ValueError(f"{np.ravel(xyz_to_camera).tolist()} is not a valid XYZ-to-camera matrix")
@@ -38,11 +34,7 @@ def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
 
 
 def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
-    """Multipliers of R, G, B, green being 1.
-
-    Raises:
-        ValueError: if the neutral is not three positive numbers.
-    """
+    """Multipliers of R, G, B, green being 1."""
     red, green, blue = (float(value) for value in np.ravel(as_shot_neutral))
     if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):
         raise ValueError(f"AsShotNeutral {red:g}, {green:g}, {blue:g} is not positive")

@@ -148,11 +148,7 @@ class _Frame:
 
 @DATASETS.register("dnd")
 def no_clean_frames(path: str, split: str) -> Sequence[Pair]:
-    """Nothing: DND has no pairs.
-
-    Raises:
-        ValueError: always, with what to do instead.
-    """
+    """Nothing: DND has no pairs."""
     raise ValueError(f"dnd:{path}: the clean frames of DND are not public; use rawaug.data.Dnd and submit the results")
 
 

@@ -59,11 +59,7 @@ class Metadata:
 
     @classmethod
     def parse(cls, values: Mapping[str, Any], where: str | Path) -> Metadata:
-        """From plain values or arrays; other keys are ignored.
-
-        Raises:
-            ValueError: if a value is not of its kind, naming ``where`` it comes from.
-        """
+        """From plain values or arrays; other keys are ignored."""
         parsed: dict[str, Any] = {}
         for key, value in values.items():
             if key not in KINDS or value is None:
@@ -75,11 +71,7 @@ class Metadata:
         return cls(**parsed)
 
     def joined(self, given: Metadata, file: Path) -> Metadata:
-        """The metadata of ``file``, completed by what is ``given``.
-
-        Raises:
-            ValueError: if both state something, but not the same.
-        """
+        """The metadata of ``file``, completed by what is ``given``."""
         for key in ("cfa", "black", "white"):
             own, other = getattr(self, key), getattr(given, key)
             if own is not None and other is not None and own != other:

@@ -24,12 +24,7 @@ MAX_BYTES = 2**30
 
 
 def mat_version(path: str | Path) -> str:
-    """``"5"`` or ``"7.3"``, by the header.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is neither.
-    """
+    """``"5"`` or ``"7.3"``, by the header."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such MATLAB file")
@@ -43,11 +38,7 @@ def mat_version(path: str | Path) -> str:
 
 
 def variables(path: str | Path) -> list[str]:
-    """The names of a file's variables.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: as :func:`read_array`.
-    """
+    """The names of a file's variables."""
     return isolated(_variables, Path(path))
 
 

@@ -146,14 +146,7 @@ class PairFolder(LazyPairs):
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
-    """Refuse RAW files that are noisy by their names where all frames are taken alike.
-
-    Args:
-        as_clean: whether the frames are taken for clean ones; if not, noisy frames are only refused beside clean ones.
-
-    Raises:
-        ValueError: naming the first.
-    """
+    """Refuse RAW files that are noisy by their names where all frames are taken alike."""
     files = {file.resolve() for file in folder.files}
     for file in folder.files:
         found = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)

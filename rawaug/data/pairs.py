@@ -197,10 +197,7 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage depends on, by frame, without reading files again.
-
-    Path, size and modification time of files; names of a dataset's frames; samples of the content of frames in memory.
-    """
+    """What a stage depends on, by frame, without reading files again."""
     if isinstance(pairs, LazyPairs):
         return [pairs.stamp(index) for index in range(len(pairs))]
     return [_sampled(pair) for pair in pairs]
@@ -415,11 +412,7 @@ def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | 
 
 
 def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of the first scenes, in order of their names, whose frames are ``count`` in all.
-
-    Raises:
-        ValueError: if no number of scenes has ``count`` frames; the numbers on either side are named.
-    """
+    """Indices of the first scenes, in order of their names, whose frames are ``count`` in all."""
     order = sorted(range(len(labels)), key=lambda k: labels[k].scene)
     totals = list(accumulate(len(list(group)) for _, group in groupby(order, key=lambda k: labels[k].scene)))
     if count not in totals:
@@ -432,11 +425,7 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
 
 
 def one_a_phone(labels: Sequence[FrameLabel], count: int) -> list[int]:
-    """Indices of ``count`` frames, one phone after another; of each phone evenly spread in ISO.
-
-    Raises:
-        ValueError: if a phone has too few frames.
-    """
+    """Indices of ``count`` frames, one phone after another; of each phone evenly spread in ISO."""
     phones = sorted({label.phone for label in labels})
     chosen: list[list[int]] = []
     for place, phone in enumerate(phones):

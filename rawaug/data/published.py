@@ -189,12 +189,7 @@ class Rawir(LazyPairs):
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
-    """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level.
-
-    Raises:
-        OSError: if the file is damaged.
-        ValueError: if its array is of another kind, or exceeds white.
-    """
+    """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level."""
     numbers, stated = _archive(file) if file.suffix == ".npz" else (_array(file), None)
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
@@ -221,11 +216,7 @@ def _archive(file: Path) -> tuple[np.ndarray, float]:
 
 
 def picture_beside(file: Path) -> Path:
-    """The picture of the same stem.
-
-    Raises:
-        FileNotFoundError: if there is no such picture.
-    """
+    """The picture of the same stem."""
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
             return file.with_suffix(suffix)

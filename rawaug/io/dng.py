@@ -111,11 +111,7 @@ def _require_colour(frame: RawFrame, path: Path) -> None:
 
 
 def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
-    """The mosaic as uint16 ``(H, W)``.
-
-    Raises:
-        ValueError: see :func:`write_dng`.
-    """
+    """The mosaic as uint16 ``(H, W)``."""
     height, width = frame.mosaic.shape[-2:]
     if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
         raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
@@ -263,14 +259,9 @@ class CarriedTags:
 
 
 def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
-    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing if it is not a TIFF.
-
-    A DNG gives all tags of its first directory and of the mosaic's; another TIFF (NEF, CR2, ARW, ...), whose private
-    tags mean something else, its description, author, XMP, EXIF and GPS.
-
-    Raises:
-        OSError: if the tags are damaged.
-    """
+    """What is kept of ``path`` for a mosaic of ``size`` (height, width); nothing if it is not a TIFF."""
+    # a DNG gives all tags of its first directory and of the mosaic's; the private tags of other TIFFs (NEF, CR2, ARW)
+    # mean something else, so that they give their description, author, XMP, EXIF and GPS
     with extra("raw"):
         import tifffile
 

@@ -50,11 +50,7 @@ class GainMap:
 
 
 def parse_gain_maps(opcodes: bytes, on_mosaic: bool) -> tuple[GainMap, ...]:
-    """The gain maps of an opcode list; its other opcodes are skipped.
-
-    Raises:
-        ValueError: if the list ends in the middle of an opcode, or a grid is empty or invalid.
-    """
+    """The gain maps of an opcode list; its other opcodes are skipped."""
     maps = []
     try:
         (count,), place = struct.unpack_from(">I", opcodes), 4

@@ -171,11 +171,7 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
 
 def require_utf8(path: Path) -> None:
-    """Refuse a name that the libraries cannot be given.
-
-    Raises:
-        OSError: if it is not UTF-8.
-    """
+    """Refuse a name that the libraries cannot be given."""
     if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
         raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
 
@@ -263,13 +259,7 @@ _MODES = {"RGB": "RGB", "GRAY": "L"}
 
 
 def to_srgb(pixels: np.ndarray, profile: bytes, path: Path) -> np.ndarray:
-    """Pixels uint8 ``(H, W, 3)`` in the space of ``profile`` as sRGB; the same pixels where that is sRGB by name.
-
-    A grey profile takes the first channel.
-
-    Raises:
-        ValueError: if the profile is damaged, or is neither of RGB nor of grey.
-    """
+    """Pixels uint8 ``(H, W, 3)`` in the space of ``profile`` as sRGB; the same pixels where that is sRGB by name."""
     with extra("raw"):
         from PIL import Image, ImageCms
 

@@ -267,11 +267,9 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions.
-
-    Where a DNG's active area begins at an odd row or column, LibRaw leaves that one out, and gives the remaining sites
-    the levels of their neighbours.
-    """
+    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
+    # where a DNG's active area begins at an odd row or column, LibRaw leaves that one out, and gives the remaining
+    # sites the levels of their neighbours
     levels = raw.black_level_per_channel
     black = np.array([[levels[k] for k in row] for row in cell], np.float32)
     if tags.black is None:

@@ -44,13 +44,8 @@ _LAYOUTS = {42: _Layout("I", "H", "HHI"), 43: _Layout("Q", "Q", "HHQ")}
 
 
 def require_no_circle(path: Path) -> None:
-    """Refuse a TIFF in which a directory leads back to itself; other files are left to whoever reads them.
-
-    A directory that two others name is none: some writers chain the children that a parent lists as well.
-
-    Raises:
-        ValueError: naming the directory's offset, or if there are more than :data:`MOST_DIRECTORIES`.
-    """
+    """Refuse a TIFF in which a directory leads back to itself; other files are left to whoever reads them."""
+    # a directory that two others name is no circle: some writers chain the children that a parent lists as well
     with path.open("rb") as file:
         start = file.read(4)
         order = {b"II": "<", b"MM": ">"}.get(start[:2])
@@ -141,11 +136,7 @@ class TiffTags:
 
 
 def read_tiff_tags(path: Path) -> TiffTags:
-    """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise.
-
-    Raises:
-        OSError: if the tags are damaged.
-    """
+    """Read the tags of the first page, and of the pages of a DNG that hold the mosaic and its noise."""
     with extra("raw"):
         import tifffile
 
@@ -172,12 +163,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
 @contextmanager
 def opened_tiff(path: Path) -> Iterator[Any]:
-    """tifffile's file, once its directories are known to end; damage becomes one OSError that names the file.
-
-    Raises:
-        OSError: if the tags are damaged.
-        tifffile.TiffFileError: if it is no TIFF.
-    """
+    """tifffile's file, once its directories are known to end; damage becomes one OSError that names the file."""
     with extra("raw"):
         import tifffile
 

@@ -184,11 +184,7 @@ class Shapes(Dataset[Tensor]):
 
 @PICTURES.register("shapes")
 def open_shapes(path: str = "", min_side: int = 2) -> Shapes:
-    """``shapes:100``, a hundred pictures of :data:`SIDE`, larger where crops are.
-
-    Raises:
-        ValueError: if no number follows.
-    """
+    """``shapes:100``, a hundred pictures of :data:`SIDE`, larger where crops are."""
     if not path.isdecimal():
         raise ValueError(f"shapes:{path}: write the number of pictures, such as shapes:100")
     return Shapes(int(path), max(SIDE, min_side))

@@ -101,11 +101,7 @@ def open_demo(path: str = "", split: str = "test") -> list[Pair]:
 
 @PICTURES.register("demo")
 def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
-    """``demo:``, all of them.
-
-    Raises:
-        ValueError: if a path follows.
-    """
+    """``demo:``, all of them."""
     if path:
         raise ValueError(f"demo:{path}: the demo's pictures have no parts; use demo:")
     return demo_pictures()

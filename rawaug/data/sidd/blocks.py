@@ -22,11 +22,12 @@ from __future__ import annotations
 import base64
 import csv
 import sys
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -56,12 +57,7 @@ LEAST_LIKENESS = 0.8
 
 
 def read_block_pictures(file: Path, blocks: tuple[int, ...], side: tuple[int, int]) -> Tensor:
-    """Pictures uint8 ``(*blocks, 3, H, W)`` of the array that is named after its file.
-
-    Raises:
-        FileNotFoundError, OSError: as :func:`rawaug.data.mat.read_array`.
-        ValueError: if they are not uint8, or of another number or size than the mosaics.
-    """
+    """Pictures uint8 ``(*blocks, 3, H, W)`` of the array that is named after its file."""
     array = read_array(file, file.stem)
     if array.dtype.name != "uint8" or array.shape != (*blocks, *side, 3):
         raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the mosaics need uint8 {(*blocks, *side, 3)}")
@@ -69,19 +65,7 @@ def read_block_pictures(file: Path, blocks: tuple[int, ...], side: tuple[int, in
 
 
 def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
-    """The pictures ``(K, 3, H, W)`` of a frame's blocks, turned as their mosaics ``(K, 1, H, W)`` are.
-
-    Raises:
-        ValueError: in the name of ``what``, if they do not show the same.
-
-    Example:
-        >>> coarse = torch.rand(2, 3, 2, 2, generator=torch.Generator().manual_seed(0))
-        >>> rgb = coarse.repeat_interleave(4, dim=2).repeat_interleave(4, dim=3)
-        >>> pictures = bayer.turn((rgb * 255).to(torch.uint8), 3)
-        >>> turned = turned_like(pictures, bayer.mosaic(rgb, CFA.RGGB), CFA.RGGB, "blocks")
-        >>> torch.equal(turned, (rgb * 255).to(torch.uint8))
-        True
-    """
+    """The pictures ``(K, 3, H, W)`` of a frame's blocks, turned as their mosaics ``(K, 1, H, W)`` are."""
     square = pictures.shape[-2] == pictures.shape[-1]
     views = range(bayer.N_VIEWS if square else bayer.N_VIEWS // 2)
     planes = bayer.pack(mosaics, cfa)
@@ -112,14 +96,7 @@ _NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
 
 
 class _Frame(NamedTuple):
-    """What the blocks of a frame have in common.
-
-    Args:
-        levels: of the noise.
-        levels_from_clean: whether they were measured against the clean blocks.
-        colour: from METADATA; None where there is none.
-        srgb, noisy_srgb: pictures ``(32, 3, H, W)``, as the mosaics lie; None where there are none.
-    """
+    """What the blocks of a frame have in common."""
 
     cfa: CFA
     camera: str
@@ -158,7 +135,37 @@ class Once(Generic[T]):
         return self.value
 
 
-class SiddBlocks(LazyPairs):
+class _Blocks(LazyPairs):
+    """Blocks that are read all at once; what the 32 of a frame have in common is kept for the last one."""
+
+    def __init__(self, path: Path, frames: Sequence[str]) -> None:
+        self.path = path
+        self._all = Once(self._read_all)
+        self._pictures: dict[str, Tensor] = {}
+        self._frame: tuple[int, _Frame] | None = None
+        super().__init__([f"{name}_{block:02d}" for name in frames for block in range(BLOCKS)])
+
+    @abstractmethod
+    def _read_all(self) -> tuple[Tensor, Tensor]:
+        """Clean and noisy blocks, ``(frames, 32, 1, H, W)``."""
+
+    @abstractmethod
+    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
+        """Name, pattern and camera of a frame; its published levels and its colour, if there are any."""
+
+    def read(self, index: int) -> Pair:
+        number, block = divmod(index, BLOCKS)
+        clean, noisy = (blocks[number] for blocks in self._all())
+        if self._frame is None or self._frame[0] != number:
+            name, cfa, camera, known, colour = self._known(number)
+            what = f"{self.path}: {name}"
+            pictures = {key: turned_like(every[number], clean, cfa, what) for key, every in self._pictures.items()}
+            levels = known or captured_noise(clean.numpy(), noisy.numpy())
+            self._frame = number, _Frame(cfa, camera, levels, known is None, colour, **pictures)
+        return _pair(self.names[index], block, clean, noisy, self._frame[1])
+
+
+class SiddBlocks(_Blocks):
     """The validation blocks, 1,280 pairs; all stay in memory (0.7 GB, pictures 0.5 GB) once the first is read.
 
     Noise levels are those of a ``noise_level_functions.csv`` if there is one below the folder with the scene
@@ -176,28 +183,12 @@ class SiddBlocks(LazyPairs):
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.files = [find_file(self.path, f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
-        self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
-        self._all = Once(self._read_all)
-        self._pictures: dict[str, Tensor] = {}
-        self._frame: tuple[int, _Frame] | None = None
-        super().__init__([f"{name}_{block:02d}" for name in HELD_BACK for block in range(BLOCKS)])
+        self.files = [find_file(Path(path), f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
+        super().__init__(Path(path), HELD_BACK)
 
-    def read(self, index: int) -> Pair:
-        scene, block = divmod(index, BLOCKS)
-        clean, noisy = (blocks[scene] for blocks in self._all())
-        if self._frame is None or self._frame[0] != scene:
-            self._frame = scene, self._frame_of(scene, clean, noisy)
-        return _pair(self.names[index], block, clean, noisy, self._frame[1])
-
-    def _frame_of(self, scene: int, clean: Tensor, noisy: Tensor) -> _Frame:
-        shot = self.scenes[scene]
-        known = self._levels.get(shot.name)
-        levels = known or captured_noise(clean.numpy(), noisy.numpy())
-        what = f"{self.path}: {shot.name}"
-        pictures = {key: turned_like(every[scene], clean, shot.cfa, what) for key, every in self._pictures.items()}
-        return _Frame(shot.cfa, shot.camera, levels, known is None, self._colours.get(shot.name), **pictures)
+    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
+        shot = SiddScene.parse(HELD_BACK[number])
+        return shot.name, shot.cfa, shot.camera, self._levels.get(shot.name), self._colours.get(shot.name)
 
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (_blocks_of_scenes(file) for file in self.files)
@@ -208,7 +199,7 @@ class SiddBlocks(LazyPairs):
         return clean, noisy
 
 
-class SiddPlusBlocks(LazyPairs):
+class SiddPlusBlocks(_Blocks):
     """The validation blocks of SIDD+, 1,024 pairs; noise levels are measured as for :class:`SiddBlocks`.
 
     Args:
@@ -222,35 +213,21 @@ class SiddPlusBlocks(LazyPairs):
     """
 
     def __init__(self, path: str | Path) -> None:
-        path = self.path = Path(path)
-        self.files = [find_file(path, f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
-        patterns = find_file(path, "siddplus_*bayer_patterns.csv")
-        self.cfas = _patterns(patterns)
-        self._all = Once(self._read_all)
-        self._pictures: dict[str, Tensor] = {}
-        self._frame: tuple[int, _Frame] | None = None
-        super().__init__([f"siddplus_{k // BLOCKS:02d}_{k % BLOCKS:02d}" for k in range(BLOCKS * len(self.cfas))])
+        self.files = [find_file(Path(path), f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
+        self.cfas = _patterns(find_file(Path(path), "siddplus_*bayer_patterns.csv"))
+        super().__init__(Path(path), [f"siddplus_{k:02d}" for k in range(len(self.cfas))])
 
-    def read(self, index: int) -> Pair:
-        number, block = divmod(index, BLOCKS)
-        part = slice(number * BLOCKS, (number + 1) * BLOCKS)
-        clean, noisy = (blocks[part] for blocks in self._all())
-        if self._frame is None or self._frame[0] != number:
-            what, cfa = f"{self.path}: frame {number}", self.cfas[number]
-            pictures: dict[str, Any] = {
-                key: turned_like(every[part], clean, cfa, what) for key, every in self._pictures.items()
-            }
-            levels = captured_noise(clean.numpy(), noisy.numpy())
-            self._frame = number, _Frame(cfa, "SIDD+", levels, True, **pictures)
-        return _pair(self.names[index], block, clean, noisy, self._frame[1])
+    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
+        return f"frame {number}", self.cfas[number], "SIDD+", None, None
 
     def _read_all(self) -> tuple[Tensor, Tensor]:
         clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         if len(clean) != len(self):
             raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
-        self._pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
-        return clean, noisy
+        pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
+        self._pictures = {key: every.unflatten(0, (-1, BLOCKS)) for key, every in pictures.items()}
+        return clean.unflatten(0, (-1, BLOCKS)), noisy.unflatten(0, (-1, BLOCKS))
 
 
 class SiddBenchmark(Sequence[NoisyBlock]):
@@ -271,7 +248,6 @@ class SiddBenchmark(Sequence[NoisyBlock]):
     def __init__(self, path: str | Path) -> None:
         self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
         self.levels = noise_level_functions(Path(path))
-        self.scenes = [SiddScene.parse(name) for name in HELD_BACK]
         self._all = Once(partial(_blocks_of_scenes, self.file))
 
     def __len__(self) -> int:
@@ -279,7 +255,7 @@ class SiddBenchmark(Sequence[NoisyBlock]):
 
     def __getitem__(self, index: int) -> NoisyBlock:  # type: ignore[override]
         scene, block = divmod(range(len(self))[index], BLOCKS)
-        frame = self.scenes[scene]
+        frame = SiddScene.parse(HELD_BACK[scene])
         return NoisyBlock(f"{frame.name}_{block:02d}", self._all()[scene, block], frame.cfa)
 
     def __iter__(self) -> Iterator[NoisyBlock]:
@@ -288,11 +264,7 @@ class SiddBenchmark(Sequence[NoisyBlock]):
 
 @DATASETS.register("sidd")
 def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
-    """The full frames (``train``) or the validation blocks (``test``).
-
-    Raises:
-        ValueError: if ``split`` is another.
-    """
+    """The full frames (``train``) or the validation blocks (``test``)."""
     if split == "train":
         return SiddFrames(path)
     if split == "test":
@@ -305,12 +277,9 @@ def sidd_pairs(path: str, split: str) -> Sequence[Pair]:
 
 @DATASETS.register("sidd-cc")
 def sidd_cc_pairs(path: str, split: str) -> Sequence[Pair]:
-    """SIDD-CC, SIDD with its clean RAW estimated anew: the full frames of its ``train``, in the layout of SIDD Medium.
+    """The full frames of SIDD-CC's own ``train``, in the layout of SIDD Medium, their clean RAW estimated anew.
 
-    Its split is its own, so that nothing is left out. Source: <https://huggingface.co/datasets/MhdMohammadi/SIDD-CC>.
-
-    Raises:
-        ValueError: if ``split`` is another.
+    Source: <https://huggingface.co/datasets/MhdMohammadi/SIDD-CC>.
     """
     if split != "train":
         raise ValueError(f"sidd-cc:{path}: no split {split}; use train; its test blocks are not read")
@@ -324,12 +293,7 @@ def siddplus_pairs(path: str, split: str) -> Sequence[Pair]:
 
 
 def find_file(path: Path, pattern: str) -> Path:
-    """The one file of this name below ``path``, or ``path`` itself.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if there are several.
-    """
+    """The one file of this name below ``path``, or ``path`` itself."""
     found = [path] if path.is_file() and path.match(pattern) else _matching(path, pattern)
     if not found:
         raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")

@@ -55,15 +55,7 @@ class SiddScene:
 
     @classmethod
     def parse(cls, name: str) -> SiddScene:
-        """From the folder's name.
-
-        Raises:
-            ValueError: if it is not a scene instance's name, or the phone is unknown.
-
-        Example:
-            >>> SiddScene.parse("0052_002_S6_01600_01000_5500_N").cfa
-            <CFA.GRBG: 'GRBG'>
-        """
+        """From the folder's name."""
         found = _NAME.fullmatch(name)
         if found is None or found[3] not in PHONES:
             raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
@@ -180,12 +172,7 @@ class SiddFrames(LazyPairs):
 
 
 def mosaic_of(file: Path) -> Tensor:
-    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out.
-
-    Raises:
-        FileNotFoundError, OSError, ValueError: as :func:`rawaug.data.mat.read_array`; ValueError also if it is no
-            matrix, or exceeds white.
-    """
+    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out."""
     return _even(normalised(read_array(file, "x"), 2, file))
 
 
@@ -204,11 +191,7 @@ def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
-    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any.
-
-    Raises:
-        ValueError: if the file has other columns.
-    """
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any."""
     file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
     if file is None:
         return {}
@@ -227,11 +210,7 @@ def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
 
 def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
     """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB,
-    NOISY_SRGB.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-    """
+    NOISY_SRGB."""
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of SIDD")
     index: dict[tuple[str, str], dict[str, Path]] = {}
@@ -251,11 +230,7 @@ class Colour(NamedTuple):
 
 
 def colour_of(file: Path) -> Colour:
-    """The colour of a frame from its METADATA file.
-
-    Raises:
-        FileNotFoundError, OSError, ValueError: as :func:`rawaug.data.mat.read_value`; ValueError also if it lacks one.
-    """
+    """The colour of a frame from its METADATA file."""
     tags: dict[str, Any] = read_value(file, "metadata")
     try:
         gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
