@@ -1,5 +1,8 @@
+"""Pictures of every kind as sRGB, and what JPEG leaves of them."""
+
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from pathlib import Path
@@ -15,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms, ImageOps
 
 from rawaug.io import decode_srgb, encode_srgb, read_picture, write_picture
-from rawaug.io.pictures import read_plane
+from rawaug.io.pictures import read_plane, through_jpeg
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (24, 37, 3), np.uint8)
 SRGB = torch.from_numpy(PIXELS).permute(2, 0, 1)
@@ -236,3 +239,24 @@ def test_a_picture_bomb_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "wide.tif", np.zeros((20, 20, 8), np.uint8), photometric="rgb")
     with pytest.raises(ValueError, match="declares 20 x 20 pixels of 8 channels, above the limit of 500"):
         read_picture(tmp_path / "wide.tif", max_pixels=500)
+
+
+def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width() -> None:
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 3, 6, 8, generator=generator)
+    picture = (255 * torch.nn.functional.interpolate(coarse, (48, 64), mode="bilinear")[0]).to(torch.uint8)
+    expected = io.BytesIO()
+    Image.fromarray(picture.permute(1, 2, 0).numpy()).save(expected, "JPEG", quality=90, subsampling="4:2:2")
+    assert np.array_equal(through_jpeg(picture, 90).permute(1, 2, 0).numpy(), np.array(Image.open(expected)))
+    errors = [(through_jpeg(picture, quality).float() - picture).square().mean() for quality in (30, 90)]
+    assert errors[0] > errors[1] > 0
+    stripes = torch.tensor([[255, 0], [0, 0], [0, 255]], dtype=torch.uint8)[:, None].repeat(1, 32, 16)
+    fine, turned = (through_jpeg(x, 90).float() - x for x in (stripes, stripes.mT))
+    assert fine.square().mean() > 2 * turned.square().mean(), "columns of colour are lost, rows are not"
+
+
+def test_what_is_no_picture_or_quality_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"uint8 \(3, H, W\), got torch.float32"):
+        through_jpeg(torch.zeros(3, 8, 8), 90)
+    with pytest.raises(ValueError, match="quality must be 1 to 100, got 0"):
+        through_jpeg(torch.zeros(3, 8, 8, dtype=torch.uint8), 0)

@@ -1,0 +1,216 @@
+"""Pairs: what they hold, which are chosen, binned frames, and the noise of a capture."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from rawaug.bayer import CFA, bin_mosaic, mosaic
+from rawaug.data import Binned, demo_pairs, open_pairs
+from rawaug.data.folders import Readable
+from rawaug.data.pairs import (
+    FrameLabel,
+    LazyPairs,
+    Pair,
+    PairPictures,
+    captured_noise,
+    one_a_phone,
+    selected,
+    shared_frame,
+    stamps,
+    whole_scenes,
+)
+from rawaug.experiment.plan import planned
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+
+
+def pair(**changes: Any) -> Pair:
+    fields: dict[str, Any] = {
+        "name": "shot",
+        "srgb": torch.zeros(3, 6, 8, dtype=torch.uint8),
+        "raw": torch.zeros(1, 6, 8),
+        "cfa": CFA.RGGB,
+        "white_balance": (2.0, 1.0, 1.5),
+        "color_matrix": torch.eye(3),
+    }
+    return Pair(**{**fields, **changes})
+
+
+def test_a_pair_holds_what_it_was_given() -> None:
+    noisy = torch.ones(1, 6, 8)
+    shot = pair(noisy=noisy, shot_var=1e-3, read_var=1e-6)
+    assert shot.noisy is noisy and shot.registered and shot.camera == "unknown"
+    assert pair().noisy is None
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        shot.name = "other"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"srgb": torch.zeros(3, 6, 8)},
+            r"pair shot: srgb must be torch.uint8 \(3, 6, 8\), got torch.float32 \(3, 6, 8\)",
+        ),
+        ({"srgb": torch.zeros(3, 6, 6, dtype=torch.uint8)}, r"srgb must be .*got torch.uint8 \(3, 6, 6\)"),
+        ({"raw": torch.zeros(1, 6, 8, dtype=torch.float64)}, r"raw must be torch.float32"),
+        ({"raw": torch.zeros(6, 8)}, r"pair shot: raw must be torch.float32"),
+        ({"noisy": torch.zeros(1, 6, 6)}, r"noisy must be torch.float32 \(1, 6, 8\)"),
+        ({"srgb": torch.zeros(3, 5, 8, dtype=torch.uint8), "raw": torch.zeros(1, 5, 8)}, "even sides"),
+        ({"color_matrix": torch.eye(4)}, r"color_matrix must be \(3, 3\)"),
+        ({"shot_var": 1e-3, "read_var": 1e-6}, "must be given together, with a noisy mosaic"),
+        ({"shot_var": 1e-3, "noisy": torch.zeros(1, 6, 8)}, "must be given together"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        pair(**changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_recipe_augments_the_pictures_of_the_pairs_that_it_trains_on() -> None:
+    pairs, test = demo_pairs("train", count=3), demo_pairs("test", count=1)
+    data = DataConfig(count=2, pictures="pairs", validation=None)
+    recipe = Recipe(data=data, arms={"ours": ArmConfig(augmented=0.5)})
+    plan = planned(recipe, {"pairs": pairs, "test": test})
+    assert isinstance(plan.pictures, PairPictures) and len(plan.pictures) == 2 == len(plan.pictures[:])
+    assert torch.equal(plan.pictures[1], pairs[1].srgb)
+    with pytest.raises(ValueError, match=r"data\.pictures: pairs takes those of data\.pairs, which is null"):
+        replace(data, pairs=None)
+
+
+PHONES = ("GP", "IP", "S6")
+LABELS = [FrameLabel(f"{scene:03d}", phone, iso) for scene in (1, 2) for phone in PHONES for iso in (100, 400, 1600)]
+
+
+class Shots(LazyPairs):
+    """Eighteen tiny frames of two scenes by three phones; notes which were read."""
+
+    def __init__(self) -> None:
+        super().__init__([f"{k:04d}_{label.scene}_{label.phone}_010" for k, label in enumerate(LABELS)])
+        self.labels = LABELS
+        self.seen: list[int] = []
+
+    def read(self, index: int) -> Pair:
+        self.seen.append(index)
+        return Pair(self.names[index], torch.zeros(3, 2, 2, dtype=torch.uint8), torch.zeros(1, 2, 2), CFA.RGGB)
+
+
+def test_the_first_ones_are_of_one_phone_and_others_are_not() -> None:
+    shots = Shots()
+    first = selected(shots, 18, 3)
+    assert first == [0, 1, 2] and {LABELS[k].phone for k in first} == {"GP"}
+    one_each = selected(shots, 18, 3, "phones")
+    assert not shots.seen, "none is read"
+    assert sorted(LABELS[k].phone for k in one_each) == sorted(PHONES)
+    assert {LABELS[k].iso for k in one_each} == {400}, "not base ISO"
+
+
+def test_phones_take_turns_and_spread_in_iso() -> None:
+    chosen = one_a_phone(LABELS, 8)
+    counts = [sum(LABELS[k].phone == phone for k in chosen) for phone in PHONES]
+    assert counts == [3, 3, 2] and len(set(chosen)) == 8
+    assert [LABELS[k].phone for k in chosen[:3]] == list(PHONES)
+    assert {LABELS[k].iso for k in chosen if LABELS[k].phone == "GP"} == {100, 400, 1600}
+    with pytest.raises(ValueError, match=r"data\.count: 20 pairs are 7 of GP, which has 6"):
+        one_a_phone(LABELS, 20)
+
+
+def test_scenes_are_whole() -> None:
+    assert whole_scenes(LABELS, 9) == list(range(9)) and whole_scenes(LABELS, 18) == list(range(18))
+    with pytest.raises(ValueError, match=r"data\.count: 5 pairs are not whole scenes; use 9 or 18"):
+        selected(Shots(), 18, 5, "scenes")
+
+
+def test_names_are_of_frames_or_of_their_folders() -> None:
+    assert selected(Shots(), 18, None, ["0004_001_IP_010", "0017_002_S6"]) == [4, 17]
+    with pytest.raises(ValueError, match=r"data\.select: 0099 is none of the 18 frames, such as 0000_001_GP_010"):
+        selected(Shots(), 18, None, ["0099"])
+
+
+def test_what_is_held_out_is_not_chosen() -> None:
+    assert selected(Shots(), 4, None) == [0, 1, 2, 3]
+    assert max(selected(Shots(), 9, 3, "phones")) < 9 and selected(Shots(), 9, 9, "scenes") == list(range(9))
+    with pytest.raises(ValueError, match="0017_002_S6 is none of the 9 frames"):
+        selected(Shots(), 9, None, ["0017_002_S6"])
+
+
+def test_what_has_no_labels_is_refused() -> None:
+    pairs = list(Shots())
+    assert selected(pairs, 18, 2) == [0, 1]
+    with pytest.raises(ValueError, match="phones needs frames with labels"):
+        selected(pairs, 18, 2, "phones")
+    with pytest.raises(ValueError, match="'best' is unknown; use first, scenes, phones or a list of names"):
+        selected(pairs, 18, 2, "best")
+
+
+COLOURS = torch.tensor([0.2, 0.5, 0.8]).reshape(3, 1, 1)
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_a_site_is_the_mean_of_its_own_colour(cfa: CFA) -> None:
+    rgb = COLOURS.expand(3, 24, 32)
+    assert torch.allclose(bin_mosaic(mosaic(rgb, cfa), cfa, 4), mosaic(rgb[:, :6, :8], cfa))
+    raw = torch.rand(1, 16, 24, generator=torch.Generator().manual_seed(0))
+    binned = bin_mosaic(raw, cfa, 2)
+    assert binned[0, 3, 4].item() == pytest.approx(raw[0, [5, 5, 7, 7], [8, 10, 8, 10]].mean().item())
+    assert torch.equal(bin_mosaic(raw, cfa, 1), raw)
+
+
+@pytest.mark.parametrize("cfa", ["XTRANS", "RGBW"])
+def test_other_patterns_are_refused(cfa: str) -> None:
+    with pytest.raises(ValueError, match=f"CFA '{cfa}' is not a Bayer pattern"):
+        bin_mosaic(torch.zeros(1, 24, 24), cfa, 2)
+    with pytest.raises(ValueError, match=r"\(24, 24\) cannot be binned by 5"):
+        bin_mosaic(torch.zeros(1, 24, 24), "RGGB", 5)
+
+
+def test_noise_falls_by_the_number_of_sites() -> None:
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.rand(1, 1, 48, generator=generator).repeat_interleave(16, 2).expand(1, 768, 768)
+    noisy = raw + torch.randn(raw.shape, generator=generator) * (4e-3 * raw + 1e-4) ** 0.5
+    srgb = torch.zeros(3, 768, 768, dtype=torch.uint8)
+    pair = Pair("a", srgb, raw.contiguous(), CFA.RGGB, noisy=noisy, shot_var=4e-3, read_var=1e-4).binned(4)
+    assert pair.noisy is not None and (pair.shot_var, pair.read_var) == pytest.approx((2.5e-4, 6.25e-6))
+    measured = captured_noise(pair.raw.numpy(), pair.noisy.numpy())
+    assert measured[0] * 0.5 + measured[1] == pytest.approx(2.5e-4 * 0.5 + 6.25e-6, rel=0.05)
+
+
+def test_pairs_are_opened_binned() -> None:
+    whole, binned = open_pairs("demo:test"), open_pairs("demo:test", bin=4)
+    assert isinstance(binned, Binned) and binned.names == [pair.name for pair in whole]
+    pair = binned[0]
+    assert pair.raw.shape == (1, 72, 112) and pair.srgb.shape == (3, 72, 112) and pair.cfa == whole[0].cfa
+    assert pair.raw.mean().item() == pytest.approx(whole[0].raw.mean().item(), rel=1e-5)
+    assert shared_frame(whole, binned) is not None and stamps(whole) != stamps(binned)
+    readable = Readable(binned)
+    readable.broken[0] = "damaged"
+    assert readable.kept()[0].raw.shape == (1, 72, 112)
+    with pytest.raises(ValueError, match="bin must be at least 1, got 0"):
+        open_pairs("demo:test", bin=0)
+    with pytest.raises(ValueError, match="too small to be binned by 200"):
+        demo_pairs("test", count=1)[0].binned(200)
+
+
+@pytest.mark.parametrize(("shot_var", "read_var"), [(1e-2, 4e-4), (2e-3, 1e-6), (1e-5, 1e-3)])
+@pytest.mark.parametrize("clipped", [False, True])
+def test_both_levels_are_found(shot_var: float, read_var: float, clipped: bool) -> None:
+    rng = np.random.default_rng(0)
+    clean = rng.random((400, 500)) ** 2
+    noisy = clean + rng.normal(size=clean.shape) * np.sqrt(shot_var * clean + read_var)
+    found = captured_noise(clean, noisy.clip(0, 1) if clipped else noisy)
+    for y in (0.05, 0.3, 0.8):
+        assert found[0] * y + found[1] == pytest.approx(shot_var * y + read_var, rel=0.15 if clipped else 0.05)
+
+
+def test_levels_are_positive_whatever_is_given() -> None:
+    flat = np.full((8, 8), 0.5)
+    assert min(captured_noise(flat, flat)) > 0 and min(captured_noise(flat, flat + 0.1)) > 0
+    rng = np.random.default_rng(0)
+    falling = rng.random((300, 300))
+    assert min(captured_noise(falling, falling + rng.normal(size=falling.shape) * (1.1 - falling))) > 0
