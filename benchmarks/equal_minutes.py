@@ -22,7 +22,7 @@ import rawaug
 from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Remembered
+from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import published_pmrid
 from rawaug.evaluation.scores import classical_method, frozen_sample, network_method, score_method
@@ -52,7 +52,7 @@ def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[s
         size: the network's settings, but for its domain.
     """
     noise = noise_model(NOISE)
-    pictures = Remembered(open_pictures(args.pictures, min_side=args.crop + 6), CACHE)
+    pictures = Cached(open_pictures(args.pictures, min_side=args.crop + 6), CACHE)
     augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
     crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
     cfa = augment.isp.cfa

@@ -216,12 +216,12 @@ def reports(pictures: Any) -> list[str]:
     return [report for each in inside if each is not None for report in reports(each)]
 
 
-class Remembered(Dataset[Tensor]):
+class Cached(Dataset[Tensor]):
     """A dataset of pictures that keeps up to ``megabytes`` of them decoded, in each worker its own.
 
     Example:
         >>> import torch
-        >>> pictures = Remembered([torch.zeros(3, 8, 8, dtype=torch.uint8)], megabytes=1)
+        >>> pictures = Cached([torch.zeros(3, 8, 8, dtype=torch.uint8)], megabytes=1)
         >>> pictures[0] is pictures[0]
         True
     """
@@ -308,7 +308,7 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     return [f"left out of {printable(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(printable, reasons)]
 
 
-def each_readable(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
+def skip_broken(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
     """The pairs that can be read, one by one; at the end the others are printed.
 
     Args:

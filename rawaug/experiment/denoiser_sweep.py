@@ -21,7 +21,7 @@ import denoisers
 from denoisers.files import DEFAULT, find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.folders import each_readable
+from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import published_pmrid
 from rawaug.evaluation.own_noise import OwnNoise, own_noise_note, own_variances, with_own_noise
@@ -109,7 +109,7 @@ def sweep(settings: DenoiserSweep, overwrite: bool = False) -> dict[str, Any]:
     opened = {spec: open_pairs(spec, split="test") for spec in settings.data}
     for spec, pairs in opened.items():
         chosen = some(pairs, settings.count, settings.crop, settings.bin)
-        clean = [replace(p, noisy=None, shot_var=None, read_var=None) for p in each_readable(chosen, spec)]
+        clean = [replace(p, noisy=None, shot_var=None, read_var=None) for p in skip_broken(chosen, spec)]
         own |= own_variances(pairs, clean, noises[settings.isos[0]], settings.seed, settings.bin)
         frames += clean
     claim(settings, overwrite)

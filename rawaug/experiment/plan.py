@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Readable, Remembered, left_out
+from rawaug.data.folders import Cached, Readable, left_out
 from rawaug.data.pairs import (
     OWN_PICTURES,
     Binned,
@@ -153,7 +153,7 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
         validation=some(validation, data.validation_count, data.validation_crop, data.bin),
         test=some(test, data.test_count, data.test_crop, data.bin),
         references=test,
-        pictures=Remembered(pictures, data.memory_mb) if data.memory_mb else pictures,
+        pictures=Cached(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
     )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data import open_pairs
-from rawaug.data.folders import each_readable
+from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.psnr_r import psnr_r
@@ -73,7 +73,7 @@ class Ablation:
 def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     """Run an ablation: a table, ``ablation.json`` and ``ablation.png``; ``overwrite`` replaces another of its name."""
     require_free(ablation, overwrite)
-    pairs = list(each_readable(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
+    pairs = list(skip_broken(open_pairs(ablation.data, split="train"), "data"))[: ablation.count]
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)

@@ -20,7 +20,7 @@ from denoisers import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.folders import each_readable
+from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Sample, SomePairs
 from rawaug.evaluation.scores import Score, score_denoiser
 from rawaug.isp.config import ReverseISP
@@ -107,7 +107,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     """Mean scores on the test frames; their noise is frozen with seed 0."""
     opened = ((open_pairs(spec, split="test"), spec) for spec in config.test)
     chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
-    pairs = (pair for frames, spec in chosen for pair in each_readable(frames, spec))
+    pairs = (pair for frames, spec in chosen for pair in skip_broken(frames, spec))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
     scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
     return mean_of(scores)

@@ -24,7 +24,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Readable, each_readable
+from rawaug.data.folders import Readable, skip_broken
 from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
@@ -190,7 +190,7 @@ class PreparedComparison:
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
         self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
-        self.pairs = list(each_readable(self.chosen, "data"))
+        self.pairs = list(skip_broken(self.chosen, "data"))
         if len(self.pairs) < 2 and not settings.test:
             raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
         if settings.test:
@@ -211,7 +211,7 @@ class PreparedComparison:
         if settings.test:
             test = open_pairs(settings.test, split="test")
             tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
-            deque(each_readable(tested, "test"), maxlen=0)
+            deque(skip_broken(tested, "test"), maxlen=0)
             self.scored = tested.kept()
             if (seen := shared_frame(self.scored, found)) is not None:
                 raise ValueError(f"test: {seen} is also in data; score on unseen frames")

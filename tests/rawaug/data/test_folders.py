@@ -22,7 +22,7 @@ from torch.utils.data import DataLoader
 
 from rawaug.bayer import CFA, turn
 from rawaug.data import PictureFolder, RawFolder, open_pairs, open_pictures
-from rawaug.data.folders import Remembered, being_read
+from rawaug.data.folders import Cached, being_read
 from rawaug.io import develop, read_raw, write_picture
 
 
@@ -360,7 +360,7 @@ class Decoded:
 
 def test_a_picture_is_decoded_once() -> None:
     pictures = Decoded()
-    kept = Remembered(pictures, megabytes=2)
+    kept = Cached(pictures, megabytes=2)
     for _ in range(2):
         assert [int(kept[k][0, 0, 0]) for k in range(len(kept))] == [0, 1, 2]
     assert pictures.read == [0, 1, 2]
@@ -368,7 +368,7 @@ def test_a_picture_is_decoded_once() -> None:
 
 def test_what_has_no_room_is_decoded_again() -> None:
     pictures = Decoded()
-    kept = Remembered(pictures, megabytes=1)  # room for two
+    kept = Cached(pictures, megabytes=1)  # room for two
     for _ in range(2):
         assert [int(kept[k][0, 0, 0]) for k in (2, 0, 1)] == [2, 0, 1]
     assert pictures.read == [2, 0, 1, 1]

@@ -9,7 +9,7 @@ from PIL import Image
 
 from rawaug.data import Shapes, open_pictures
 from rawaug.data.demo.drawn import KINDS
-from rawaug.data.folders import Remembered, reports
+from rawaug.data.folders import Cached, reports
 
 
 def test_a_picture_depends_on_seed_and_index_alone() -> None:
@@ -68,7 +68,7 @@ def test_a_damaged_file_is_reported_behind_a_cache_and_among_others(tmp_path: Pa
     for k in range(30):
         Image.new("RGB", (40, 30), (9, 9, 9)).save(tmp_path / f"{k:02}.png")
     (tmp_path / "07.png").write_bytes(b"no picture")
-    pictures = Remembered(open_pictures(["shapes:1", str(tmp_path)]), megabytes=1)
+    pictures = Cached(open_pictures(["shapes:1", str(tmp_path)]), megabytes=1)
     assert reports(pictures) == []
     assert pictures[8].shape == (3, 30, 40)
     (report,) = reports(pictures)
