@@ -77,7 +77,7 @@ def test_missing_frames_are_reported(fivek: Path) -> None:
         open_pairs(f"fivek:{fivek}", split="validation")
     with pytest.raises(ValueError, match="fivek: no camera sony; use one of canon, nikon"):
         fivek_pairs(fivek, "test", ["sony"])
-    with pytest.raises(FileNotFoundError, match="no such fivek of FiveK"):
+    with pytest.raises(FileNotFoundError, match="no such folder of FiveK"):
         fivek_pairs(fivek / "none", "test", CAMERAS)
 
 
@@ -260,7 +260,7 @@ def test_what_is_wrong_with_zurich_is_reported(zurich: Path) -> None:
         Zurich(zurich, "test")[0]
     with pytest.raises(ValueError, match="zurich: no split validation; use train or test"):
         open_pairs(f"zurich:{zurich}", "validation")
-    with pytest.raises(FileNotFoundError, match="no such zurich of Zurich"):
+    with pytest.raises(FileNotFoundError, match="no such folder of Zurich"):
         Zurich(zurich / "train")
 
 
