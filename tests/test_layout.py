@@ -32,7 +32,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "isp": BASE | {"kernels"},
     "io": BASE,
     "data": BASE | {"io"},
-    "plugin": CAMERA,
+    "plugin": CAMERA | {"io"},
     "evaluation": CAMERA | {"plugin", "data", "io"},
     "training": CAMERA | {"plugin", "data", "io", "evaluation"},
     "explore": CAMERA | {"plugin", "data", "io", "evaluation"},

@@ -26,13 +26,14 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pattern
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
-from rawaug.isp.fast import BakedISP
+from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
+from rawaug.plugin.targets import Target, Targets, through_jpeg
 from rawaug.registry import nearest
 from rawaug.seeding import keyed_generator, rank_key
 
@@ -63,6 +64,11 @@ class RawAugment(nn.Module):
             like. RAW of these last is a mosaic ``(B, 1, H, W)`` in place of packed RAW; see :mod:`rawaug.bayer`.
         light: of an ISP of published cameras, the light that cameras are drawn in: a colour temperature in kelvin, or
             one of :data:`rawaug.isp.cameras.LAMPS` by name. Any light by default.
+        target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
+            ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"``: both as sRGB ``(B, 3, H, W)`` in [0, 1],
+            developed by the setting that made the RAW, and no variance map; see :mod:`rawaug.plugin.targets`.
+        demosaicing: of ``"srgb"``: a name of :data:`rawaug.bayer.STENCILS`, or several to draw from (all).
+        jpeg: of ``"srgb"``: lowest and highest quality of the JPEG that the noisy picture goes through (no JPEG).
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
     Raises:
@@ -89,6 +95,9 @@ class RawAugment(nn.Module):
         cfa: str | None = None,
         light: float | str | None = None,
         tone: str | None = None,
+        target: Target = "raw",
+        demosaicing: str | Sequence[str] | None = None,
+        jpeg: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
         self.pattern = None if cfa is None else pattern(cfa)
@@ -97,6 +106,8 @@ class RawAugment(nn.Module):
             isp.configure(cfa=str(cfa))
         self.isp = frozen(isp)
         self.baked = frozen(BakedISP(isp))
+        self.targets = Targets(target, demosaicing, jpeg, self.cfa)
+        self.forward_pass = frozen(FastForward(isp)) if target == "srgb" else None
         self._draw(noise, sampling, strength, seed, exposure, light, tone)
 
     def _draw(
@@ -183,7 +194,8 @@ class RawAugment(nn.Module):
             place = torch.tensor([0, 0, *srgb.shape[-2:], 0]).repeat(len(srgb), 1)
         with _float32(srgb):
             setting = self._expose(self._sample_isp(srgb, generator), generator)
-            return AugmentParams(setting, self.noise.sample(len(srgb), generator), place)
+            noise = self.noise.sample(len(srgb), generator)
+            return AugmentParams(setting, noise, place, self.targets.sample(len(srgb), generator))
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
@@ -240,9 +252,20 @@ class RawAugment(nn.Module):
             clean = self._clean(srgb, params)
             noisy, variance = self.noise.apply_with_variance(clean, params.noise)
             _require_finite(noisy)
+            if self.targets.target == "srgb":
+                noisy, clean = (self._developed(raw, params) for raw in (noisy, clean))
+                if "quality" in params.development:
+                    noisy = through_jpeg(noisy, params.development["quality"])
+                return RawPair(noisy, clean, variance.new_empty(len(noisy), 0), params)
             if self.pattern is not None:
                 noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
+            if self.targets.target == "rgb":
+                clean = self.baked.colours(srgb, params.isp, params.place, white=1.0)
             return RawPair(noisy, clean, variance, params)
+
+    def _developed(self, raw: Tensor, params: AugmentParams) -> Tensor:
+        assert self.forward_pass is not None
+        return self.targets.develop(self.forward_pass, bayer.unpack(raw, self.isp.cfa), self.isp.cfa, params)
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
         """Clean RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""

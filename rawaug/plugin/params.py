@@ -23,21 +23,26 @@ class AugmentParams(NamedTuple):
         place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
             turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
             enlarged to the crop.
+        development: of target ``"srgb"``: number of the demosaicing and, with JPEG, its quality; else empty.
     """
 
     isp: ISPParams
     noise: dict[str, Tensor]
     place: Tensor
+    development: dict[str, Tensor]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
         """The same function applied to every tensor: ``params.map(lambda t: t[0])`` are those of the first picture."""
-        noise = {name: change(value) for name, value in self.noise.items()}
-        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place))
+        noise, development = (
+            {name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.development)
+        )
+        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place), development)
 
     def tensors(self) -> dict[str, Tensor]:
         """As a flat dict, to store with a batch; :meth:`from_tensors` is the inverse."""
-        isp = {f"isp.{name}": value for name, value in self.isp._asdict().items()}
-        return isp | {f"noise.{name}": value for name, value in self.noise.items()} | {"place": self.place}
+        groups = {"isp": self.isp._asdict(), "noise": self.noise, "development": self.development}
+        flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
+        return flat | {"place": self.place}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:
@@ -46,8 +51,11 @@ class AugmentParams(NamedTuple):
         if missing:
             raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
         isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
-        noise = {name.removeprefix("noise."): value for name, value in tensors.items() if name.startswith("noise.")}
-        return cls(isp, noise, tensors["place"])
+        noise, development = (
+            {name.removeprefix(group): value for name, value in tensors.items() if name.startswith(group)}
+            for group in ("noise.", "development.")
+        )
+        return cls(isp, noise, tensors["place"], development)
 
 
 class RawPair(NamedTuple):

@@ -126,13 +126,6 @@ def test_clean_raw_is_that_of_bayer_wherever_both_keep_the_same_colour(
     assert not torch.equal(other.clean[:, 0, ~same], bayer.unpack(drawn.clean, "RGGB")[:, 0, ~same])
 
 
-def test_stages_in_another_order_make_it_too(srgb: Tensor) -> None:
-    isp = DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"), colour_atoms=3, gain_atoms=3))
-    pair = RawAugment(isp, cfa="XTRANS")(srgb)
-    expected = XTRANS.mosaic(isp.reverse_pixels(srgb / 255.0, pair.params.isp)).clamp(max=1.0)
-    torch.testing.assert_close(pair.clean, expected)
-
-
 def test_the_noise_obeys_its_law_at_every_site_of_the_mosaic(isp: DictionaryISP) -> None:
     augment = RawAugment(isp, noise=(1e-3, 1e-5), sampling="chosen", cfa="XTRANS")
     pair = augment(torch.full((1, 3, 516, 516), 128, dtype=torch.uint8))
