@@ -1,6 +1,4 @@
-"""The reconstruction table in print: a row a method and setting, a column a figure.
-
-The reconstruction table: every method fitted on the same pairs, measured on frames left out.
+"""The reconstruction table: every method fitted on the same pairs, measured on frames left out.
 
 PSNR_r is leave-one-frame-out: a method is fitted on all frames but one, and scored on that one. With ``test`` it is
 that of a published split: a method is fitted once to all frames, and scored on every frame of another set.

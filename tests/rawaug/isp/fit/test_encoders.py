@@ -1,4 +1,4 @@
-"""Encoders are trained and kept only where they help on frames left out."""
+"""Encoders and end-to-end training are kept only where frames left out gain."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ import torch
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
 from rawaug.isp.fit.config import EncoderTraining
+from rawaug.isp.fit.descent import Descent, decibels
+from rawaug.isp.fit.encoders import joint_steps, train_jointly
+from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
@@ -28,7 +31,7 @@ def config(wanted: str, quick: EncoderTraining = QUICK) -> FitConfig:
     return FitConfig(atoms=2, reach=1.0, shading="off", isp=SETTINGS, **settings)
 
 
-def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:
+def lit_frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> list[Pair]:
     """Tiny frames in one of two lights. Brightness shows which, or misleads every other time."""
     pairs = []
     for k in range(count):
@@ -41,7 +44,7 @@ def frames(exact_pair: Callable[..., Pair], count: int, informative: bool) -> li
 
 
 def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
-    pairs = frames(exact_pair, 4, informative=True)
+    pairs = lit_frames(exact_pair, 4, informative=True)
     isp = fit_isp(pairs, config("on"), progress=False)
     assert isp.config.encoders
     dark, bright = (isp.choose(pairs[k].srgb[None]).gains[0] for k in (0, 2))
@@ -51,17 +54,17 @@ def test_on_they_look_at_the_picture(exact_pair: Callable[..., Pair]) -> None:
 
 
 def test_auto_leaves_the_constants_to_few_frames(exact_pair: Callable[..., Pair]) -> None:
-    isp = fit_isp(frames(exact_pair, 4, informative=True), config("auto"), progress=False)
+    isp = fit_isp(lit_frames(exact_pair, 4, informative=True), config("auto"), progress=False)
     assert not isp.config.encoders and "encoders_gain_db" not in isp.info
 
 
 def test_auto_keeps_them_where_the_picture_shows_the_light(exact_pair: Callable[..., Pair]) -> None:
-    isp = fit_isp(frames(exact_pair, 12, informative=True), config("auto"), progress=False)
+    isp = fit_isp(lit_frames(exact_pair, 12, informative=True), config("auto"), progress=False)
     assert isp.config.encoders and isp.info["encoders_gain_db"] > 1.0
 
 
 def test_auto_drops_them_where_it_does_not(exact_pair: Callable[..., Pair]) -> None:
-    pairs = frames(exact_pair, 12, informative=False)
+    pairs = lit_frames(exact_pair, 12, informative=False)
     isp = fit_isp(pairs, config("auto"), progress=False)
     assert not isp.config.encoders and isp.info["encoders_gain_db"] < -0.2
     off = fit_isp(pairs, config("off"), progress=False)
@@ -95,8 +98,59 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
 
     monkeypatch.setattr(pipeline, "_Fit", Noted)
     monkeypatch.setattr(encoders, "decibels", decibels)
-    fit_isp(frames(exact_pair, 4, informative=True), settings, progress=False)
+    fit_isp(lit_frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
     for seen, scored in judged:
         assert scored and not seen & scored and seen | scored == everything
+
+
+CONFIG = FitConfig(steps=5, curve_steps=20, pixels=512, batch=128, shading="off", joint_steps=0, prior_steps=50)
+
+
+@pytest.fixture(scope="module")
+def frames(exact_pair: Callable[..., Pair]) -> list[Pair]:
+    return [exact_pair(f"shot{k}", (1.6, 1.0, 1.7), k, size=(32, 40)) for k in range(3)]
+
+
+@pytest.fixture
+def isp(frames: list[Pair]) -> DictionaryISP:
+    return fit_isp(frames, CONFIG, progress=False)
+
+
+def trained(isp: DictionaryISP, frames: list[Pair], steps: int, learning_rate: float) -> None:
+    """Looked at every 5 steps."""
+    samples, shots = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
+    config, descent = replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False, report_steps=5)
+    train_jointly(isp, samples, shots, config, descent, learning_rate)
+
+
+def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair]) -> None:
+    assert "joint" not in isp.info
+    with torch.no_grad():
+        isp.gain.log_gains.add_(0.1)
+    samples, shots = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
+    before = decibels(isp, samples, shots, [0])
+    trained(isp, frames, steps=20, learning_rate=1e-2)
+    gain, info = decibels(isp, samples, shots, [0]) - before, isp.info["joint"]
+    assert gain > 3.0 and info["gain_db"] == pytest.approx(gain, abs=0.006)
+    assert info["steps"] == 20 and info["kept_step"] in (5, 10, 15, 20)
+
+
+def test_where_every_step_is_worse_the_start_remains(isp: DictionaryISP, frames: list[Pair]) -> None:
+    before = {key: value.clone() for key, value in isp.state_dict().items()}
+    trained(isp, frames, steps=10, learning_rate=1.0)
+    assert isp.info["joint"] == {"steps": 10, "kept_step": 0, "gain_db": 0.0}
+    assert all(torch.equal(value, before[key]) for key, value in isp.state_dict().items())
+
+
+def test_it_ends_a_fit_that_asks_for_it_and_one_of_many_frames(frames: list[Pair]) -> None:
+    assert fit_isp(frames, replace(CONFIG, joint_steps=1), progress=False).info["joint"]["steps"] == 1
+    by_itself = replace(CONFIG, joint_steps=None)
+    assert [joint_steps(by_itself, count) for count in (3, 49, 50)] == [0, 0, 1000]
+    assert joint_steps(replace(CONFIG, joint_steps=7), 100) == 7
+
+
+def test_a_single_frame_leaves_none_to_watch(frames: list[Pair]) -> None:
+    with pytest.raises(ValueError, match="two frames or more"):
+        fit_isp(frames[:1], replace(CONFIG, joint_steps=5), progress=False)

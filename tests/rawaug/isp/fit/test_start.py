@@ -1,4 +1,4 @@
-"""Every frame's own colour: the curve in two numbers, the mask, and what draws the frames of a camera together."""
+"""From the frames to dictionaries: each frame's own colour, clusters, reach, cameras apart, and the constants."""
 
 from __future__ import annotations
 
@@ -8,13 +8,128 @@ from typing import Any, cast
 
 import pytest
 import torch
+from scipy.optimize import nnls
 
 from rawaug.data.pairs import Pair
+from rawaug.isp.conditioning import with_white_balance
+from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import sample_pixels
-from rawaug.isp.fit.start import TIE, TIE_RANGE, FrameColour, Tie, fall_off, least_squares
+from rawaug.isp.fit.start import (
+    TIE,
+    TIE_RANGE,
+    FrameColour,
+    Tie,
+    best_constants,
+    fall_off,
+    least_squares,
+    reach_atoms,
+    set_priors,
+)
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
+
+QUICK = FitConfig(steps=0, curve_steps=20, pixels=2048, batch=512, shading="off")  # the curve is the start's
+OTHER = torch.tensor([[0.8, 0.15, 0.05], [0.25, 0.5, 0.25], [0.1, 0.1, 0.8]])
+
+
+def oracle_gains(isp: DictionaryISP, gains: tuple[float, float, float]) -> torch.Tensor:
+    """Of all in the convex hull of the atoms, the inverse gains nearest to those of ``gains``, as a ratio to them."""
+    inverse, wanted = 1 / isp.gain.channel_gains().detach().double(), 1 / torch.tensor(gains).double()
+    one = 1e3 * torch.ones(1, len(inverse)).double()
+    weights, _ = nnls(torch.cat([inverse.T, one]).numpy(), torch.cat([wanted, one[0, :1]]).numpy())
+    return torch.as_tensor(weights) @ inverse / wanted
+
+
+@pytest.fixture(scope="module")
+def one_light(exact_pair: Callable[..., Pair]) -> list[Pair]:
+    return [exact_pair(f"shot{k}", (1.7 + 0.01 * k, 1.0, 1.6), k) for k in range(2)]
+
+
+def test_reach_brings_an_unseen_light_into_the_hull(one_light: list[Pair]) -> None:
+    isp = fit_isp(one_light, QUICK, progress=False)
+    assert (isp.config.colour_atoms, isp.config.gain_atoms) == (2, 10)
+    for light in ((2.2, 1.0, 1.25), (1.35, 1.0, 2.1), (2.0, 1.0, 1.9)):
+        torch.testing.assert_close(oracle_gains(isp, light), torch.ones(3).double(), atol=0.01, rtol=0)
+
+
+def test_a_reach_of_one_adds_no_atoms(one_light: list[Pair]) -> None:
+    isp = fit_isp(one_light, replace(QUICK, reach=1.0), progress=False)
+    assert isp.config.gain_atoms == isp.config.colour_atoms == 2
+    assert (oracle_gains(isp, (2.2, 1.0, 1.25)) - 1).abs().max() > 0.1
+
+
+def test_reach_atoms_are_corners_of_a_box_tetrahedron_first() -> None:
+    corners = reach_atoms(8, 1.6).exp()
+    assert corners[:, 1:].unique().tolist() == pytest.approx([1 / 1.6, 1.6])
+    assert corners[:, 0].unique().tolist() == pytest.approx([1.6**-0.25, 1.6**0.25])
+    assert len(corners.unique(dim=0)) == 8 and reach_atoms(0, 1.6).shape == (0, 3)
+    torch.testing.assert_close(corners[:4].log().sum(0), torch.zeros(3))  # every four are about the mean
+
+
+def test_two_cameras_in_one_fit_are_reported_apart_by_their_light(
+    exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
+) -> None:
+    first = [exact_pair(f"a{k}", (1.5 + 0.05 * k, 1.0, 2.0 - 0.05 * k), k, camera="A") for k in range(3)]
+    second = [exact_pair(f"b{k}", (2.4, 1.0, 1.3), 3 + k, matrix=OTHER, camera="B") for k in range(3)]
+    isp = fit_isp([*first, *second], QUICK, progress=False)
+    torch.testing.assert_close(isp.colour.atoms()[3:], OTHER.expand(3, 3, 3), atol=0.02, rtol=0)
+    for light, own, matrix in (((1.55, 1.0, 1.95), slice(3), camera_matrix), ((2.4, 1.0, 1.3), slice(3, 6), OTHER)):
+        assert isp.colour.weights_for(torch.tensor([light]))[0, own].sum() > 0.95
+        unseen = exact_pair("unseen", light, 9, matrix=matrix)
+        known = isp.reverse(unseen.srgb[None], white_balance=light)
+        isp_of_all = isp.colour.spread.clone()
+        isp.colour.spread.fill_(torch.inf)
+        alike = isp.reverse(unseen.srgb[None], with_white_balance(isp, isp.choose(unseen.srgb[None]), light, None))
+        isp.colour.spread.copy_(isp_of_all)
+        scores = [psnr(result.raw, unseen.raw[None]).item() for result in (known, alike)]
+        assert scores[0] > 48.0 and scores[0] > scores[1] + 10.0
+
+
+def test_frames_that_are_all_alike_are_clustered_without_a_word(exact_pair: Callable[..., Pair]) -> None:
+    frames = [exact_pair("same", (1.6, 1.0, 1.5), 0)] * 3
+    isp = fit_isp(frames, replace(QUICK, atoms=2), progress=False)
+    torch.testing.assert_close(isp.colour.atoms()[0], isp.colour.atoms()[1])
+
+
+def test_constants_serve_the_many_and_not_the_odd_one_out() -> None:
+    inverse = torch.tensor([[1.0, 1.0, 1.0], [0.5, 1.0, 0.5]])
+    wanted = torch.tensor([0.8, 0.8, 0.8, 0.52])[:, None] * torch.tensor([1.0, 0.0, 1.0])
+    wanted[:, 1] = 1.0
+    a = torch.tensor([0.1, 0.2, 0.3, 5.0])[:, None].expand(4, 3)  # the last has by far the largest error to offer
+    weights = best_constants(a, wanted * a, inverse)
+    torch.testing.assert_close(weights @ inverse, torch.tensor([0.8, 1.0, 0.8]), atol=0.005, rtol=0)
+
+
+def test_clipped_readings_say_nothing_of_the_gains(
+    exact_pair: Callable[..., Pair], camera_matrix: torch.Tensor
+) -> None:
+    gains = (2.0, 1.0, 1.5)
+    pair = exact_pair("shot", gains, 0)
+    clipped = (torch.arange(pair.raw.shape[-1]) % 8 < 4).expand_as(pair.raw)
+    srgb, raw = torch.where(clipped, 255, pair.srgb), torch.where(clipped, 1.0, pair.raw)
+    isp = DictionaryISP(ISPConfig(colour_atoms=1, gain_atoms=2, attention=False))
+    with torch.no_grad():
+        isp.colour.matrices.copy_(camera_matrix[None])
+        isp.gain.log_gains.copy_(torch.tensor([[1.0, 2.0, 1.5], [1.0, 1.0, 1.0]]).log())
+    samples, _ = sample_pixels([replace(pair, srgb=srgb.to(torch.uint8), raw=raw)], 4096, seed=0)
+    set_priors(isp, samples, FitConfig())
+    torch.testing.assert_close(isp.choose(pair.srgb[None]).gains, torch.tensor([gains]), atol=0.02, rtol=0)
+
+
+def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[Pair]) -> None:
+    knees = []
+    for spared in (False, True):
+        pairs = []
+        for pair in exact_pairs[:2]:
+            mean = pair.srgb.float().mean(0) / 255
+            bright = (mean > 0.6).expand_as(pair.srgb)
+            raw = torch.where(bright[:1], 1.0, pair.raw) if spared else pair.raw
+            pairs.append(Pair(pair.name, torch.where(bright, 255, pair.srgb).to(torch.uint8), raw, pair.cfa,
+                              pair.white_balance, pair.color_matrix))  # fmt: skip
+        knees.append(fit_isp(pairs, QUICK, progress=False).config.knee)
+    assert knees[0] > knees[1]
+
 
 CURVE = FitConfig(steps=0, pixels=2048, batch=512, prior_steps=100)
 SHORT = replace(CURVE, curve_steps=50)
