@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import denoisers
 from benchmarks import augment, crops, denoise, equal_minutes, measure, networks, synth
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
@@ -31,11 +30,6 @@ def test_augmentation_is_compared_in_one_unit() -> None:
     assert ours["moved"] == pytest.approx(ours["counted"] * 19 / 11)
     assert rows["upi"]["ratio"] == pytest.approx(ours["mpix_s"] / rows["upi"]["mpix_s"])
     assert "moved" not in rows["upi"], "what other methods move is not known"
-
-
-def test_bandwidth_and_peak_memory_are_positive_and_finite() -> None:
-    assert 0.01 < augment.bandwidth(CPU, megabytes=1, repeats=2) < 1e5
-    assert 0 <= augment.peak_memory(CPU, 32, 32) < float("inf")
 
 
 def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,12 +61,6 @@ def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch:
     assert seen == 5 * [torch.Size([2, 4, 16, 16])], "one batch to start, four timed"
 
 
-def test_published_sizes_can_be_built() -> None:
-    with torch.device("meta"):
-        built = {name: denoisers.build(name, **size) for name, size in networks.GPU_SIZES.items()}
-    assert built.keys() == networks.SIZES.keys()
-
-
 def test_denoising_is_timed_whole_and_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
     denoise.main(["--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
@@ -82,15 +70,6 @@ def test_denoising_is_timed_whole_and_in_tiles(tmp_path: Path, capsys: pytest.Ca
     assert all(row["seconds"] > 0 for row in rows.values())
     assert denoise.frame(12, CPU).shape == (1, 4, 1414, 2121)
     capsys.readouterr()
-
-
-def test_a_form_without_room_is_reported_and_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-        raise torch.OutOfMemoryError("CUDA out of memory")
-
-    assert denoise.measure(full, torch.rand(1, 4, 8, 8), repeats=1) == {  # type: ignore[arg-type]
-        f"{form}, {p}": {} for form in ("whole", "tiles") for p in ("float32", "bfloat16")
-    }
 
 
 def test_pairs_on_disk_and_online_are_compared_with_decoding(tmp_path: Path) -> None:
