@@ -35,7 +35,7 @@ _SHADING_NODES = (25, 33)
 
 
 class PictureTask(Task):
-    """A picture, its name as the key of its draws, where its pairs go, and the numbers of those that are missing."""
+    """The missing pairs of one picture; its name in the folder is the key of its draws."""
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
         self.picture, self.key, self.stem = picture, key, stem
@@ -55,7 +55,7 @@ class PictureTask(Task):
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:
-    """One a picture. Pictures that differ in their extension alone keep it in the names of their pairs."""
+    """One task for each picture; pictures that differ only in their extension keep it in the names of their pairs."""
     stems = Counter(picture.with_suffix("") for picture in pictures)
     taken: dict[Path, Path] = {}
     for picture in pictures:
@@ -70,7 +70,7 @@ def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: 
 
 
 def _short(name: str) -> str:
-    """The name, or its beginning and a hash where it leaves no room for the endings of the pairs' files."""
+    """The name, shortened and with a hash if the pairs' file names would become too long."""
     encoded = os.fsencode(name)
     if len(encoded) <= LONGEST_STEM:
         return name
@@ -97,7 +97,7 @@ def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, o
 
 
 def params_file(stem: Path) -> Path:
-    """Where the parameters of the pair are."""
+    """The file of the pair's parameters."""
     return _beside(stem, ".safetensors")
 
 
@@ -129,7 +129,7 @@ def _beside(stem: Path, ending: str) -> Path:
 
 
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
-    """The metadata of a mosaic; a colour that no camera has is left out."""
+    """Metadata of the mosaics; colour that cannot be inverted is not stored."""
     noise = pair.params.noise
     stated: dict[str, Any] = {"cfa": augment.cfa}
     stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
@@ -187,7 +187,7 @@ def _black(darkest: float) -> float:
 
 
 def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
-    """What corrects the Gaussian part of the shading, where there is any."""
+    """Gain maps that correct the Gaussian part of the shading, if the ISP has any."""
     lens = augment.isp.find(LensShading)
     if lens is None:
         return ()

@@ -25,7 +25,7 @@ from rawaug.registry import Spec
 
 
 def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or compare them with those in it, unless ``overwrite``."""
+    """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
     if path.is_file() and not overwrite:
         try:
             known = json.loads(path.read_text())
@@ -70,14 +70,14 @@ class Origin:
 
 
 class Outcome(NamedTuple):
-    """Of a task: pairs made, and the pictures that could not be read, with why."""
+    """Result of a task: the number of pairs made, and the reason for each picture that could not be read."""
 
     made: int
     broken: dict[str, str]
 
 
 class Task(ABC):
-    """What one process makes at a time.
+    """A unit of work for one process.
 
     Attributes:
         pictures: how many it is about.
@@ -93,7 +93,7 @@ class Task(ABC):
 
     @abstractmethod
     def make(self, maker: PairMaker) -> Outcome:
-        """Write what is missing."""
+        """Write the missing files."""
 
 
 class PairMaker:
@@ -104,13 +104,13 @@ class PairMaker:
         self.augment = settings.drawing.make()
 
     def origin(self, picture: Path, content: str) -> Origin:
-        """Of the pairs of a picture with this hash."""
+        """The origin of the pairs of a picture with this hash."""
         drawing = self.settings.drawing
         noise, cfa = drawing.noise_spec, self.augment.cfa
         return Origin(str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa)
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
-        """What pairs of a file are made from, and the pairs ``(4, h, w)`` by their numbers."""
+        """The origin of a picture's pairs, and an iterator over (number, pair ``(4, h, w)``)."""
         before, content = picture.stat(), sha256(picture)
         srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()

@@ -41,7 +41,7 @@ _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "
 
 
 class ShardTask(Task):
-    """One shard: its path, the number of its first picture, and its pictures by name; ``known`` is its record."""
+    """One shard: its path, the index of its first picture, and the names of its pictures."""
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
         self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
@@ -51,7 +51,7 @@ class ShardTask(Task):
         self.broken, self.todo = dict(known.get("broken", {})), not known
 
     def known(self) -> dict[str, Any]:
-        """What says that the shard is whole; empty without it."""
+        """The record that marks the shard as complete; empty if there is none."""
         if not self.record.is_file():
             return {}
         try:
@@ -81,7 +81,7 @@ class ShardTask(Task):
 def shard_tasks(
     pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
 ) -> list[ShardTask]:
-    """One a shard."""
+    """One task for each shard."""
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)
@@ -95,7 +95,7 @@ def shard_tasks(
 def shard_settings(
     pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
 ) -> dict[str, object]:
-    """What else all shards of a folder have in common: a picture more, and all that follow would move."""
+    """Settings that must not change between runs: adding a picture would shift all later shards."""
     listed = os.fsencode("\n".join(_names(pictures, source)))  # names need not be UTF-8
     return {
         "pictures": len(pictures),
@@ -111,7 +111,7 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 
 
 def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
-    """The JSON of a sample. Paths are those within the folder, which other machines have elsewhere."""
+    """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
     own = {**vars(origin), "picture": name, "isp": Path(origin.isp).name, "number": number}
     height, width = maker.augment.mosaic(pair.clean).shape[-2:]
     levels = {key: pair.params.noise[key].item() for key in ("shot_var", "read_var") if key in pair.params.noise}
@@ -156,7 +156,7 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
 
 
 def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
-    """Write index and card, if all shards are there, whoever made them; whether they are."""
+    """Write the index and the dataset card once all shards exist; returns whether they do."""
     if not all(task.record.is_file() for task in tasks):
         return False
     records = [task.known() for task in tasks]

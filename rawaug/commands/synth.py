@@ -75,7 +75,7 @@ def run(
 
 @dataclass
 class Synthesis:
-    """What a run did: pairs made, pairs that were there already, and the pictures that could not be read, with why."""
+    """Result of a run: pairs made, pairs that existed before, and the reason for each unreadable picture."""
 
     out: Path
     pictures: int = 0
@@ -181,14 +181,14 @@ def _settings(format: Format, per_image: int, seed: int, **drawn: Any) -> Settin
 
 
 def _portable(settings: Settings) -> dict[str, object]:
-    """The settings of shards, which machines that have the ISP's file in different places share."""
+    """Settings without the path of the ISP's file, which differs between machines."""
     return {**settings.stored(), "isp": Path(settings.drawing.isp).name}
 
 
 def _work_off(
     tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None, result: Synthesis
 ) -> None:
-    """Do what is to be done, and count."""
+    """Run the unfinished tasks and add up their outcomes."""
     result.pictures = sum(task.pictures for task in tasks)
     result.existing = sum(task.existing for task in tasks)
     for task in tasks:
@@ -220,7 +220,7 @@ _maker: PairMaker
 
 
 def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
-    """Of each task as it finishes."""
+    """Yield the outcome of each task as it finishes."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
     if workers < 1:
         _prepare(settings, max_pixels)
@@ -242,7 +242,7 @@ def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: i
 
 
 def _start_worker(settings: Settings, max_pixels: int) -> None:
-    """A worker has one thread, leaves the interrupt to the parent, and ends when the parent has died."""
+    """Single-threaded; ignores Ctrl-C, which the parent handles; exits when the parent dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

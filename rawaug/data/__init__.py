@@ -165,12 +165,12 @@ def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Cal
 
 
 def _kind_and_path(spec: str) -> tuple[str | None, str]:
-    """``"kind:path"`` taken apart; the kind of a bare path (``C:\\shots`` too) is None."""
+    """Split ``"kind:path"``; the kind is None for a plain path, including ``C:\\shots``."""
     kind, colon, path = spec.partition(":")
     return (kind, path) if colon and len(kind) > 1 and kind.replace("-", "").isidentifier() else (None, spec)
 
 
 def _path_and_split(path: str) -> tuple[str, str | None]:
-    """``"path:split"`` taken apart; demo's bare split is its path."""
+    """Split ``"path:split"``; the split is None if not given."""
     folder, colon, split = path.rpartition(":")
     return (folder, split) if colon and split in _SPLITS else (path, None)

@@ -151,7 +151,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """RAW files and pictures of no known dataset, and FiveK, whose files are like any others."""
+    """RAW files and pictures of no known dataset, and FiveK, which cannot be told from other DNGs."""
     files = [path] if path.is_file() else list(files_below(path))
     if path.is_dir() and looks_like_pairs(files):
         yield "noisy/clean pairs", partial(PairFolder, path)
@@ -175,7 +175,7 @@ def _fivek(numbers: set[str]) -> str:
 
 
 class _RawFrames(Sequence[RawFrame]):
-    """The RAW files of a folder, or one, without a rendering of them."""
+    """RAW files, read without rendering them."""
 
     def __init__(self, path: Path) -> None:
         self.files = [path] if path.is_file() else sorted(files_below(path, RAW_EXTENSIONS))
@@ -192,7 +192,7 @@ def _submission(path: Path) -> list[Tensor]:
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
-    """Read the items one by one; what fails is a line of the report."""
+    """Read the items one by one; failures become lines of the report."""
     part = PartReport(what)
     try:
         items = open_part()
@@ -211,7 +211,7 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
 
 
 def _name(items: Any, index: int) -> object:
-    """Of an item, in the report of a crash."""
+    """How the report of a crash names an item."""
     if isinstance(items, PictureFolder):
         return items.file(index)
     names = items.files if isinstance(items, _RawFrames) else getattr(items, "names", range(len(items)))
@@ -220,7 +220,7 @@ def _name(items: Any, index: int) -> object:
 
 @lru_cache(maxsize=1)
 def _opened(opening: bytes) -> Any:
-    """The part, opened once in the helper process; damaged blocks of a file stay known there."""
+    """The dataset, opened once in the helper process."""
     return pickle.loads(opening)()
 
 

@@ -165,7 +165,7 @@ class PictureFolder(Dataset[Tensor]):
         return [self.file(index) for index in self._reading.tolist() if index >= 0]
 
     def _attempt(self, index: int) -> Tensor | None:
-        """The picture, or None and a mark where it is damaged."""
+        """The picture, or None if it is damaged, which is then remembered."""
         slot = _slot()
         self._reading[slot] = index
         try:
@@ -209,7 +209,7 @@ def _slot() -> int:
 
 
 def reports(pictures: Any) -> list[str]:
-    """What each folder in ``pictures`` skipped so far, a text a folder; those behind a cache or in a list too."""
+    """The report of each folder in ``pictures`` that skipped files, including cached and concatenated ones."""
     if isinstance(pictures, PictureFolder):
         return [pictures.report()] if pictures.skipped else []
     inside = pictures.datasets if isinstance(pictures, ConcatDataset) else [getattr(pictures, "pictures", None)]
@@ -280,7 +280,7 @@ class Readable(Sequence[Pair]):
             raise ValueError(f"none of the {len(self.pairs)} frames can be read; {self.reasons()[0]}")
 
     def attempt(self, index: int, read: Callable[[int], T]) -> T | None:
-        """``read(index)``; None where this pair, now or before, could not be read."""
+        """``read(index)``, or None if this pair cannot be read."""
         if index in self.broken:
             return None
         try:
@@ -290,18 +290,18 @@ class Readable(Sequence[Pair]):
             return None
 
     def reasons(self) -> list[str]:
-        """Why pairs were left out so far, in their order."""
+        """The reasons for the pairs skipped so far, in order."""
         return [self.broken[index] for index in sorted(self.broken)]
 
     def kept(self) -> Sequence[Pair]:
-        """Those that were not found to be broken so far; all of them as they were given if none was."""
+        """The pairs without those found broken so far; the original sequence if none was."""
         if not self.broken:
             return self.pairs
         return SomePairs(self.pairs, [k for k in range(len(self.pairs)) if k not in self.broken])
 
 
 def left_out(pairs: Readable, of: str) -> list[str]:
-    """What was left out of a dataset, as lines to print: how many, then the reason of each; none if nothing was."""
+    """Lines to print about skipped pairs: how many, then each reason; empty if none was skipped."""
     reasons = pairs.reasons()
     if not reasons:
         return []
@@ -309,7 +309,7 @@ def left_out(pairs: Readable, of: str) -> list[str]:
 
 
 def skip_broken(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
-    """The pairs that can be read, one by one; at the end the others are printed.
+    """Iterate over the readable pairs; afterwards, print the skipped ones.
 
     Args:
         pairs: a dataset, or one that is :class:`Readable` already, which then keeps what was found.

@@ -138,7 +138,7 @@ Found = tuple[np.ndarray, Mapping[str, Any]]
 
 
 class _Unclear(ValueError):
-    """The file is whole, but which array is meant is not clear."""
+    """The file is intact, but it does not say which array is the mosaic."""
 
 
 def _read_npz(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
@@ -324,7 +324,7 @@ def _levels_of(file: Path, numbers: np.ndarray, stated: Metadata) -> tuple[tuple
 
 
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:
-    """``(4, h, w)`` as it is; a mosaic ``(H, W)`` or ``(1, H, W)`` packed."""
+    """Pack a mosaic ``(H, W)`` or ``(1, H, W)``; packed RAW is returned unchanged."""
     if numbers.ndim == 3 and numbers.shape[0] == 4:
         return numbers
     if numbers.ndim == 3 and numbers.shape[0] == 1:

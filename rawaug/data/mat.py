@@ -114,7 +114,7 @@ def _require_size(size: int, name: str) -> None:
 
 
 def _member(group: Any, name: str) -> Any:
-    """What a group itself holds under a name: links of HDF5 can lead to any file on this machine."""
+    """A member of a group; HDF5 links are refused, since they can point to any file on this machine."""
     with extra("data"):
         import h5py
 
@@ -124,7 +124,7 @@ def _member(group: Any, name: str) -> Any:
 
 
 class _Missing(ValueError):
-    """A variable that is not there: no damage."""
+    """The variable does not exist; the file is not damaged."""
 
 
 def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
@@ -132,7 +132,7 @@ def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
 
 
 def _values(node: Any) -> Any:
-    """All of a dataset of HDF5, which is in the file itself, and no larger than it may be."""
+    """The values of an HDF5 dataset; refuses external storage and datasets above the size limit."""
     if node.external or node.is_virtual:
         raise ValueError(f"{node.name} is stored in another file")
     _require_size(node.size * node.dtype.itemsize, node.name)

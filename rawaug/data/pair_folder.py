@@ -146,7 +146,7 @@ class PairFolder(LazyPairs):
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
-    """Refuse RAW files that are noisy by their names where all frames are taken alike."""
+    """Raise ValueError if a folder of RAW files holds noisy frames, by their names."""
     files = {file.resolve() for file in folder.files}
     for file in folder.files:
         found = re.fullmatch(r"(.*)_noisy", file.stem, re.IGNORECASE)
@@ -192,7 +192,7 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
 
 
 def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> list[PairFiles]:
-    """Every noisy file with its clean one."""
+    """Match every noisy file with its clean one."""
     if len(_WILD.findall(noisy)) != len(_WILD.findall(clean)):
         raise ValueError(f"the patterns {noisy} and {clean} must have the same number of * and ?")
     index = {file.relative_to(top).as_posix().casefold(): file for file in files}
@@ -222,7 +222,7 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
 
 
 def _clean_pattern(noisy: str) -> str:
-    """The pattern with its word noisy, in any case, replaced by clean."""
+    """Replace the word noisy by clean, keeping its case."""
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
     if not count:

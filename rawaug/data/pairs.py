@@ -100,14 +100,14 @@ class Pair:
         return self.white_balance != (1.0, 1.0, 1.0)
 
     def with_levels(self) -> Pair:
-        """This pair; the levels of a noisy capture that came without are measured against ``raw``."""
+        """This pair, with noise levels measured against ``raw`` if the capture states none."""
         if self.noisy is None or self.shot_var is not None:
             return self
         shot_var, read_var = measured_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
     def require_rendered(self) -> None:
-        """Refuse a pair whose colours are unknown.
+        """Raise ValueError if the colours of the pair are unknown.
 
         Raises:
             ValueError: if ``srgb`` is no rendering in the camera's colours.
@@ -197,7 +197,7 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 
 
 def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """What a stage depends on, by frame, without reading files again."""
+    """A fingerprint for each frame, without reading its file."""
     if isinstance(pairs, LazyPairs):
         return [pairs.stamp(index) for index in range(len(pairs))]
     return [_sampled(pair) for pair in pairs]
@@ -333,7 +333,7 @@ class Binned(SomePairs):
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:
-    """The names, without reading lazy pairs."""
+    """Names of the pairs; lazy ones are not read."""
     return list(pairs.names) if isinstance(pairs, LazyPairs) else [pair.name for pair in pairs]
 
 
@@ -380,7 +380,7 @@ class Labelled(Protocol):
 
 
 def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
-    """Indices of ``count`` of the first ``kept`` pairs, of all of these if None; none is read.
+    """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices.
 
     Args:
         pairs: the dataset.

@@ -138,7 +138,7 @@ def _camera(frame: RawFrame) -> dict[int, Tag]:
 
 
 def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
-    """Tags that a DNG source has itself, or lacks on purpose."""
+    """Tags that are only written if the source is not a DNG."""
     tags: list[Tag] = [
         (_DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
         (50707, BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0)), True),
@@ -205,7 +205,7 @@ def _exif(frame: RawFrame, byte_order: str) -> list[Entry]:
 
 
 def _rationals(values: Iterable[float], denominator: int = 10**6) -> tuple[int, ...]:
-    """Numerators and denominators of 32 bits: what is large has a smaller denominator."""
+    """Numerators and denominators of 32 bits; large values get smaller denominators."""
     numbers = []
     for value in values:
         if not abs(value) <= _LARGEST:

@@ -28,7 +28,7 @@ _one_at_a_time = threading.Lock()
 
 
 def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
-    """``read(*arguments)`` in a helper process; in this one where it is itself a worker, or the limit is 0.
+    """Call ``read(*arguments)`` in a helper process, or directly in a worker process or if the limit is 0.
 
     Args:
         read: a function of a module, found there by its name.
@@ -67,7 +67,7 @@ def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
 
 @contextmanager
 def damage_as_os_error(path: Path, what: str, *passed: type[Exception]) -> Iterator[None]:
-    """Whatever a decoder raises on a damaged file as one OSError that names it; ``passed`` are let through."""
+    """Turn any exception of a decoder into an OSError that names the file, except those in ``passed``."""
     try:
         yield
     except (ImportError, *passed):  # type: ignore[misc]

@@ -120,7 +120,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
 
 @contextmanager
 def _text_damage_as_os_error(path: Path) -> Iterator[None]:
-    """Header texts that are not valid UTF-8 make OpenImageIO's binding fail."""
+    """OpenImageIO's binding fails on header texts that are not valid UTF-8."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -171,7 +171,7 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
 
 def require_utf8(path: Path) -> None:
-    """Refuse a name that the libraries cannot be given."""
+    """Raise OSError if the name is not UTF-8, which the libraries need."""
     if any("\udc80" <= letter <= "\udcff" for letter in str(path)):  # how Python represents bytes that are not UTF-8
         raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
 
@@ -184,7 +184,7 @@ def _floating() -> tuple[Any, ...]:
 
 
 def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
-    """Refuse what would fill the memory before anything is decoded."""
+    """Raise ValueError if the declared size is above the limit, before anything is decoded."""
     pixels = spec.width * spec.height * spec.depth
     if pixels > max_pixels or pixels * spec.nchannels > MAX_CHANNELS * max_pixels:
         size = f"{spec.height} x {spec.width} pixels"
@@ -193,7 +193,7 @@ def _require_size(spec: Any, path: Path, max_pixels: int) -> None:
 
 
 def _require_srgb(spec: Any, path: Path) -> None:
-    """Refuse what would need a profile, or a choice of channels, to become sRGB."""
+    """Raise ValueError if a conversion to sRGB would need a profile or a choice of channels."""
     stored = spec.get_string_attribute("tiff:ColorSpace") or spec.get_string_attribute("jpeg:ColorSpace")
     if any(name in stored for name in ("CMYK", "YCCK", "LAB", "separated")):
         raise ValueError(f"{path}: is {stored}; convert it to sRGB first")

@@ -52,7 +52,7 @@ UNKNOWN = Exposure()
 
 
 def exposure_of(raw: Any) -> Exposure:
-    """LibRaw says 0 where it does not know, and 1970 of a date; absurd values count as unknown too."""
+    """Exposure as LibRaw states it; 0, the year 1970 and absurd values mean unknown."""
     other = getattr(raw, "other", None)  # rawpy 0.27 or newer
     numbers = [float(getattr(other, name, 0)) for name in ("shutter_speed", "aperture", "focal_length")]
     seconds, f_number, focal_length = (number if 0 < number < _SENSE else None for number in numbers)
@@ -326,7 +326,7 @@ def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
 
 
 def _kind(raw: Any) -> str:
-    """What a file holds instead of a Bayer mosaic, in words."""
+    """Describe what a file holds instead of a Bayer mosaic."""
     with extra("raw"):
         import rawpy
 
@@ -341,7 +341,7 @@ def _kind(raw: Any) -> str:
 
 
 def _white_balance(raw: Any) -> tuple[float, float, float]:
-    """As LibRaw chooses: as shot, else for daylight."""
+    """As-shot multipliers, or those for daylight if the file has none."""
     as_shot = raw.camera_whitebalance
     return _green_is_1(as_shot if min(as_shot[:3]) > 0 else raw.daylight_whitebalance)
 
@@ -353,7 +353,7 @@ def _green_is_1(gains: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _color_matrix(raw: Any) -> tuple[np.ndarray, bool]:
-    """As LibRaw chooses: the file's own, else its table's for the model; a typical one, and False, without either."""
+    """The file's matrix, else LibRaw's for the model, else a typical one; and whether it is known."""
     own = np.asarray(raw.color_matrix, np.float64)[:, :3]
     if own.any():
         return own / own.sum(axis=1, keepdims=True), True

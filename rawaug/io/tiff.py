@@ -44,7 +44,7 @@ _LAYOUTS = {42: _Layout("I", "H", "HHI"), 43: _Layout("Q", "Q", "HHQ")}
 
 
 def require_no_circle(path: Path) -> None:
-    """Refuse a TIFF in which a directory leads back to itself; other files are left to whoever reads them."""
+    """Raise ValueError if the directories of a TIFF form a circle; other files are not checked."""
     # a directory that two others name is no circle: some writers chain the children that a parent lists as well
     with path.open("rb") as file:
         start = file.read(4)
@@ -163,7 +163,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
 @contextmanager
 def opened_tiff(path: Path) -> Iterator[Any]:
-    """tifffile's file, once its directories are known to end; damage becomes one OSError that names the file."""
+    """Open a TIFF after checking its directories; damage becomes an OSError that names the file."""
     with extra("raw"):
         import tifffile
 
@@ -174,7 +174,7 @@ def opened_tiff(path: Path) -> Iterator[Any]:
 
 
 def tag_damage(path: Path) -> AbstractContextManager[None]:
-    """The many ways in which tags of wrong types, counts and values fail as one OSError that names the file."""
+    """Turn the errors of damaged tags into an OSError that names the file."""
     with extra("raw"):
         import tifffile
 
@@ -220,7 +220,7 @@ def _numbers(tag: Any) -> Any:
 
 
 def _deltas(mosaic: Any, code: int) -> tuple[float, ...]:
-    """What is added to the black level of each row or column of the active area; empty where nothing is."""
+    """Offsets of the black level for each row or column of the active area; empty if there are none."""
     tag = mosaic.tags.get(code)
     if tag is None or not np.any(values := _numbers(tag)):
         return ()
@@ -230,7 +230,7 @@ def _deltas(mosaic: Any, code: int) -> tuple[float, ...]:
 
 
 def _about_zero(deltas: tuple[float, ...]) -> tuple[float, ...]:
-    """What is left without the mean; empty where that is nothing."""
+    """Subtract the mean; empty if nothing is left."""
     mean = _mean(deltas)
     return tuple(delta - mean for delta in deltas) if any(delta != mean for delta in deltas) else ()
 

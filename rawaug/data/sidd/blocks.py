@@ -79,7 +79,7 @@ def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tenso
 
 
 def _correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Of two stacks of images; 1 where one of them is flat, which contradicts nothing."""
+    """Correlation of two stacks of images; 1 if one of them is flat."""
     value = torch.corrcoef(torch.stack([a.flatten(), b.flatten()]))[0, 1]
     return torch.where(value.isfinite(), value, torch.ones(()))
 
@@ -116,7 +116,7 @@ class NoisyBlock(NamedTuple):
 
 
 class Once(Generic[T]):
-    """What ``read`` gives, read when it is first asked for; a file found damaged then is not read again."""
+    """Calls ``read`` once and keeps its value or its error."""
 
     def __init__(self, read: Callable[[], T]) -> None:
         self.read = read
@@ -136,7 +136,7 @@ class Once(Generic[T]):
 
 
 class _Blocks(LazyPairs):
-    """Blocks that are read all at once; what the 32 of a frame have in common is kept for the last one."""
+    """Blocks, read all at once; properties shared by the 32 blocks of a frame are kept for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:
         self.path = path
@@ -309,7 +309,7 @@ def _matching(folder: Path, pattern: str) -> list[Path]:
 
 
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
-    """The pictures of the clean and of the noisy blocks, of those that there are."""
+    """Pictures of the clean and noisy blocks, as far as their files exist."""
     found = {}
     for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
         name = pattern.format(kind)
