@@ -65,6 +65,7 @@ def test_parts_in_any_order_make_the_bytes_of_one_run(pictures: Path, whole: Pat
 def test_a_killed_run_is_resumed_by_shard(pictures: Path, whole: Path, tmp_path: Path) -> None:
     shards(pictures, tmp_path, "1/3")
     with replacing(tmp_path / "shard-000001.tar") as partial:
+        partial.touch()
         abandoned = partial
     (tmp_path / "shard-000001.tar").unlink()
     abandoned.write_bytes(b"killed here")

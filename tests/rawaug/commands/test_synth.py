@@ -72,6 +72,7 @@ def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -
     for file in parts.rglob("a_png_0*"):
         file.unlink()
     with replacing(parts / "c_1_clean.dng") as partial:
+        partial.touch()
         abandoned = partial.name
     (parts / "c_1_clean.dng").unlink()
     (parts / abandoned).write_bytes(b"a run that was killed here")
