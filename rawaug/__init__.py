@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
+    from rawaug.plugin.adapters import isp_model as isp_model
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.dataset import RawPairs as RawPairs
     from rawaug.plugin.dataset import RawPairStream as RawPairStream
@@ -31,6 +32,7 @@ _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
+    "rawaug.plugin.adapters": ("isp_model",),
     "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.loader": ("WrappedLoader", "wrap"),

@@ -5,13 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from rawaug import AugmentParams, DictionaryISP, RawAugment, RawPair, RawPairs, load_params, save_params, wrap
+from rawaug import (
+    AugmentParams,
+    DictionaryISP,
+    RawAugment,
+    RawPair,
+    RawPairs,
+    isp_model,
+    load_params,
+    save_params,
+    wrap,
+)
 from rawaug.bayer import STENCILS, pack_rgb
 from rawaug.isp.config import ISPConfig
 from rawaug.metrics import psnr
@@ -113,6 +124,27 @@ def test_datasets_and_loaders_collate_them(universal: DictionaryISP) -> None:
     assert torch.equal(pairs.replay(2, pairs[2].params).noisy, batch.noisy[2])
     (wrapped,) = wrap(DataLoader(pictures, batch_size=4), RawAugment(universal, target="rgb"))  # type: ignore[arg-type]
     assert wrapped.noisy.shape == (4, 4, 24, 32) and wrapped.clean.shape == (4, 3, 48, 64)
+
+
+def degradation(img: np.ndarray, hq: np.ndarray, isp_model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The call of KAIR's ``utils_blindsr.degradation_bsrgan``."""
+    with torch.no_grad():
+        img, hq = isp_model.forward(img.copy(), hq)
+    return img, hq
+
+
+def test_kair_s_call_gets_camera_noise_on_the_picture_and_its_target_back(universal: DictionaryISP) -> None:
+    augment = RawAugment(universal, noise=(1e-3, 1e-5), target="srgb", jpeg=(60, 90))
+    srgb = smooth(1, 48, 64)[0].permute(1, 2, 0).numpy().astype(np.float64)[:47, :63]
+    hq = np.zeros((94, 126, 3))
+    first, same = degradation(srgb, hq, isp_model(augment))
+    second, _ = degradation(srgb, hq, isp_model(augment))
+    assert first.shape == srgb.shape and first.dtype == np.float32 and same is hq
+    assert first.min() >= 0 and first.max() <= 1
+    assert not np.array_equal(first, second)
+    assert 20 < -10 * np.log10(np.mean((first - srgb) ** 2)) < 45
+    with pytest.raises(ValueError, match="needs an augmentation with target 'srgb', got 'raw'"):
+        isp_model(RawAugment(universal))
 
 
 def test_settings_without_meaning_are_refused(universal: DictionaryISP) -> None:
