@@ -45,7 +45,7 @@ app = App(
     help="Train and evaluate RAW denoisers and camera ISPs.",
     version=f"rawaug {__version__}",
     help_format="rst",
-    default_parameter=Parameter(negative_iterable=()),
+    default_parameter=Parameter(negative=""),
     result_action="return_value",
 )
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # main says what to do
@@ -70,7 +70,7 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> None:
 @app.meta.default
 def _launch(
     *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    quiet: Annotated[bool, Parameter(negative="")] = False,
+    quiet: bool = False,
 ) -> None:
     """Run a command.
 

@@ -28,5 +28,5 @@ def _converted(_: Any, tokens: Sequence[Token]) -> Any:
     return value_of(tokens[0].value)
 
 
-YAML = Parameter(converter=_converted, n_tokens=1, json_list=False)
+YAML = Parameter(converter=_converted, n_tokens=1, json_list=False, metavar="VALUE")
 """One argument of several forms: a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from itertools import islice
+from dataclasses import replace
 from pathlib import Path
 
 from denoisers.files import shipped
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import benchmark, crops, tables
+from rawaug.evaluation.benchmark import TOLD, benchmark, crops, tables
 from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.evaluation.own_noise import own_noise_note
 from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import require_writable, write_json
 from rawaug.kernels.runtime import find_device
+from rawaug.noise import own_noise
 
 ON_PAGE = 4
 
 
 def run(
     *denoisers: str,
-    data: str = "demo:test",
+    data: str = "real:test",
     bin: int = 1,
     count: int = 6,
     crop: int = 384,
@@ -39,7 +41,7 @@ def run(
         bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
-        seed: of the noise.
+        seed: seed of the noise.
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
@@ -55,11 +57,16 @@ def run(
         one = contestant(spec, where)
         name = one.name if one.name not in contestants else spec
         contestants[name] = one._replace(name=name)
-    frames = list(islice(open_pairs(data, split="test", bin=bin), count))
+    pairs = open_pairs(data, split="test", bin=bin)
+    frames = [replace(pairs[k], own_noise=own_noise(pairs, k)) for k in range(min(count, len(pairs)))]
     everyone = list(contestants.values())
     result = {"data": data, "bin": bin, "crop": crop, **benchmark(everyone, frames, crop, seed)}
     for title, head, cells in tables(result):
         print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
+    told = {name: row["scores"][TOLD] for name, row in result["rows"].items()}
+    shares = {f"{name} ({at})": scores[at] for name, scores in told.items() for at in scores if name != "noisy input"}
+    if note := own_noise_note(shares):
+        print(note)
     print("GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development.")
     print(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
     if json:

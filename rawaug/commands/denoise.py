@@ -69,9 +69,9 @@ def run(
         out: output DNG, or output folder.
         denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
-        noise: auto (NoiseProfile where the frame bears it out, else estimate), profile, estimate, camera (the law that
-            the denoiser was trained for), an ISP file (uses its stored noise law), a measured camera's name, or
-            [shot_var, read_var].
+        noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
+            law), profile, estimate, camera (the law that the denoiser was trained for), an ISP file (uses its stored
+            noise law), the name of a camera, or [shot_var, read_var].
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.

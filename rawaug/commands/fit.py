@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from cyclopts import Parameter
+
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
 from rawaug.errors import printable
@@ -18,7 +20,7 @@ def run(
     data: list[str],
     /,
     *,
-    camera_jpeg: bool = True,
+    camera_jpeg: Annotated[bool, Parameter(negative="--no-camera-jpeg")] = True,
     held_out: str | None = None,
     out: str,
     noise: Literal["auto", "on", "off"] = "auto",
@@ -30,14 +32,14 @@ def run(
 
     Args:
         data: RAW files, folders of them, or one kind:path.
-        camera_jpeg: use the camera's JPEG of the same stem as the sRGB image; false always uses LibRaw's rendering.
+        camera_jpeg: use the camera's JPEG of the same stem as the sRGB image, else LibRaw's rendering.
         held_out: frames to leave out of the fit; their PSNR_r is shown during the fit.
         out: output .safetensors file.
-        noise: measure the camera's noise at each ISO of the files, for noise: camera; auto continues without it where
-            the frames do not allow it.
+        noise: measure the camera's noise at each ISO of the files; auto continues without it where the frames do
+            not allow it.
         dark: folder of dark frames to measure the read variance.
         mosaics: CFA and levels of pairs:PATH.
-        config: of the fit.
+        config: settings of the fit.
     """
     if Path(out).suffix != ".safetensors":
         raise ValueError(f"--out {out}: the file must end in .safetensors")

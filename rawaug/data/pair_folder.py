@@ -48,7 +48,7 @@ class PairSettings(MosaicSettings):
     """How noisy/clean pairs are found and read if ``pairs:PATH`` alone does not determine it.
 
     Args:
-        noisy: pattern of the noisy files' names in pairs:PATH, such as "*_noisy.*", the naming of rawaug synth.
+        noisy: pattern of the noisy files' names in pairs:PATH, such as ``*_noisy.*``, as rawaug synth names them.
         clean: pattern of the clean files' names in pairs:PATH; by default ``noisy`` with clean in place of noisy.
     """
 

@@ -127,7 +127,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("run fewshot --train.learning 1", "train.learning: no such key (nearest: train.learning_rate)"),
         ("run fewshot --train.stepz=3", "train.stepz: no such key (nearest: train.steps)"),
         ("run fewshot --arms.real.augmneted 1", "arms.real.augmneted: no such key (nearest: arms.NAME.augmented)"),
-        ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be between 0 and 1, got 7"),
+        ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be a number from 0.0 to 1.0, got 7"),
         ("run fewshot --data.count few", "data.count: input should be a valid integer"),
         ("run fewshot --isp.tone curves", "isp.tone: input should be 'auto', 'learned' or 'curve', got 'curves'"),
         ("run fewshot --train.ema null", "train.ema: input should be a valid number, got None"),

@@ -20,11 +20,11 @@ class EncoderTraining:
     """How encoders are trained, and whether they help is found out.
 
     Args:
-        steps: of Adam.
-        frames: of a step.
-        pixels: of each of them.
-        learning_rate: initial, with cosine decay to 0.
-        fewest_frames: from which on "auto" trains encoders.
+        steps: steps of Adam.
+        frames: frames in a step.
+        pixels: pixels of each frame in a step.
+        learning_rate: initial learning rate, with cosine decay to 0.
+        fewest_frames: number of frames from which on "auto" trains encoders.
         folds: parts of the frames that are left out in turn, to compare encoders with constants on them.
     """
 
@@ -65,9 +65,9 @@ class FitConfig:
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
         encoder_training: how that is done, as an :class:`EncoderTraining` or its settings by name.
-        joint_steps: steps of a last end-to-end training of everything at once; None is 1000 with 50 frames or more,
+        joint_steps: steps of a last end-to-end training of everything at once; by default 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
-        curve_steps: steps of the first stage, which fits the tone curve; None is 150.
+        curve_steps: steps of the first stage, which fits the tone curve; 150 by default.
         prior_steps: steps of the descent on the constant weights.
         mse_floor: added to a frame's mean squared error under the logarithm: frames beyond 50 dB count no more.
         intermediate: weight of the loss on the images between the stages, beside 1 of that on sRGB; 0 leaves it out.

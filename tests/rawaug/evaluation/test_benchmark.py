@@ -75,6 +75,7 @@ def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
 )
 def test_a_denoiser_that_fails_is_named(run: object, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ruler, "STRENGTHS", {"phone": LEVELS})
+    monkeypatch.setattr(ruler, "OF_SENSORS", ("phone",))
     frames = [pair.middle(64) for pair in list(open_pairs("demo:test", split="test"))[:1]]
     with pytest.raises(ValueError, match=said) as error:
         benchmark([Contestant("mine", run)], frames, crop=64)  # type: ignore[arg-type]
