@@ -6,7 +6,7 @@
 Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
 repository, has them. Half of the mutations know the structure of the file (benchmarks/mutations.py); the others flip
 bits, cut the file short, overwrite numbers, exchange or repeat pieces (benchmarks/damage.py); all are keyed by (seed,
-kind, number). A worker process reads one after the other, every eighth by the commands too (benchmarks/commands.py),
+kind, number). A worker process reads one after the other, every eighth by the commands too,
 and is restarted when a decoder takes it down. Counted are files that were read; that were refused as documented
 (ValueError or OSError of one line with the file's name); that crashed a decoder, by its name, which the package
 contains (:mod:`rawaug.io.isolated`); and what must not be: other exceptions and numbers that are not finite, more than
