@@ -8,7 +8,6 @@ Each fit's figures go into a file of their own, so that a stopped run can resume
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -32,6 +31,7 @@ from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr, worst_and_best_quarter
 from rawaug.paper.frames import synthetic_frames
+from rawaug.paper.methods import kept
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
 from rawaug.seeding import keyed_generator
@@ -147,8 +147,8 @@ def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_
     """The scores of one fit, from its file where it is there."""
     sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
     key = fingerprint("learned", asdict(config), sums)
-    if place.is_file() and (known := json.loads(place.read_text())).get("key") == key:
-        return dict(known)
+    if (known := kept(place, key)) is not None:
+        return known
     place.parent.mkdir(parents=True, exist_ok=True)
     isp = fit_isp(frames, config, progress=False, state=place.with_suffix(".state"))
     scores = [score(isp, pair) for pair in left_out]

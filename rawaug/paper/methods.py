@@ -26,11 +26,13 @@ signal processing", CVPR 2021, and the authors' published scripts. Pieces begin 
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import singledispatch
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -73,6 +75,12 @@ class Fitted(NamedTuple):
     model: ReverseISP
     seconds: float
     parameters: int
+
+
+def kept(path: Path, key: str) -> dict[str, Any] | None:
+    """The figures of a fit that an earlier run wrote under the same key."""
+    known: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return known if known.get("key") == key else None
 
 
 def is_method(family: str) -> bool:

@@ -8,7 +8,6 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -41,6 +39,7 @@ from rawaug.paper.methods import (
     cycle_psnr,
     fit_family,
     is_method,
+    kept,
     learns_by_descent,
     mosaic_only_psnr,
     score_rows,
@@ -187,38 +186,16 @@ class PreparedComparison:
             require_trainable("cpu", 1, settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
         found = open_pairs(settings.data, split="train")
-        self.chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
-        self.pairs = list(skip_broken(self.chosen, "data"))
-        if len(self.pairs) < 2 and not settings.test:
-            raise ValueError(f"data: {settings.data} has {len(self.pairs)} frame; leave-one-out needs two or more")
-        if settings.test:
-            self.pairs = [pair.in_pattern(self.pairs[0].cfa) for pair in self.pairs]
-        exact = any(learns_by_descent(method) for method in settings.methods)
-        for pair in self.pairs:
-            if pair.cfa != self.pairs[0].cfa or (exact and not pair.registered):
-                what = "is not registered pixel by pixel" if pair.cfa == self.pairs[0].cfa else "has a different CFA"
-                raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
-        if settings.noise:
-            noise = noise_model(settings.noise)
-            self.pairs = [_with_noise(pair, noise) for pair in self.pairs]
+        self.pairs = _fitted_frames(settings, found)
+        self.scored = _test_frames(settings, found) if settings.test else self.pairs
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        names = names_of(self.chosen)
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
-        self.scored: Sequence[Pair] = self.pairs
-        if settings.test:
-            test = open_pairs(settings.test, split="test")
-            tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
-            deque(skip_broken(tested, "test"), maxlen=0)
-            self.scored = tested.kept()
-            if (seen := shared_frame(self.scored, found)) is not None:
-                raise ValueError(f"test: {seen} is also in data; score on unseen frames")
         if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
             where, count = settings.test or settings.data, len(self.scored)
             raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
         self._fitted: tuple[str, Fitted] | None = None
         side = settings.downstream.train.crop if settings.downstream else 2
-        self.pictures = [even_sided(picture) for picture in _each(open_pictures(settings.pictures, min_side=side))]
+        pictures = open_pictures(settings.pictures, min_side=side)
+        self.pictures = [even_sided(pictures[k]) for k in range(len(pictures))]
 
     def table(self) -> dict[str, dict[str, Any]]:
         """All rows; printed, and written with every single figure."""
@@ -271,12 +248,11 @@ class PreparedComparison:
     def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
         """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
         settings, name = self.settings, names_of(self.scored)[frame]
-        seconds = settings.seconds * scale
-        budget = (seconds, settings.crop, settings.batch)
-        more = [settings.balanced, settings.perturbed] if settings.balanced or settings.perturbed else []
-        key = fingerprint(family, budget, seed, settings.patches, *self._frames(), *more)
+        budget = (settings.seconds * scale, settings.crop, settings.batch)
+        measured = settings.patches, settings.balanced, settings.perturbed
+        key = fingerprint(family, budget, seed, *measured, *self._frames())
         path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
-        if (known := _read(path, key)) is not None:
+        if (known := kept(path, key)) is not None:
             return known
         pair = self.scored[frame]
         if settings.test:
@@ -302,16 +278,10 @@ class PreparedComparison:
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
         seeds = range(settings.seed, settings.seed + settings.seeds)
         budget = (settings.seconds, settings.crop, settings.batch)
-        parts = (
-            asdict(self.fit),
-            settings.noise,
-            downstream and asdict(downstream),
-            settings.data,
-            [p.name for p in self.pairs],
-        )
-        key = fingerprint(family, budget, list(seeds), settings.pictures, *parts)
+        after = downstream and asdict(downstream)
+        key = fingerprint(family, budget, list(seeds), settings.pictures, *self._frames(), after)
         path = self._path(f"{family}-all-frames")
-        if (known := _read(path, key)) is not None:
+        if (known := kept(path, key)) is not None:
             return known
         fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
         result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
@@ -325,11 +295,41 @@ class PreparedComparison:
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
-        test = [self.settings.test] if self.settings.test else []
-        return asdict(self.fit), self.settings.noise, self.settings.data, [pair.name for pair in self.pairs], *test
+        settings = self.settings
+        return asdict(self.fit), settings.noise, settings.data, [pair.name for pair in self.pairs], settings.test
 
     def _path(self, stem: str) -> Path:
         return self.folder / f"{stem.replace('/', '_')}.json"
+
+
+def _fitted_frames(settings: Comparison, found: Sequence[Pair]) -> list[Pair]:
+    """The chosen frames, all of one pattern, and registered where a method needs that."""
+    chosen = SomePairs(found, selected(found, len(found), settings.count, settings.select))
+    names = names_of(chosen)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"data: several frames are named {twice[0]}; rename the files")
+    pairs = list(skip_broken(chosen, "data"))
+    if len(pairs) < 2 and not settings.test:
+        raise ValueError(f"data: {settings.data} has {len(pairs)} frame; leave-one-out needs two or more")
+    if settings.test:
+        pairs = [pair.in_pattern(pairs[0].cfa) for pair in pairs]
+    exact = any(learns_by_descent(method) for method in settings.methods)
+    for pair in pairs:
+        if pair.cfa != pairs[0].cfa or (exact and not pair.registered):
+            what = "is not registered pixel by pixel" if pair.cfa == pairs[0].cfa else "has a different CFA"
+            raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
+    return pairs if settings.noise is None else [_with_noise(pair, noise_model(settings.noise)) for pair in pairs]
+
+
+def _test_frames(settings: Comparison, found: Sequence[Pair]) -> Sequence[Pair]:
+    """The frames of ``test`` that can be read, none of which is in the data."""
+    test = open_pairs(str(settings.test), split="test")
+    tested = Readable(SomePairs(test, range(len(test))[: settings.test_count]))
+    deque(skip_broken(tested, "test"), maxlen=0)
+    scored = tested.kept()
+    if (seen := shared_frame(scored, found)) is not None:
+        raise ValueError(f"test: {seen} is also in data; score on unseen frames")
+    return scored
 
 
 def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
@@ -337,18 +337,6 @@ def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
     cfa = CFA(pair.cfa)
     noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
     return replace(pair, noisy=noisy)
-
-
-def _each(pictures: Any) -> Iterator[Tensor]:
-    for index in range(len(pictures)):
-        yield pictures[index]
-
-
-def _read(path: Path, key: str) -> dict[str, Any] | None:
-    if not path.is_file():
-        return None
-    known: dict[str, Any] = json.loads(path.read_text())
-    return known if known.get("key") == key else None
 
 
 def _median(values: list[float | None]) -> float | None:

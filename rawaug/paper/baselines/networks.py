@@ -2,14 +2,14 @@ r"""Two networks without a model of a camera: a plain U-Net, and the invertible-
 
 *The U-Net*, ``y = mosaic(x + U(x))``, is trained end to end with l1. The published size is 11.77 M parameters. That is
 UPI's U-Net with three channels in and out (five scales of three convolutions, 32 to 512 features, bilinear
-interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.networks` is used. That the paper's U-Net is this
-one is concluded from the number of parameters. Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
+interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.networks` is used. That the paper's U-Net is
+this one is concluded from the number of parameters. Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
 
-*Invertible greyscale*, ``x = E(demosaic(y))``, ``y = mosaic(D(x))``: Xia et al. hide a colour picture in a grey one by an
-encoder E and restore it by a decoder D, trained together with the grey picture's likeness as a condition. In InvISP's
-comparison the hidden picture is the RAW and the visible one the sRGB, so E renders RAW and D goes back. E is a residual
-encoder-decoder: 3 x 3 convolutions to 64 features, 2 residual blocks, down to 128 and 256 features by strides of 2,
-4 residual blocks, up by nearest neighbours with the finer features added, 2 residual blocks. D has 64 features
+*Invertible greyscale*, ``x = E(demosaic(y))``, ``y = mosaic(D(x))``: Xia et al. hide a colour picture in a grey one by
+an encoder E and restore it by a decoder D, trained together with the grey picture's likeness as a condition. In
+InvISP's comparison the hidden picture is the RAW and the visible one the sRGB, so E renders RAW and D goes back. E is a
+residual encoder-decoder: 3 x 3 convolutions to 64 features, 2 residual blocks, down to 128 and 256 features by strides
+of 2, 4 residual blocks, up by nearest neighbours with the finer features added, 2 residual blocks. D has 64 features
 throughout and 8 residual blocks, then 256 features, then a 1 x 1 convolution. Two things differ here, and are
 assumptions: the outputs are linear, since most of RAW is near black, where the published tanh is flat; and the losses
 are l1 of the two directions on the pairs, as for InvISP, since there is no grey picture to resemble. Source: Xia et
