@@ -13,6 +13,8 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
@@ -71,14 +73,29 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> None:
 def _launch(
     *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     quiet: bool = False,
+    own: Annotated[list[Path] | None, Parameter(name="--import")] = None,
 ) -> None:
     """Run a command.
 
     Args:
         quiet: do not print progress.
+        own: a Python file whose networks, noise models and the like can be used by name; stands before the command.
     """
+    for file in own or ():
+        _import(file)
     with without_progress(quiet):
         app(words, exit_on_error=False, print_error=False)
+
+
+def _import(file: Path) -> None:
+    """Run a file that registers things of the user's own."""
+    if not file.is_file():
+        raise FileNotFoundError(f"--import {file}: no such file")
+    spec = spec_from_file_location(file.stem, file)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"--import {file}: is no Python file")
+    sys.modules[file.stem] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -158,7 +158,10 @@ class Registry(Mapping[str, Any]):
             self._import_next()
         if name not in self._things:
             if name not in self._entry_points:
-                raise UnknownName(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}")
+                raise UnknownName(
+                    f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}; "
+                    f"one of your own: rawaug --import FILE.py COMMAND, or an entry point in {self.group}"
+                )
             self._things[name] = self._loaded(name)
         return self._things[name]
 

@@ -16,6 +16,7 @@ import pytest
 from rawaug.cli import COMMANDS, main
 from rawaug.data import demo_pictures
 from rawaug.io import write_picture
+from rawaug.registry import FILTERS
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
 TINY = [
@@ -263,3 +264,19 @@ def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(
             monkeypatch.delenv("THP_MEM_ALLOC_ENABLE")
         main([command, "--help"])
         assert os.environ.get("THP_MEM_ALLOC_ENABLE") == expected, command
+
+
+def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own_filter.py").write_text(
+        "from denoisers.classical import Classical\n"
+        "from rawaug.registry import FILTERS\n"
+        "@FILTERS.register('Nothing')\n"
+        "class Nothing(Classical):\n"
+        "    def denoise(self, planes):\n"
+        "        return planes\n"
+    )
+    evaluate = ["evaluate", "rawaug-small", "--data", str(tmp_path / "gone"), "--classical", "[Nothing]"]
+    assert "rawaug --import FILE.py COMMAND, or an entry point in rawaug.filters" in refused(capsys, *evaluate)
+    assert "no such file" in refused(capsys, "--import", str(tmp_path / "own.py"), *evaluate)
+    assert "gone" in refused(capsys, "--import", str(tmp_path / "own_filter.py"), *evaluate)
+    FILTERS._things.pop("Nothing")

@@ -29,7 +29,7 @@ def test_a_name_is_given_once_and_a_module_may_run_again() -> None:
 
 def test_unknown_names_settings_and_types_are_refused_with_the_nearest() -> None:
     for spec, message in (
-        ("r3r", r"estimator 'r3r' is unknown; use one of .*\(nearest: r2r\)$"),
+        ("r3r", r"estimator 'r3r' is unknown; use one of .*\(nearest: r2r\); one of your own"),
         ({"name": "r2r", "settings": {"alhpa": 1.0}}, r"estimator r2r has no setting 'alhpa'; .*\(nearest: alpha\)$"),
         ({"name": "r2r", "settings": {"alpha": "big"}}, "r2r: alpha must be float, got 'big'"),
         ({"name": "noisier", "settings": {"correct": 1}}, "noisier: correct must be bool, got 1"),
