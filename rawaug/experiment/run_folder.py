@@ -1,4 +1,4 @@
-"""The folder of a run: ``OUT/LOCK``, which holds one run alone.
+"""The folder of a run: ``OUT/NAME``, which holds one run alone.
 
 ``run.json`` holds the settings of the run. The same settings resume it; others are refused, but for those that change
 neither weights nor scores.
