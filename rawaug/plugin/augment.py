@@ -31,6 +31,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
+from rawaug.plugin.bursts import Burst
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.plugin.targets import Target, Targets, through_jpeg
@@ -69,6 +70,10 @@ class RawAugment(nn.Module):
             developed by the setting that made the RAW, and no variance map; see :mod:`rawaug.plugin.targets`.
         demosaicing: of ``"srgb"``: a name of :data:`rawaug.bayer.STENCILS`, or several to draw from (all).
         jpeg: of ``"srgb"``: lowest and highest quality of the JPEG that the noisy picture goes through (no JPEG).
+        burst: number N of noisy frames of the scene that a pair holds, ``(B, N, ...)``; clean is that of the first. By
+            default a single one, without the N.
+        motion: of a burst: largest shift in pixels and rotation in degrees, see :mod:`rawaug.plugin.bursts`.
+        stops: of a burst: exposure of each frame in stops, for brackets; all alike by default.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
     Raises:
@@ -98,6 +103,9 @@ class RawAugment(nn.Module):
         target: Target = "raw",
         demosaicing: str | Sequence[str] | None = None,
         jpeg: tuple[int, int] | None = None,
+        burst: int | None = None,
+        motion: tuple[float, float] = (2.0, 0.5),
+        stops: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self.pattern = None if cfa is None else pattern(cfa)
@@ -108,6 +116,7 @@ class RawAugment(nn.Module):
         self.baked = frozen(BakedISP(isp))
         self.targets = Targets(target, demosaicing, jpeg, self.cfa)
         self.forward_pass = frozen(FastForward(isp)) if target == "srgb" else None
+        self.burst = None if burst is None else Burst(burst, motion, stops)
         self._draw(noise, sampling, strength, seed, exposure, light, tone)
 
     def _draw(
@@ -195,7 +204,10 @@ class RawAugment(nn.Module):
         with _float32(srgb):
             setting = self._expose(self._sample_isp(srgb, generator), generator)
             noise = self.noise.sample(len(srgb), generator)
-            return AugmentParams(setting, noise, place, self.targets.sample(len(srgb), generator))
+            extras = self.targets.sample(len(srgb), generator)
+            if self.burst is not None:
+                extras |= self.burst.sample(len(srgb), generator)
+            return AugmentParams(setting, noise, place, extras)
 
     def _sample_isp(self, srgb: Tensor, generator: torch.Generator) -> ISPParams:
         if self.sampling in ("convex", "independent"):
@@ -249,30 +261,53 @@ class RawAugment(nn.Module):
         if len(params.place) != len(srgb):
             raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(srgb)}")
         with _float32(srgb):
-            clean = self._clean(srgb, params)
-            noisy, variance = self.noise.apply_with_variance(clean, params.noise)
-            _require_finite(noisy)
-            if self.targets.target == "srgb":
-                noisy, clean = (self._developed(raw, params) for raw in (noisy, clean))
-                if "quality" in params.development:
-                    noisy = through_jpeg(noisy, params.development["quality"])
-                return RawPair(noisy, clean, variance.new_empty(len(noisy), 0), params)
-            if self.pattern is not None:
-                noisy, clean, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, clean, variance))
+            if self.burst is not None:
+                return self._burst(srgb, params, self.burst)
+            noisy, clean, variance = self._noisy(self._clean(srgb, params), params)
             if self.targets.target == "rgb":
                 clean = self.baked.colours(srgb, params.isp, params.place, white=1.0)
             return RawPair(noisy, clean, variance, params)
 
-    def _developed(self, raw: Tensor, params: AugmentParams) -> Tensor:
-        assert self.forward_pass is not None
-        return self.targets.develop(self.forward_pass, bayer.unpack(raw, self.isp.cfa), self.isp.cfa, params)
-
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
-        """Clean RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
         if self.pattern is None:
             return self.baked(srgb, params.isp, params.place, white=1.0)
-        rgb = self.baked.colours(srgb, params.isp, params.place, white=1.0)
+        return self._planes(self.baked.colours(srgb, params.isp, params.place, white=1.0))
+
+    def _planes(self, rgb: Tensor) -> Tensor:
+        """RAW as four planes: packed, or, of other patterns, the sites of every 2 x 2 square as they come."""
+        if self.pattern is None:
+            return bayer.pack_rgb(rgb, self.isp.cfa)
         return bayer.pack(self.pattern.mosaic(rgb), CFA.RGGB)
+
+    def _noisy(self, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
+        """Noisy, clean and variance of clean planes, as RAW or developed."""
+        noisy, variance = self.noise.apply_with_variance(planes, params.noise)
+        _require_finite(noisy)
+        if self.forward_pass is not None:
+            developed = [
+                self.targets.develop(self.forward_pass, bayer.unpack(raw, self.isp.cfa), self.isp.cfa, params)
+                for raw in (noisy, planes)
+            ]
+            if "quality" in params.extras:
+                developed[0] = through_jpeg(developed[0], params.extras["quality"])
+            return developed[0], developed[1], variance.new_empty(len(noisy), 0)
+        if self.pattern is None:
+            return noisy, planes, variance
+        noisy, planes, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, planes, variance))
+        return noisy, planes, variance
+
+    def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
+        scene = self.baked.colours(srgb, params.isp, params.place)
+        frames = burst.frames_of(scene, params.extras["motion"])
+        repeated = params.map(lambda t: t.repeat_interleave(burst.frames, 0))
+        if "seed" in repeated.noise:
+            repeated.noise["seed"] = params.extras["frame_seed"].flatten()
+        noisy, clean, variance = (
+            x.unflatten(0, (len(srgb), burst.frames)) for x in self._noisy(self._planes(frames), repeated)
+        )
+        if self.targets.target == "rgb":
+            clean = frames.unflatten(0, (len(srgb), burst.frames))
+        return RawPair(noisy, clean[:, 0], variance, params)
 
     @overload
     def forward(self, batch: Tensor, generator: torch.Generator | None = None, key: None = None) -> RawPair: ...

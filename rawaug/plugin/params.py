@@ -23,24 +23,23 @@ class AugmentParams(NamedTuple):
         place: ``(B, 5)`` top, left, height, width, view: position of the picture in its full frame, and how it was
             turned after the crop (see :func:`rawaug.bayer.turn`); ``(B, 6)`` with the number of rows that were
             enlarged to the crop.
-        development: of target ``"srgb"``: number of the demosaicing and, with JPEG, its quality; else empty.
+        extras: of target ``"srgb"`` ``demosaicing`` (its number) and, with JPEG, ``quality``, each ``(B,)``; of bursts
+            ``motion`` ``(B, N, 3)`` and ``frame_seed`` ``(B, N)``; else empty.
     """
 
     isp: ISPParams
     noise: dict[str, Tensor]
     place: Tensor
-    development: dict[str, Tensor]
+    extras: dict[str, Tensor]
 
     def map(self, change: Callable[[Tensor], Tensor]) -> AugmentParams:
         """The same function applied to every tensor: ``params.map(lambda t: t[0])`` are those of the first picture."""
-        noise, development = (
-            {name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.development)
-        )
-        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place), development)
+        noise, extras = ({name: change(value) for name, value in drawn.items()} for drawn in (self.noise, self.extras))
+        return AugmentParams(ISPParams(*map(change, self.isp)), noise, change(self.place), extras)
 
     def tensors(self) -> dict[str, Tensor]:
         """As a flat dict, to store with a batch; :meth:`from_tensors` is the inverse."""
-        groups = {"isp": self.isp._asdict(), "noise": self.noise, "development": self.development}
+        groups = {"isp": self.isp._asdict(), "noise": self.noise, "extras": self.extras}
         flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
         return flat | {"place": self.place}
 
@@ -51,11 +50,11 @@ class AugmentParams(NamedTuple):
         if missing:
             raise ValueError(f"not the parameters of an augmentation: {', '.join(sorted(missing))} missing")
         isp = ISPParams(*(tensors[f"isp.{name}"] for name in ISPParams._fields))
-        noise, development = (
+        noise, extras = (
             {name.removeprefix(group): value for name, value in tensors.items() if name.startswith(group)}
-            for group in ("noise.", "development.")
+            for group in ("noise.", "extras.")
         )
-        return cls(isp, noise, tensors["place"], development)
+        return cls(isp, noise, tensors["place"], extras)
 
 
 class RawPair(NamedTuple):

@@ -65,7 +65,7 @@ class Targets:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
         linear = mosaic.new_empty(len(mosaic), 3, *mosaic.shape[-2:])
         for number, name in enumerate(self.names):
-            own = (params.development["demosaicing"] == number).nonzero()[:, 0].to(mosaic.device)
+            own = (params.extras["demosaicing"] == number).nonzero()[:, 0].to(mosaic.device)
             if len(own):
                 linear[own] = demosaic(mosaic[own], cfa, name)
         developed: Tensor = forward(linear, params.isp, params.place)

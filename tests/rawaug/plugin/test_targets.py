@@ -95,7 +95,7 @@ def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp
     assert torch.allclose(pair.noisy * 255, (pair.noisy * 255).round(), atol=1e-4)
     save_params(pair.params, tmp_path / "a.safetensors")
     params = load_params(tmp_path / "a.safetensors")
-    assert set(params.development) == {"demosaicing", "quality"}
+    assert set(params.extras) == {"demosaicing", "quality"}
     again = augment.apply(srgb, params)
     assert torch.equal(again.noisy, pair.noisy) and torch.equal(again.clean, pair.clean)
     one = augment.apply(srgb[1], params.map(lambda t: t[1]))
@@ -104,7 +104,7 @@ def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp
 
 def test_every_demosaicing_and_quality_is_drawn_and_a_low_quality_costs_more(universal: DictionaryISP) -> None:
     srgb = smooth(64)
-    drawn = RawAugment(universal, target="srgb", jpeg=(10, 12)).sample(srgb, seeded()).development
+    drawn = RawAugment(universal, target="srgb", jpeg=(10, 12)).sample(srgb, seeded()).extras
     assert set(drawn["demosaicing"].tolist()) == {0, 1} and set(drawn["quality"].tolist()) == {10, 11, 12}
     without, high, low = (
         RawAugment(universal, noise=(1e-4, 0.0), target="srgb", demosaicing="malvar", jpeg=jpeg)(srgb[:2], seeded())
@@ -120,7 +120,7 @@ def test_datasets_and_loaders_collate_them(universal: DictionaryISP) -> None:
     pairs.set_epoch(0)
     batch: RawPair = next(iter(DataLoader(pairs, batch_size=4)))
     assert batch.noisy.shape == batch.clean.shape == (4, 3, 32, 32) and batch.variance.shape == (4, 0)
-    assert isinstance(batch.params, AugmentParams) and batch.params.development["quality"].shape == (4,)
+    assert isinstance(batch.params, AugmentParams) and batch.params.extras["quality"].shape == (4,)
     assert torch.equal(pairs.replay(2, pairs[2].params).noisy, batch.noisy[2])
     (wrapped,) = wrap(DataLoader(pictures, batch_size=4), RawAugment(universal, target="rgb"))  # type: ignore[arg-type]
     assert wrapped.noisy.shape == (4, 4, 24, 32) and wrapped.clean.shape == (4, 3, 48, 64)
