@@ -244,7 +244,7 @@ class Recipe:
         train = replace(self.train, steps=1, validate_every=1, checkpoint_every=1, workers=min(self.train.workers, 1))
         if find_device(self.device).type == "cpu":
             train = replace(train, batch=min(train.batch, 4 * self.devices))
-        return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1)
+        return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1, views=4)
 
     @property
     def self_supervised(self) -> bool:
