@@ -44,7 +44,7 @@ _SCENE_WHITE = 0.999
 
 
 def trust(srgb: Tensor) -> Tensor:
-    """m: how far pixels of sRGB ``(B, 3, H, W)`` in [0, 1] are to be believed not to be clipped, ``(B, 1, H, W)``.
+    """m: confidence ``(B, 1, H, W)`` that pixels of sRGB ``(B, 3, H, W)`` in [0, 1] are not clipped.
 
     Example:
         >>> trust(torch.tensor([0.5, 0.9, 1.0]).expand(1, 3, 1, 3)).flatten().tolist()  # doctest: +ELLIPSIS
@@ -99,7 +99,7 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
-    """x to x5, gains without their care for highlights."""
+    """x to x5, with plain division by the gains."""
     for stage in isp.ordered_stages:
         plain = isinstance(stage, WhiteBalance)
         x = inverse_gains(x, params.gains, knee=None) if plain else stage.reverse(x, params)
@@ -107,7 +107,7 @@ def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
 
 
 def _compressed(light: Tensor) -> Tensor:
-    """f(L), and a below a: then the ratio to ``max(L, a)`` is 1."""
+    """f(L), held to at least a, so that its ratio to ``max(L, a)`` is 1 in the shadows."""
     flat = light.flatten(1)
     brightest = flat.kthvalue(max(round(_SCENE_WHITE * flat.shape[1]), 1), dim=1).values.clamp_min(1.0)
     white = ((brightest - MIDDLE_GREY) / (1.0 - MIDDLE_GREY)).reshape(-1, 1, 1, 1)

@@ -141,14 +141,14 @@ def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gain
 
 
 def chosen_atoms(points: Tensor, count: int) -> Choice:
-    """As many atoms of ``points`` ``(P, D)``."""
+    """``count`` atoms among ``points`` ``(P, D)``."""
     atoms = list(range(len(points))) if count >= len(points) else greedy_atoms(points, count)
     typical = nearest_in_hull(points.mean(dim=0, keepdim=True), points[atoms])[0][0]
     return Choice(atoms, typical.float())
 
 
 def chosen_gains(inverse: Tensor, count: int) -> Choice:
-    """As many atoms of inverse gains ``(P, 3)``, as :func:`chosen_atoms` of the corners of their hull."""
+    """``count`` atoms among the corners of the hull of inverse gains ``(P, 3)``."""
     points = inverse / 3**0.5
     corners = extreme_points(points)
     chosen = corners[chosen_atoms(points[corners], count).atoms]

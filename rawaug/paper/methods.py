@@ -84,7 +84,7 @@ def kept(path: Path, key: str) -> dict[str, Any] | None:
 
 
 def is_method(family: str) -> bool:
-    """Whether this is a family to fit, or an ISP that exists: the name of a shipped one or a file."""
+    """Whether this is a family to fit, the name of a shipped ISP, or the file of one."""
     if family in FAMILIES:
         return True
     try:

@@ -60,7 +60,7 @@ def mean_square(isp: DictionaryISP, part: PixelSamples, params: ISPParams) -> Te
     return error.sum((1, 2, 3)) / part.known.sum((1, 2, 3)).clamp_min(1.0)
 
 
-def apart(ours: ISPParams, theirs: ISPParams) -> Tensor:
+def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
     """``|w_r - w_f|^2`` of both dictionaries."""
     colour = (ours.colour_weights - theirs.colour_weights).square().sum()
     return colour + (ours.gain_weights - theirs.gain_weights).square().sum()

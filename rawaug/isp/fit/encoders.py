@@ -3,7 +3,7 @@ r"""Training of the encoders and of everything at once, each kept only if frames
 *Encoders* are trained last, with tone and dictionaries frozen:
 ``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``, the RAW that the weights of the reverse
 encoders make, the same for the forward encoders', and the consistency of the two (Conde et al., AAAI 2022, "Training").
-Trained together with the rest on few frames, encoders learn the frames by heart and take tone and matrices with them.
+Trained together with the rest on few frames, encoders memorise the frames and distort tone and matrices as well.
 Whether they help is decided on unseen frames: for every fold, curve, tone and atoms are fitted anew without its frames,
 then constants and encoders are compared on these.
 
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import Descent, apart, cycle_error, decibels, mean_square
+from rawaug.isp.fit.descent import Descent, cycle_error, decibels, mean_square, weight_distance
 from rawaug.isp.fit.samples import FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 
@@ -91,11 +91,11 @@ def _frame_loss(
     srgb, raw = _same_piece(shots[frame].srgb, isp.unshaded(shots[frame].raw, None), g)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
-    return (errors[0] + errors[1]).sum() + config.consistency * apart(ours, theirs)
+    return (errors[0] + errors[1]).sum() + config.consistency * weight_distance(ours, theirs)
 
 
 def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The same random piece of both thumbnails, flipped or not: the encoders must not learn the frames by heart."""
+    """The same random piece of both thumbnails, flipped or not, so that the encoders cannot memorise the frames."""
     share = 0.5 + 0.5 * torch.rand(2, generator=generator)
     start = torch.rand(2, generator=generator) * (1.0 - share)
     flip = bool(torch.rand((), generator=generator) < 0.5)
@@ -131,7 +131,7 @@ CONSISTENCY = 0.01
 
 
 def joint_steps(config: FitConfig, frames: int) -> int:
-    """How long a number of frames is trained jointly."""
+    """Steps of end-to-end training on this number of frames."""
     if config.joint_steps is not None:
         return config.joint_steps
     return STEPS if frames >= MANY_FRAMES else 0
@@ -180,4 +180,4 @@ def _joint_frame_loss(
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, config)
-    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * config.consistency * apart(ours, theirs)
+    return mean_square(isp, part, ours)[0] + cycle + CONSISTENCY * config.consistency * weight_distance(ours, theirs)

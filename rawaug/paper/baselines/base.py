@@ -107,7 +107,7 @@ class CropTrainedISP(BaselineISP):
     """For Adam, at the start."""
 
     def prepare(self, pairs: Sequence[FramePair]) -> None:
-        """Take from the pairs what is no matter of descent; called once, before training."""
+        """Set from the pairs what descent does not learn; called once, before training."""
 
     @abstractmethod
     def loss(self, crops: Crops, both: bool) -> Tensor:

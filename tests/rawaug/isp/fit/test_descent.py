@@ -14,7 +14,7 @@ from torch import Tensor
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, descent, encoders, fit_isp
-from rawaug.isp.fit.descent import Descent, apart, cycle_error, mean_square, reading_error
+from rawaug.isp.fit.descent import Descent, cycle_error, mean_square, reading_error, weight_distance
 from rawaug.isp.fit.samples import FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
@@ -206,7 +206,10 @@ def test_from_noisy_readings_the_way_back_starts_where_the_reverse_pass_ended(
 def test_weights_apart_add_up_over_both_dictionaries(isp: DictionaryISP) -> None:
     srgb = torch.rand(1, 3, 8, 8)
     ours, theirs = isp.choose(srgb), isp.choose_forward(srgb)
-    assert apart(ours, theirs).item() == pytest.approx(APART, rel=1e-4) and apart(ours, ours).item() == 0.0
+    assert (
+        weight_distance(ours, theirs).item() == pytest.approx(APART, rel=1e-4)
+        and weight_distance(ours, ours).item() == 0.0
+    )
 
 
 def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(

@@ -118,7 +118,7 @@ def test_clipped_readings_say_nothing_of_the_gains(
 
 
 def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[Pair]) -> None:
-    knees = []
+    knees: list[float] = []
     for spared in (False, True):
         pairs = []
         for pair in exact_pairs[:2]:
@@ -127,7 +127,7 @@ def test_the_knee_spares_highlights_only_where_the_camera_did(exact_pairs: list[
             raw = torch.where(bright[:1], 1.0, pair.raw) if spared else pair.raw
             pairs.append(Pair(pair.name, torch.where(bright, 255, pair.srgb).to(torch.uint8), raw, pair.cfa,
                               pair.white_balance, pair.color_matrix))  # fmt: skip
-        knees.append(fit_isp(pairs, QUICK, progress=False).config.knee)
+        knees.append(fit_isp(pairs, QUICK, progress=False).config.knee or 1.0)
     assert knees[0] > knees[1]
 
 
