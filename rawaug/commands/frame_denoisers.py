@@ -184,15 +184,13 @@ FILTER_TILE, FILTER_OVERLAP = 512, 32
 
 
 class Frame(Protocol):
-    """What is denoised: a RAW file's frame, or a block of one."""
+    """What is denoised: the mosaic ``(1, H, W)`` of a RAW file, or of a block of one."""
 
     @property
-    def mosaic(self) -> Tensor:
-        """float32 ``(1, H, W)``."""
+    def mosaic(self) -> Tensor: ...
 
     @property
-    def cfa(self) -> CFA:
-        """Its pattern."""
+    def cfa(self) -> CFA: ...
 
 
 class FrameDenoiser(Protocol):

@@ -57,7 +57,8 @@ def pair(look: Look) -> list[Panel]:
     """Noisy and clean RAW, developed."""
     made = drawn(look)
     noisy, clean = _developed(made, made.pair.noisy, made.pair.clean)
-    quality = psnr(made.pair.noisy[None], made.pair.clean[None]).item()
+    factor = 2 if made.augment.pattern is None else 1
+    quality = psnr(*(_cropped(raw, factor)[None] for raw in (made.pair.noisy, made.pair.clean))).item()
     return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", noisy), Panel(f"clean: {_setting(made)}", clean)]
 
 
