@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from rawaug.bayer import bin_mosaic
 from rawaug.cli import main
 from rawaug.data import Pair, demo_pairs
 from rawaug.data.pairs import names_of, stamps
@@ -131,6 +132,17 @@ def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfi
     with pytest.raises(ValueError, match=r"data\.test: train_00_astronaut is also in data\.pairs"):
         plan_of(recipe, pairs=pairs, test=pairs[:1])
     assert names_of(plan_of(recipe, pairs=pairs, validation=test[1:], test=test[:1]).pairs) == names_of(pairs)
+
+
+def test_validation_and_test_frames_are_binned_and_cropped_and_training_frames_are_not(data: DataConfig) -> None:
+    shots = {split: demo_pairs(split, count=1) for split in ("train", "validation", "test")}
+    given = {"pairs": shots["train"], "validation": shots["validation"], "test": shots["test"]}
+    recipe = Recipe(arms=ARMS, data=replace(data, bin=4, validation_crop=None, test_crop=32))
+    plan = plan_of(recipe, **given)
+    (watched,) = shots["validation"]
+    assert torch.equal(plan.validation[0].raw, bin_mosaic(watched.raw, watched.cfa, 4))
+    assert plan.test[0].raw.shape == (1, 32, 32) and plan.pairs[0] is shots["train"][0]
+    assert plan.references[0].raw.shape == shots["test"][0].raw.shape
 
 
 def test_two_folders_may_use_the_same_names(own: Path, data: DataConfig, tmp_path: Path) -> None:
