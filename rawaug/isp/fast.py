@@ -8,8 +8,8 @@ numbers a picture, and the mask is a function of the coordinates. Every site com
 mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
 has a table of its own.
 
-The forward pass, of camera colour that is demosaiced already, is ``x = T'(sqrt(pinv(C) diag(g) x5 / G(p) A'))``, with
-the forward network and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
+The forward pass of demosaiced RAW is ``x = T'(sqrt(pinv(C) min(g x5 / G(p) A', min g)))``, with the forward network
+and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
 
 The encoders' choice of a setting is made cheap as well. They look at the N images that the atoms make of one picture,
 which are linear in a few maps,
@@ -168,7 +168,8 @@ class FastForward(nn.Module):
     def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Linear camera RGB ``(B, 3, H, W)``, x5, to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
 
-        Light above white is clipped before tone, as RAW developers do; the ISP's own pass clips sRGB alone.
+        Balanced light is clipped at the least gain, where a saturated sensor is neutral, as RAW developers do; the
+        ISP's own pass clips sRGB alone, and its saturated highlights are magenta.
         Differentiable with respect to ``linear`` and to the matrix and gains of ``params``.
 
         Args:
@@ -181,7 +182,7 @@ class FastForward(nn.Module):
         """
         _require_batch(linear, params, place)
         display, linear = self._display(linear, params, place), linear.float()
-        learning = linear.requires_grad or display.matrix.requires_grad
+        learning = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
         if linear.device.type != "cpu" or not runtime.has_numba() or (learning and torch.is_grad_enabled()):
             return render(linear, display)
         return fastest("render", linear, display, otherwise=lambda: render(linear, display))
@@ -192,7 +193,9 @@ class FastForward(nn.Module):
         if curves.numel():
             light = torch.linspace(0.0, 1.0, CURVE_NODES).square().to(curves).expand(len(curves), 1, 1, -1)
             curves = to_code(light, curves)[:, 0, 0]
-        return Display(table, curves, self.attention, torch.linalg.pinv(matrix) / floor, frame, shading)
+        gains = 1.0 / floor[:, 0]
+        gains = torch.cat([gains, gains.amin(dim=1, keepdim=True)], dim=1)
+        return Display(table, curves, self.attention, torch.linalg.pinv(matrix), gains, frame, shading)
 
 
 def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:

@@ -73,10 +73,8 @@ def render(linear: Tensor, display: Display) -> Tensor:
     if not srgb.numel():
         return srgb
     x5, out = linear.detach().contiguous().numpy(), srgb.numpy()
-    table, curves, attention, matrix, frame, shading = (
-        value.detach().contiguous().numpy() if value.numel() else None for value in display
-    )
-    settings = (table, curves, attention, matrix, frame, shading)
+    # Absent parts are None, so that no code is compiled for them.
+    settings = tuple(value.detach().contiguous().numpy() if value.numel() else None for value in display)
     over_rows(batch * height, 3 * width, lambda start, stop: _srgb_rows(x5, *settings, out, start, stop))
     return srgb
 
@@ -329,7 +327,7 @@ def _demosaiced_rows(source, stencils, kinds, rgb, start, stop):  # type: ignore
 
 @part
 def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
-    """The root of one channel of x2, held to [0, 1], of x4 ``(3, n)``."""
+    """The root of one channel of x2, held to [0, 1], of x3 ``(3, n)``."""
     for j in range(len(out)):
         y = c0 * x[0, j] + c1 * x[1, j] + c2 * x[2, j]
         y = y if y > _ZERO else _ZERO
@@ -351,7 +349,7 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _srgb_rows(  # type: ignore[no-untyped-def]
-    linear, table, curves, attention, matrix, frame, shading, srgb, start, stop,
+    linear, table, curves, attention, matrix, gains, frame, shading, srgb, start, stop,
 ):  # fmt: skip
     """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
     height, width = linear.shape[2], linear.shape[3]
@@ -378,6 +376,12 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                 for c in range(3):
                     for j in range(n):
                         x[c, j] *= found[0, 0, j]
+            white = gains[b, 3]
+            for c in range(3):
+                gain = gains[b, c]
+                for j in range(n):
+                    y = x[c, j] * gain
+                    x[c, j] = y if y < white else white
             for c in range(3):
                 _root(x, matrix[b, c, 0], matrix[b, c, 1], matrix[b, c, 2], root[c, :n])
             if curves is not None:

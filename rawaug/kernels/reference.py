@@ -133,7 +133,8 @@ class Display(NamedTuple):
         table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
         curves: ``(B, T)`` sRGB code over the root of x2, one curve a picture for all of its channels; or empty.
         attention: of the same form as ``table``, a gain in the first of the four over the cube of x5; or empty.
-        matrix: ``(B, 3, 3)`` x4 to x2.
+        matrix: ``(B, 3, 3)`` x3 to x2.
+        gains: ``(B, 4)`` of R, G and B, then the least of them.
         frame, shading: as of :class:`Camera`.
     """
 
@@ -141,6 +142,7 @@ class Display(NamedTuple):
     curves: Tensor
     attention: Tensor
     matrix: Tensor
+    gains: Tensor
     frame: Tensor
     shading: Tensor
 
@@ -151,6 +153,10 @@ def render(linear: Tensor, display: Display) -> Tensor:
     x = linear if mask is None else linear / mask
     if display.attention.numel():
         x = x * look_up(display.attention, x)[:, :1]
+    # A saturated sensor is balanced at its least gain alone; as RAW developers do, all channels are clipped there, or
+    # highlights would turn magenta.
+    gains, white = display.gains[:, :3, None, None], display.gains[:, 3:, None, None]
+    x = torch.minimum(x * gains, white)
     # The root spreads the dark tones, where an inverse tone curve is steep, over more of the table's nodes.
     root = torch.einsum("bij,bjhw->bihw", display.matrix, x).clamp(1e-12, 1.0).sqrt()
     if display.curves.numel():
