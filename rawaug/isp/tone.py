@@ -141,8 +141,9 @@ class ToneDictionary(nn.Module):
 
     def _weighed(self, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Weights ``(B,)`` with a curve ``(1021,)``, or a curve for each ``(B, 1021)``, in the order of the atoms."""
-        # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it.
-        if weights.is_cuda or weights.requires_grad:
+        # Weights of 0 are skipped on a CPU, unless they are being fitted; on a GPU looking for them would stall it, and
+        # an exported pass has no values to look at.
+        if weights.is_cuda or weights.requires_grad or torch.compiler.is_compiling():
             yield from zip(weights.unbind(1), self.curves, strict=True)
             return
         unused = weights == 0
