@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -157,7 +158,7 @@ def _save_array(path: Path) -> None:
 
 
 def _save_checkpoint(path: Path) -> None:
-    TrainingState(denoisers.build("DnCNN", width=24, depth=4), TrainConfig(steps=1)).save(path)
+    TrainingState(denoisers.build("DnCNN", width=24, depth=4), TrainConfig(steps=1)).save(path, key="key")
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -253,31 +254,39 @@ def test_a_picture_that_vanishes_during_an_epoch_is_replaced_and_reported(tmp_pa
 # -- workers, descriptors, shared memory, clocks ----------------------------------------------------------------------
 
 
-class Deadly(Dataset[Any]):
-    """Its second sample has the worker killed by the system."""
+class Deadly(PictureFolder):
+    """Its second picture has the worker killed by the system."""
 
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, index: int) -> torch.Tensor:
+    def read(self, index: int) -> torch.Tensor:
         if index:
             os.kill(os.getpid(), signal.SIGKILL)
-        return torch.zeros(1)
+        return super().read(index)
 
 
-class Wrong(Deadly):
+class Wrong(Dataset[Any]):
+    def __len__(self) -> int:
+        return 1
+
     def __getitem__(self, index: int) -> torch.Tensor:
         raise ValueError("a.png: is too small")
 
 
 def test_a_worker_that_the_system_kills_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    dataset: list[Dataset[Any]] = [Deadly(), Wrong()]
-    monkeypatch.setattr("rawaug.cli._dispatch", lambda argv: list(DataLoader(dataset.pop(0), num_workers=1)) and 0)
-    assert main([]) == 2
-    assert "a worker process was killed, perhaps for its memory; use fewer workers" in capsys.readouterr().err
-    assert main([]) == 2
+    for k in range(2):
+        write_picture(tmp_path / f"{k}.png", torch.zeros(3, 8, 8))
+    datasets: list[Dataset[Any]] = [Deadly(tmp_path), Wrong()]
+
+    def load(words: list[str], **_: Any) -> None:
+        list(DataLoader(datasets.pop(0), num_workers=1))
+
+    monkeypatch.setattr("rawaug.cli.app", SimpleNamespace(meta=load))
+    assert main(["x"]) == 2
+    error = capsys.readouterr().err
+    assert "a worker process was killed, perhaps for its memory; use fewer workers" in error and error.count("\n") == 1
+    assert error.rstrip().endswith(f"it was reading {tmp_path / '1.png'}")
+    assert main(["x"]) == 2
     assert capsys.readouterr().err == "rawaug: a.png: is too small\n"
 
 
