@@ -113,7 +113,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     frames, out = [shoot("a.dng"), shoot("b.dng")], tmp_path / "x.safetensors"
     state = tmp_path / "x.safetensors.state"
     whole = fit(tmp_path / "whole.safetensors", *frames)
-    kept, restore = Descent._keep, Descent._restore
+    kept, restored = Descent._keep, Descent._restored
     steps: dict[str, int] = {}
 
     def stop(self: Descent, stage: str, *rest: object) -> None:
@@ -121,9 +121,9 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
         if stage == "sRGB to RAW":
             raise KeyboardInterrupt
 
-    def noted(self: Descent, stage: str, *rest: object) -> int:
-        steps[stage] = restore(self, stage, *rest)  # type: ignore[arg-type]
-        return steps[stage]
+    def noted(self: Descent, stage: str, *rest: object) -> tuple[int, dict[int, Any]]:
+        steps[stage], state = restored(self, stage, *rest)  # type: ignore[arg-type]
+        return steps[stage], state
 
     monkeypatch.setattr(Descent, "_keep", stop)
     fit(out, *frames, status=INTERRUPTED)
@@ -131,7 +131,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     assert "run the same command again to resume" in capsys.readouterr().err
     stopped = state.read_bytes()
     monkeypatch.setattr(Descent, "_keep", kept)
-    monkeypatch.setattr(Descent, "_restore", noted)
+    monkeypatch.setattr(Descent, "_restored", noted)
     assert same(fit(out, *frames), whole)
     assert steps.pop("curve") == 10 and steps.pop("sRGB to RAW") == 4  # not one of them again
     assert set(steps.values()) == {0} and not state.exists()
