@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +54,7 @@ def scene(seed: int, size: int = 1024, texture: float = 0.3) -> Tensor:
     return (light * torch.tensor([0.6, 1.0, 1.0, 0.7])[:, None, None]).clamp(max=1)
 
 
-def shoot(clean: Tensor, shot: float, read: float, seed: int, **switches: float) -> Tensor:
+def shoot(clean: Tensor, shot: float, read: float, seed: int, **switches: Any) -> Tensor:
     """The mosaic of a camera with these levels."""
     model = SensorNoise(FixedLevels(shot, read), poisson=True, bits=BITS, black_level=BLACK, **switches)
     return unpack(model.apply(clean, model.sample(1, torch.Generator().manual_seed(seed))), "GRBG")

@@ -198,9 +198,10 @@ def test_a_state_of_two_processes_counts_passes(
     as_rank: Callable[[int, int], None], count: int, drop_last: bool
 ) -> None:
     as_rank(0, 2)
-    visits = Visits(count)
+    visits, dataset = Visits(count), list(range(count))
+    sampler: DistributedSampler[int] = DistributedSampler(dataset, 2, 0, shuffle=False, drop_last=drop_last)  # type: ignore[arg-type]
     for number in (1, 2):
-        for picture in DistributedSampler(range(count), 2, 0, shuffle=False, drop_last=drop_last):  # type: ignore[arg-type]
+        for picture in sampler:
             visits.key(picture)
             assert visits.state_dict()["visits"].tolist() == [number] * count, "a pass that has begun counts"
 
