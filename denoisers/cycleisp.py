@@ -55,12 +55,7 @@ class ResidualGroup(nn.Module):
 
 
 class Trunk(nn.Module):
-    """What the three networks share: a first convolution, groups, a convolution and the one PReLU used all over.
-
-    Args:
-        inputs: channels that come in.
-        features, groups, blocks, reduction: 96, 3, 5 and 8 as published.
-    """
+    """What the three networks share: a first convolution, groups, a convolution and the one PReLU used all over."""
 
     def __init__(self, inputs: int, features: int, groups: int, blocks: int, reduction: int) -> None:
         super().__init__()

@@ -34,20 +34,7 @@ _LEAST_RATIO = 1e-3
 
 
 def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """The levels behind a noise map ``shot_var max(noisy, 0) + read_var``, by least squares.
-
-    Args:
-        noisy, variance: ``(B, C, h, w)``.
-
-    Returns:
-        shot_var and read_var, ``(B, 1, 1, 1)``, not negative.
-
-    Example:
-        >>> noisy = torch.rand(1, 4, 8, 8) - 0.1
-        >>> shot, read = levels_of(noisy, 1e-3 * noisy.clamp_min(0) + 1e-5)
-        >>> round(shot.item(), 6), round(read.item(), 7)
-        (0.001, 1e-05)
-    """
+    """The levels behind a noise map ``shot_var max(noisy, 0) + read_var``, by least squares."""
     light, axes = noisy.clamp_min(0.0), (1, 2, 3)
     mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
     spread = (light - mean).square().mean(axes, keepdim=True)
@@ -57,11 +44,7 @@ def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Domain(ABC):
-    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``.
-
-    Attributes:
-        least_shot: the least shot_var that photons are counted with.
-    """
+    """A transform of RAW ``(B, C, h, w)``, and back; levels are ``(B, 1, 1, 1)``."""
 
     least_shot: ClassVar[float]
 

@@ -131,11 +131,7 @@ def shipped() -> list[str]:
 
 
 def find(name: str | Path) -> Path:
-    """The file of a denoiser: a path to a ``.safetensors`` file, or the name of a shipped one.
-
-    Raises:
-        FileNotFoundError: if it is neither, naming the shipped ones.
-    """
+    """The file of a denoiser: a path to a ``.safetensors`` file, or the name of a shipped one."""
     path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
     if not path.is_file():
         known = ", ".join(shipped()) or "none in this installation"

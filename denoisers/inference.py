@@ -164,15 +164,6 @@ class Recorrupted(nn.Module):
     A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
     added noise costs. ``m`` has the noise's variance at ``f(y)``: at ``y`` it would follow the noise. Source: Pang et
     al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
-
-    Args:
-        model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
-        alpha: standard deviation of the extra noise over that of the noise, as in training.
-        draws: how many.
-        seed: of the extra noise, which is the same in every call.
-
-    Raises:
-        ValueError: if ``draws`` is less than 1 or ``alpha`` not positive.
     """
 
     def __init__(

@@ -75,12 +75,7 @@ def _launch(
     quiet: bool = False,
     own: Annotated[list[Path] | None, Parameter(name="--import")] = None,
 ) -> None:
-    """Run a command.
-
-    Args:
-        quiet: do not print progress.
-        own: a Python file whose networks, noise models and the like can be used by name; stands before the command.
-    """
+    """Run a command."""
     for file in own or ():
         _import(file)
     with without_progress(quiet):

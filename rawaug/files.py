@@ -33,15 +33,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 def yaml_value(text: str) -> Any:
-    """Plain values of YAML, in which ``1e-4`` is a number, as in YAML 1.2.
-
-    Raises:
-        ValueError: in one line, if it is no YAML.
-
-    Example:
-        >>> yaml_value("{noise: [1e-4, 0], names: [a, null]}")
-        {'noise': [0.0001, 0], 'names': ['a', None]}
-    """
+    """Plain values of YAML, in which ``1e-4`` is a number, as in YAML 1.2."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -60,17 +52,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an error.
 
     Two writers of one file take turns. What a killed process left is removed by the next.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with replacing(f"{folder}/new/a.txt") as partial:
-        ...         _ = partial.write_text("whole")
-        ...     [file.name for file in Path(folder, "new").iterdir()]
-        ['a.txt']
     """
     from filelock import FileLock
 
@@ -97,18 +78,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Hold the lock ``file``. Its folder is made, and removed again if it stays empty.
-
-    Raises:
-        ValueError: if another run holds it.
-        OSError: if it cannot be written, or the folder was removed during the run.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder, locked(Path(folder, LOCK)):
-        ...     [path.name for path in Path(folder).iterdir()]
-        ['rawaug.lock']
-    """
+    """Hold the lock ``file``. Its folder is made, and removed again if it stays empty."""
     from filelock import FileLock, Timeout
 
     folder = file.absolute().parent
@@ -159,11 +129,7 @@ def _finite(value: Any) -> Any:
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """A JSON object from a file of others.
-
-    Raises:
-        ValueError: if it is something else, too deeply nested, or has a number that is not finite.
-    """
+    """A JSON object from a file of others."""
 
     def refuse(number: str) -> float:
         raise ValueError(f"{number} is not a finite number")
@@ -183,16 +149,7 @@ def parse_object(text: str) -> dict[str, Any]:
 
 
 def require_writable(path: str | Path, folder: bool = False) -> None:
-    """Refuse, before any work, a file (or ``folder``) that could not be written at the end.
-
-    Raises:
-        OSError: with what is in the way.
-
-    Example:
-        >>> require_writable("/dev/null/report.html")
-        Traceback (most recent call last):
-        OSError: /dev/null/report.html: cannot be written: /dev/null is not a folder
-    """
+    """Refuse, before any work, a file (or ``folder``) that could not be written at the end."""
     path = Path(path)
     if path.is_dir() and not folder:
         raise OSError(f"{path}: cannot be written: is a folder; give the name of a file")
@@ -227,16 +184,7 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
 def read_tensors(
     path: str | Path, advice: str, infinite: Collection[str] = ()
 ) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a safetensors file, on the CPU.
-
-    Args:
-        path: the file.
-        advice: ends the messages.
-        infinite: names of tensors in which infinity has a meaning.
-
-    Raises:
-        ValueError: if it cannot be read, or a value is not finite; ending in ``advice``.
-    """
+    """Header and tensors of a safetensors file, on the CPU."""
     header, tensors = _opened(path, advice, tensors=True)
     for name, tensor in tensors.items():
         values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own
@@ -246,11 +194,7 @@ def read_tensors(
 
 
 def read_header(path: str | Path) -> dict[str, str]:
-    """The header of a rawaug file, without its tensors.
-
-    Raises:
-        ValueError: if it is not a safetensors file written by rawaug.
-    """
+    """The header of a rawaug file, without its tensors."""
     header, _ = _opened(
         path, "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again", tensors=False
     )
@@ -270,14 +214,7 @@ def _opened(path: str | Path, advice: str, tensors: bool) -> tuple[dict[str, str
 
 
 def find_weights(name: str | Path, *more: Path) -> Path:
-    """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package.
-
-    Args:
-        more: further folders of shipped weights, such as :data:`denoisers.files.FOLDER`.
-
-    Raises:
-        FileNotFoundError: naming the shipped ones.
-    """
+    """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package."""
     folders = (WEIGHTS, *more)
     paths = [Path(name)] if Path(name).suffix else [folder / f"{name}.safetensors" for folder in folders]
     for path in paths:
@@ -306,10 +243,5 @@ def sha256(path: str | Path) -> str:
 
 
 def fingerprint(*settings: Any) -> str:
-    """A short hash of settings, equal if and only if they are.
-
-    Example:
-        >>> fingerprint("isp", {"seed": 0}) == fingerprint("isp", {"seed": 1})
-        False
-    """
+    """A short hash of settings, equal if and only if they are."""
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]

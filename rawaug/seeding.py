@@ -14,12 +14,7 @@ import torch
 
 
 def derived_seed(*keys: int | str) -> int:
-    """A 63-bit seed from a sequence of integers and strings, the same on every machine.
-
-    Example:
-        >>> derived_seed(0, "noise", 17) == derived_seed(0, "noise", 17)
-        True
-    """
+    """A 63-bit seed from a sequence of integers and strings, the same on every machine."""
     digest = hashlib.blake2b(repr(keys).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
 
@@ -30,12 +25,7 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
 
 
 def rank_key() -> tuple[int, ...]:
-    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single process.
-
-    Example:
-        >>> rank_key()
-        ()
-    """
+    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single process."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     rank = torch.distributed.get_rank() if distributed else 0
     return (rank,) if rank else ()
@@ -43,11 +33,8 @@ def rank_key() -> tuple[int, ...]:
 
 @contextmanager
 def initialised_from(seed: int) -> Iterator[None]:
-    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then what it was.
-
-    Example:
-        >>> with initialised_from(0):
-        ...     layer = torch.nn.Linear(3, 3)
+    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then what it
+    was.
     """
     default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):

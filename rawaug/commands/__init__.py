@@ -14,12 +14,7 @@ OPTIONS = Parameter(name="*")
 
 
 def value_of(text: str) -> Any:
-    """What a word of the command line means: YAML, but ``demo:`` is a name and no mapping.
-
-    Example:
-        >>> [value_of(text) for text in ("1e-4", "null", "demo:", "{width: 4}")]
-        [0.0001, None, 'demo:', {'width': 4}]
-    """
+    """What a word of the command line means: YAML, but ``demo:`` is a name and no mapping."""
     value = yaml_value(text)
     return text if isinstance(value, dict) and not text.lstrip().startswith("{") else value
 

@@ -61,10 +61,6 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     """(shot_var, read_var) of a frame and their source.
 
     ``auto`` is the profile where the frame bears it out, else the estimate, else the camera's published law.
-
-    Raises:
-        UnknownNoise: if the frame has no profile, its noise cannot be estimated, or a law does not reach its ISO.
-        ValueError: if there is no such name.
     """
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
@@ -142,11 +138,7 @@ def _checked_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[flo
 
 
 def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
-    """The law at the frame's ISO.
-
-    Raises:
-        ValueError: if the law is of another camera, or does not reach the ISO.
-    """
+    """The law at the frame's ISO."""
     known = {law.camera, frame.camera} - {"unknown"}
     if len(known) > 1:
         raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
@@ -157,11 +149,7 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
 
 
 def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
-    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or no law in it.
-    """
+    """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is."""
     if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
         return noise
     stored = denoisers.load(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
@@ -266,11 +254,7 @@ class ClassicalDenoiser:
 def frame_denoiser(
     denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
 ) -> FrameDenoiser:
-    """What denoises: the network, the classical filter, or the network that is taken where neither is named.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is none such, or both are named.
-    """
+    """What denoises: the network, the classical filter, or the network that is taken where neither is named."""
     if classical is None:
         return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
     if denoiser is not None or self_ensemble:

@@ -24,11 +24,7 @@ def run(weights: str, /, *, json: bool = False) -> None:
 
 
 def as_json(weights: str | Path) -> dict[str, Any]:
-    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.model.DictionaryISP.description`.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
-    """
+    """What ``rawaug info --json`` prints: of an ISP see :func:`rawaug.isp.model.DictionaryISP.description`."""
     path = find_weights(weights, FOLDER)
     content: dict[str, Any] = {"file": str(path), "sha256": sha256(path), "version": __version__}
     if read_header(path)["kind"] == "isp":
@@ -40,11 +36,7 @@ def as_json(weights: str | Path) -> dict[str, Any]:
 
 
 def describe(weights: str | Path) -> str:
-    """Kind, size, settings and, for an ISP, its atoms as numbers.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it was not written by rawaug.
-    """
+    """Kind, size, settings and, for an ISP, its atoms as numbers."""
     path = find_weights(weights, FOLDER)
     kind = read_header(path)["kind"]
     if kind == "isp":

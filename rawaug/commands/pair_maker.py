@@ -77,14 +77,7 @@ class Outcome(NamedTuple):
 
 
 class Task(ABC):
-    """A unit of work for one process.
-
-    Attributes:
-        pictures: how many it is about.
-        existing: pairs that are there already.
-        broken: pictures that an earlier run could not read, with why.
-        todo: whether anything is missing.
-    """
+    """A unit of work for one process."""
 
     pictures: int
     existing: int

@@ -68,14 +68,7 @@ def run(
 
 
 def with_values(settings: type[Any], content: Mapping[str, Any], source: object) -> Any:
-    """An instance of the dataclass ``settings`` with the values of ``content``, which its types decide on.
-
-    Args:
-        source: opens the messages.
-
-    Raises:
-        ValueError: naming the first key that is unknown or has an impossible value.
-    """
+    """An instance of the dataclass ``settings`` with the values of ``content``, which its types decide on."""
     content = {key: value for key, value in content.items() if key != "experiment" or key in get_type_hints(settings)}
     try:
         _require_known(settings, content, [key.name for key in keys_of(settings)])

@@ -156,15 +156,7 @@ def synth(
 
 
 def part_of(shard: str) -> tuple[int, int]:
-    """K and N of ``"K/N"``.
-
-    Raises:
-        ValueError: unless 1 <= K <= N.
-
-    Example:
-        >>> part_of("3/32")
-        (3, 32)
-    """
+    """K and N of ``"K/N"``."""
     first, _, second = shard.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
         raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")

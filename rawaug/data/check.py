@@ -35,15 +35,7 @@ _PAIRS = "pairs:"
 
 @dataclass
 class PartReport:
-    """One kind of data in a folder.
-
-    Attributes:
-        what: the kind of data.
-        items: number of pairs, frames, blocks or pictures, of which ``examined`` were read.
-        sizes, cfas, cameras, iso, levels: how often each occurs among those that could be read.
-        signal: least and greatest value of RAW.
-        broken: one line per damaged file, with its name.
-    """
+    """One kind of data in a folder."""
 
     what: str
     items: int = 0

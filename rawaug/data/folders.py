@@ -50,9 +50,6 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
     """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
 
     What macOS and Windows leave beside one's files is no part of a dataset. No folder, no files.
-
-    Raises:
-        OSError: if a folder may not be listed.
     """
 
     def refuse(error: OSError) -> None:
@@ -217,14 +214,7 @@ def reports(pictures: Any) -> list[str]:
 
 
 class Cached(Dataset[Tensor]):
-    """A dataset of pictures that keeps up to ``megabytes`` of them decoded, in each worker its own.
-
-    Example:
-        >>> import torch
-        >>> pictures = Cached([torch.zeros(3, 8, 8, dtype=torch.uint8)], megabytes=1)
-        >>> pictures[0] is pictures[0]
-        True
-    """
+    """A dataset of pictures that keeps up to ``megabytes`` of them decoded, in each worker its own."""
 
     def __init__(self, pictures: Sequence[Tensor] | Any, megabytes: int) -> None:
         self.pictures, self._left = pictures, megabytes * 2**20
@@ -247,19 +237,6 @@ class Readable(Sequence[Pair]):
     """Pairs without those that cannot be read, whose reasons are kept.
 
     Iterating raises ValueError if no pair is readable.
-
-    Attributes:
-        broken: by index, why a pair could not be read; a pair is tried once.
-
-    Example:
-        >>> class Damaged(list):
-        ...     def __getitem__(self, index):
-        ...         if index == 1:
-        ...             raise OSError(f"{index}.dng: truncated")
-        ...         return super().__getitem__(index)
-        >>> pairs = Readable(Damaged(["first", "second"]))
-        >>> list(pairs), pairs.broken
-        (['first'], {1: '1.dng: truncated'})
     """
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
@@ -309,17 +286,7 @@ def left_out(pairs: Readable, of: str) -> list[str]:
 
 
 def skip_broken(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
-    """Iterate over the readable pairs; afterwards, print the skipped ones.
-
-    Args:
-        pairs: a dataset, or one that is :class:`Readable` already, which then keeps what was found.
-        of: what a user calls it.
-        seconds: after which no further pair is read, from the first one on, which also waits for the libraries.
-        least: that many are read all the same.
-
-    Raises:
-        ValueError: if there are pairs, and none can be read.
-    """
+    """Iterate over the readable pairs; afterwards, print the skipped ones."""
     readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
     start = math.inf
     for count, pair in enumerate(readable, start=1):

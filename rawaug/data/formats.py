@@ -228,12 +228,7 @@ TWO_IN_ONE = (".npz", ".mat")
 
 
 class Mosaic(NamedTuple):
-    """A mosaic float32 ``(1, H, W)``, sides even (of an odd side the last line is left out), and its sensor.
-
-    Args:
-        white_balance, color_matrix: as in :class:`rawaug.data.Pair`; None where the file does not state them.
-        levels: (shot_var, read_var), None if not stated.
-    """
+    """A mosaic float32 ``(1, H, W)``, sides even (of an odd side the last line is left out), and its sensor."""
 
     raw: Tensor
     cfa: CFA
@@ -245,18 +240,7 @@ class Mosaic(NamedTuple):
 
 
 def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> Mosaic:
-    """Read a mosaic.
-
-    Args:
-        which: ``"noisy"`` or ``"clean"``.
-        given: CFA and levels for files that do not state them.
-        alone: the file holds both mosaics of its pair, each by its name.
-        max_pixels: a PNG with more is refused; other formats have limits of their own.
-
-    Raises:
-        FileNotFoundError, OSError: if it is missing or damaged.
-        ValueError: if CFA or levels are unknown or contradict ``given``, or the numbers are not a mosaic within them.
-    """
+    """Read a mosaic."""
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
         return _camera_file(file, given)

@@ -57,16 +57,7 @@ def _variables(path: Path) -> list[str]:
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
-    """The numeric array ``name``, axes and type as in MATLAB.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`mat_version`; ValueError also if there is no such array.
-        OSError: if the file is damaged.
-
-    Example:
-        >>> read_array("0001_NOISY_RAW_010.MAT", "x").shape  # doctest: +SKIP
-        (3000, 5328)
-    """
+    """The numeric array ``name``, axes and type as in MATLAB."""
     value = isolated(_read, Path(path), name, False)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise ValueError(f"{path}: {name} is not a numeric array but {type(value).__name__}")
@@ -76,9 +67,6 @@ def read_array(path: str | Path, name: str) -> np.ndarray:
 def read_value(path: str | Path, name: str) -> Any:
     """The variable ``name`` as plain values: structs are dicts, struct arrays lists of dicts, cells lists, characters
     strings, numbers arrays without axes of length 1. A matrix of cells or structs is listed row by row.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: as :func:`read_array`.
     """
     return isolated(_read, Path(path), name, True)
 

@@ -186,13 +186,7 @@ class Sample(NamedTuple):
 
 
 def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
-    """A frame that both hold, by its path or name; None if they share none.
-
-    Example:
-        >>> from rawaug.data import demo_pairs
-        >>> shared_frame(demo_pairs("train"), demo_pairs("train", count=1))
-        'train_00_astronaut'
-    """
+    """A frame that both hold, by its path or name; None if they share none."""
     return min(_identities(first) & _identities(second), default=None)
 
 
@@ -220,14 +214,7 @@ def _sampled(pair: Pair) -> str:
 
 
 class LazyPairs(Sequence[Pair], ABC):
-    """A sequence of pairs that reads one at a time; the last one stays in memory.
-
-    Args:
-        names: of the pairs, known without reading any.
-
-    Attributes:
-        max_pixels: sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded.
-    """
+    """A sequence of pairs that reads one at a time; the last one stays in memory."""
 
     max_pixels: int = MAX_PIXELS
 
@@ -267,13 +254,7 @@ class LazyPairs(Sequence[Pair], ABC):
 
 
 class SomePairs(LazyPairs):
-    """Some pairs of a sequence, by index.
-
-    Example:
-        >>> from rawaug.data import demo_pairs
-        >>> SomePairs(demo_pairs("train", count=3), [2, 0]).names
-        ['train_02_astronaut', 'train_00_astronaut']
-    """
+    """Some pairs of a sequence, by index."""
 
     def __init__(self, pairs: Sequence[Pair], indices: Sequence[int]) -> None:
         self.pairs, self.indices = pairs, list(indices)
@@ -342,11 +323,7 @@ OWN_PICTURES = "pairs"
 
 
 class PairPictures(Sequence[Tensor]):
-    """The pictures uint8 ``(3, H, W)`` of pairs; a pair is read when its picture is asked for.
-
-    Args:
-        pairs: the pairs; keep them in memory if they are asked for often.
-    """
+    """The pictures uint8 ``(3, H, W)`` of pairs; a pair is read when its picture is asked for."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
@@ -380,23 +357,7 @@ class Labelled(Protocol):
 
 
 def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
-    """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices.
-
-    Args:
-        pairs: the dataset.
-        kept: number of pairs to choose from; the others are held out.
-        count: how many.
-        select: ``first``; ``scenes``, whole scenes until there are ``count`` pairs; ``phones``, as many of each phone,
-            the middle ones by ISO; or names of frames, or of their folders (scene instances).
-
-    Raises:
-        ValueError: if a name is unknown, the dataset has no labels, or ``count`` is not that of whole scenes.
-
-    Example:
-        >>> labels = [FrameLabel("001", phone, iso) for phone in ("GP", "S6") for iso in (100, 400, 800)]
-        >>> one_a_phone(labels, 2)
-        [1, 4]
-    """
+    """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices."""
     if not isinstance(select, str):
         return _named(names_of(pairs)[:kept], select)[:count]
     if select not in SELECTIONS:
@@ -458,15 +419,7 @@ _SITES = 2**20
 
 
 def captured_noise(clean: np.ndarray, noisy: np.ndarray) -> tuple[float, float]:
-    """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> clean = rng.random((300, 300))
-        >>> noisy = clean + rng.normal(size=clean.shape) * np.sqrt(0.01 * clean + 0.0004)
-        >>> captured_noise(clean, noisy)  # doctest: +ELLIPSIS
-        (0.01..., 0.0003...)
-    """
+    """(shot_var, read_var) of ``noisy``, both positive; arrays of the same shape, black 0, white 1."""
     signal = np.ravel(clean).astype(np.float64)
     square = (np.ravel(noisy) - signal) ** 2
     order = np.argsort(signal)

@@ -103,15 +103,7 @@ for _camera in CAMERAS:
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:
-    """The numbers, four digits, of the DNGs of a split.
-
-    Raises:
-        ValueError: if there is no such camera or split.
-
-    Example:
-        >>> fivek_numbers("nikon", "test")[:3]
-        ['0002', '0088', '0208']
-    """
+    """The numbers, four digits, of the DNGs of a split."""
     splits = _splits()
     if camera not in CAMERAS:
         raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")

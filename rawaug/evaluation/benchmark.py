@@ -166,11 +166,7 @@ def _row(one: Contestant, frames: Sequence[Pair], columns: Sequence[Column]) -> 
 
 
 def denoised_by(one: Contestant, sample: Sample, cfa: CFA) -> Tensor:
-    """The denoiser's result, checked.
-
-    Raises:
-        ValueError: naming the denoiser, if it fails, or its result is not finite or of another shape.
-    """
+    """The denoiser's result, checked."""
     try:
         with torch.inference_mode():
             denoised = one.run(sample.noisy.clone(), sample.variance.clone(), cfa)

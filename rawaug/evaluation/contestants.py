@@ -41,11 +41,7 @@ class Contestant(NamedTuple):
 
 
 def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
-    """The denoiser that a string names; see the module.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is none such, or its file is damaged; in one line.
-    """
+    """The denoiser that a string names; see the module."""
     path = Path(spec)
     if path.suffix == ".onnx":
         return Contestant(path.stem, _of_onnx(path))
@@ -65,11 +61,7 @@ def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
 
 
 def published_pmrid(path: str | Path) -> denoisers.PMRID:
-    """PMRID with the weights of its authors.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such file, or it does not fit the network.
-    """
+    """PMRID with the weights of its authors."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"pmrid: {path}: no such file")
     model = denoisers.PMRID()
@@ -88,9 +80,6 @@ def bf_dncnn(weights: Mapping[str, Tensor]) -> Callable[[Tensor, Tensor], Tensor
     with twenty 3 x 3 convolutions f without biases, normalisations folded in, and the exact unbiased inverse. Source:
     S. Mohan, Z. Kadkhodaie, E. P. Simoncelli, C. Fernandez-Granda, "Robust and interpretable blind image denoising via
     bias-free convolutional neural networks", ICLR 2020.
-
-    Args:
-        weights: ``conv00`` to ``conv19``, each ``(out, in, 3, 3)``.
     """
     *layers, last = (weights[name] for name in sorted(weights))
 

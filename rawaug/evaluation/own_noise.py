@@ -36,13 +36,7 @@ class OwnNoise(NamedTuple):
 def own_variances(
     whole: Sequence[Pair], scored: Sequence[Pair], noise: NoiseModel, seed: int = 0, factor: int = 1
 ) -> dict[str, OwnNoise]:
-    """The own noise of references, by name, where it is stated or can be measured (:func:`rawaug.noise.own_noise`).
-
-    Args:
-        whole: the frames as they were read.
-        scored: the same frames, binned by ``factor`` and cropped; some may be missing.
-        noise, seed: of the test, see :func:`rawaug.evaluation.scores.frozen_sample`.
-    """
+    """The own noise of references, by name, where it is stated or can be measured (:func:`rawaug.noise.own_noise`)."""
     found, binned = {}, Binned(whole, factor)
     count = min(MOST_MEASURED, len(scored))
     chosen = [scored[k * len(scored) // count] for k in range(count)]

@@ -62,12 +62,7 @@ class Part:
 
 
 class Page:
-    """Collects the parts of the page; frames are encoded as they come and not kept.
-
-    Args:
-        title: of the page.
-        parts: that come first.
-    """
+    """Collects the parts of the page; frames are encoded as they come and not kept."""
 
     def __init__(self, title: str, parts: Sequence[Part] = ()) -> None:
         self.title, self.parts = title, list(parts)

@@ -162,11 +162,7 @@ def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
-    """Check names, settings and libraries of classical denoisers.
-
-    Raises:
-        ValueError: if one is unknown, or its library is not installed.
-    """
+    """Check names, settings and libraries of classical denoisers."""
     for spec in specs:
         reason = FILTERS.make(spec).missing()
         if reason is not None:
@@ -174,10 +170,8 @@ def require_classical(specs: Sequence[Spec]) -> None:
 
 
 def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
-    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if ``shown``.
-
-    Raises:
-        ValueError: as :func:`require_classical`, for the others.
+    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if
+    ``shown``.
     """
     bm3d = {"BM3D": FILTERS["BM3D"].missing()}
     kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
@@ -256,11 +250,7 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:
-    """Report scores that summaries omitted, once all else is printed and written.
-
-    Raises:
-        ValueError: if a frame could not be read, or a score is no number.
-    """
+    """Report scores that summaries omitted, once all else is printed and written."""
     faults = [fault for one in summaries for key in ("broken", "no_numbers") for fault in one.get(key, ())]
     if faults:
         more = f"; and {len(faults) - SHOWN_FAULTS} more" if len(faults) > SHOWN_FAULTS else ""

@@ -60,13 +60,7 @@ def training_stream(
     noise: NoiseModel,
     seed: int,
 ) -> TrainingStream:
-    """The training samples of one arm.
-
-    Args:
-        frames: the real ones, see :func:`frames_of`.
-        pictures: the sRGB pictures, which ``isp`` and ``noise`` make RAW of.
-        seed: of the run.
-    """
+    """The training samples of one arm."""
     crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
     augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure) if arm.augmented else None
     real: Source | None = None
@@ -86,11 +80,7 @@ def training_stream(
 def validation_samples(
     recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
 ) -> list[Watched]:
-    """The frozen samples by which weights are chosen, the same in every arm and run.
-
-    Args:
-        frames: of validation, see :func:`frames_of`; none for samples made from ``pictures``.
-    """
+    """The frozen samples by which weights are chosen, the same in every arm and run."""
     augment = RawAugment(isp, noise)
     if recipe.self_supervised:
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]

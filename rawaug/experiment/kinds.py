@@ -21,11 +21,7 @@ def settings_of(kind: str) -> type[Any]:
 
 
 def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
-    """Print what data a training would use, and do the run in its shortest form in a temporary folder.
-
-    Raises:
-        OSError, ValueError: for the first thing that would stop the run.
-    """
+    """Print what data a training would use, and do the run in its shortest form in a temporary folder."""
     folder = require_free(settings, overwrite)
     if isinstance(settings, Recipe):
         print("\n".join(planned(settings, {}).lines(settings)))

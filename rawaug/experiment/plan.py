@@ -95,11 +95,6 @@ def with_own_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection
 
     What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
     of null, on RAW made from the pictures, stays.
-
-    Args:
-        recipe: as its file and the command line say.
-        content: of the file.
-        given: the keys of the command line, such as ``data.pairs``.
     """
     usual = (content.get("data") or {}).get("pairs", DataConfig.pairs)
     if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):
@@ -124,15 +119,7 @@ def with_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Rec
 
 
 def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
-    """Open the data of a recipe.
-
-    Args:
-        given: pairs in place of what ``data.pairs``, ``data.validation`` and ``data.test`` name, by the ends of these
-            keys.
-
-    Raises:
-        FileNotFoundError, ValueError: if something is missing, or the test frames are not unseen.
-    """
+    """Open the data of a recipe."""
     data, clean = recipe.data, not recipe.self_supervised
     test = _opened(data, given.get("test", data.test), "test", True)
     pairs = _opened(data, given.get("pairs", data.pairs), "train", clean)
@@ -180,11 +167,7 @@ def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED
 
 
 def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[Pair]) -> None:
-    """Check that frames, as they were read, have what fit and arms need of them.
-
-    Raises:
-        ValueError: naming the first frame that lacks it.
-    """
+    """Check that frames, as they were read, have what fit and arms need of them."""
     real = {name: arm for name, arm in recipe.arms.items() if arm.augmented < 1.0}
     for pair in pairs:
         if recipe.camera is None and not pair.color_known:

@@ -253,11 +253,7 @@ class Recipe:
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
-    """The content of a recipe's file.
-
-    Raises:
-        ValueError: if it is not YAML, larger than a recipe can be, or no mapping.
-    """
+    """The content of a recipe's file."""
     import yaml
 
     if (size := Path(file).stat().st_size) > MOST_BYTES:
@@ -275,11 +271,7 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
-    """The kind of experiment that a recipe names.
-
-    Raises:
-        ValueError: if there is no such kind.
-    """
+    """The kind of experiment that a recipe names."""
     kind = content.get("experiment", "training")
     if not isinstance(kind, str) or kind not in EXPERIMENTS:
         raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(EXPERIMENTS)}")
@@ -306,15 +298,7 @@ def _listed() -> list[tuple[str, Path]]:
 
 
 def find_recipe(name: str) -> Path:
-    """A recipe's path: the file itself, or one that travels with the package, with or without ``.yaml``.
-
-    Raises:
-        FileNotFoundError: naming those there are.
-
-    Example:
-        >>> find_recipe("sidd/fewshot").name
-        'fewshot.yaml'
-    """
+    """A recipe's path: the file itself, or one that travels with the package, with or without ``.yaml``."""
     path, known = Path(name), shipped_recipes()
     if path.is_file():
         return path

@@ -23,20 +23,7 @@ FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
 
 
 def run_folder(settings: Any) -> Path:
-    """The folder of a run.
-
-    Args:
-        settings: of any kind of experiment, with ``out`` and ``name``.
-
-    Raises:
-        ValueError: if the name leads out of ``out``, or is that of ``out`` itself.
-
-    Example:
-        >>> from rawaug.paper.ablation import Ablation
-        >>> run_folder(Ablation(name="../mine"))
-        Traceback (most recent call last):
-        ValueError: name '../mine': must be a folder within runs; give a name without .. and not beginning with /
-    """
+    """The folder of a run."""
     out, name = Path(settings.out), Path(settings.name)
     if name.is_absolute() or ".." in name.parts or not name.parts:
         raise ValueError(
@@ -46,16 +33,7 @@ def run_folder(settings: Any) -> Path:
 
 
 def require_free(settings: Any, overwrite: bool = False) -> Path:
-    """The folder of a run, checked: it can be written, and is empty or this run's.
-
-    Args:
-        settings: of any kind of experiment.
-        overwrite: take the folder of another run.
-
-    Raises:
-        ValueError: if it holds another run, naming the settings that differ.
-        OSError: if it cannot be written.
-    """
+    """The folder of a run, checked: it can be written, and is empty or this run's."""
     folder = run_folder(settings)
     require_writable(folder, folder=True)
     if overwrite or not folder.is_dir() or not _filled(folder):

@@ -108,12 +108,7 @@ def noise(drawn: Drawn) -> list[np.ndarray]:
 
 
 def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of the signal in logarithmic bins, and the mean squares of the noise there.
-
-    Args:
-        clean, noisy: values ``(N,)`` of the same sites.
-        expected: variance of the noise there, ``(N,)``: sites that it may clip, within three deviations, are left out.
-    """
+    """Means of the signal in logarithmic bins, and the mean squares of the noise there."""
     seen = (clean > 1e-4) & (clean + 3.0 * expected.sqrt() < 1.0)
     signal, square = clean[seen], (noisy[seen] - clean[seen]).square()
     where = ((signal.log10() + 4) * (_BINS / 4)).long().clamp(0, _BINS - 1)

@@ -90,11 +90,7 @@ FIRST_SEED = 2
 
 
 def look_of(values: Mapping[str, Any]) -> Look:
-    """The look that the controls' values mean.
-
-    Raises:
-        ValueError: if no picture is chosen.
-    """
+    """The look that the controls' values mean."""
     picture = values["picture"]
     if not picture:
         raise ValueError("choose a picture")
@@ -269,11 +265,7 @@ def server_of(page: Any) -> Any:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """A socket for :func:`server_of`; port 0 takes any that is free.
-
-    Raises:
-        OSError: if the address or the port cannot be used.
-    """
+    """A socket for :func:`server_of`; port 0 takes any that is free."""
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:

@@ -94,12 +94,7 @@ def noises_of(isp: str) -> list[str]:
 
 
 def iso_range(noise: str) -> tuple[float, float] | None:
-    """Lowest and highest ISO of a camera's noise; None where the noise does not depend on one.
-
-    Example:
-        >>> iso_range("Google Pixel"), iso_range("upi")
-        ((100.0, 3200.0), None)
-    """
+    """Lowest and highest ISO of a camera's noise; None where the noise does not depend on one."""
     if noise == "camera":
         return None
     levels = noise_levels(noise)

@@ -166,12 +166,7 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
 
 
 class Development:
-    """Develops RAW of one setting.
-
-    Args:
-        isp: whose stages are reversed.
-        setting: of one picture, without the leading B.
-    """
+    """Develops RAW of one setting."""
 
     @torch.no_grad()
     def __init__(self, isp: DictionaryISP, setting: ISPParams) -> None:
@@ -187,12 +182,7 @@ class Development:
 
     @torch.no_grad()
     def __call__(self, rgb: Tensor, place: tuple[int, int, int, int] | None = None) -> np.ndarray:
-        """Demosaiced RAW ``(3, H, W)`` to sRGB, uint8 ``(H, W, 3)``.
-
-        Args:
-            rgb: demosaiced.
-            place: top, left, and the full frame's height and width; the whole frame by default.
-        """
+        """Demosaiced RAW ``(3, H, W)`` to sRGB, uint8 ``(H, W, 3)``."""
         height, width = rgb.shape[-2:]
         if self.shading is not None:
             top, left, *frame = place or (0, 0, height, width)

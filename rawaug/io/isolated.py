@@ -28,21 +28,7 @@ _one_at_a_time = threading.Lock()
 
 
 def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
-    """Call ``read(*arguments)`` in a helper process, or directly in a worker process or if the limit is 0.
-
-    Args:
-        read: a function of a module, found there by its name.
-        arguments: that can be pickled.
-        name: of the file in errors; by default the first argument.
-
-    Raises:
-        OSError: if the helper dies or takes too long.
-        Exception: whatever ``read`` raises.
-
-    Example:
-        >>> isolated(len, "four")
-        4
-    """
+    """Call ``read(*arguments)`` in a helper process, or directly in a worker process or if the limit is 0."""
     seconds = time_limit()
     if not seconds or multiprocessing.parent_process() is not None:
         return read(*arguments)
@@ -78,11 +64,7 @@ def damage_as_os_error(path: Path, what: str, *passed: type[Exception]) -> Itera
 
 
 def time_limit() -> float:
-    """Seconds that a file may take; 0 to read it in this process.
-
-    Raises:
-        ValueError: if ``RAWAUG_READ_SECONDS`` is no number of seconds.
-    """
+    """Seconds that a file may take; 0 to read it in this process."""
     text = os.environ.get(LIMIT, str(SECONDS))
     try:
         seconds = float(text)

@@ -80,12 +80,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG.
-
-    Raises:
-        FileNotFoundError, OSError: as :func:`read_picture`.
-        ValueError: if it has more than one channel, or its numbers are not integers of 8 or 16 bits.
-    """
+    """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG."""
     with _text_damage_as_os_error(Path(path)):
         pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
@@ -227,10 +222,6 @@ def read_exposure(path: str | Path) -> float:
     """The exposure in stops, ``log2(t S / (100 N^2))`` of its EXIF's seconds t, ISO S and f-number N.
 
     One stop more is twice the RAW value; unlike the exposure value of ISO 2720 it grows with exposure.
-
-    Raises:
-        FileNotFoundError, OSError: if there is no such file, or it is not a picture.
-        ValueError: if its EXIF lacks exposure time, f-number or ISO.
     """
     with extra("raw"):
         import OpenImageIO as oiio
@@ -289,16 +280,7 @@ def _transform(profile: bytes) -> tuple[str, Any]:
 
 
 def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
-    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again.
-
-    Raises:
-        ValueError: if the picture is of another kind, or the quality out of range.
-
-    Example:
-        >>> picture = torch.full((3, 16, 16), 128, dtype=torch.uint8)
-        >>> bool((through_jpeg(picture, 90) == picture).all())
-        True
-    """
+    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again."""
     with extra("raw"):
         from PIL import Image
 

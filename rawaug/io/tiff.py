@@ -110,19 +110,7 @@ _RATIONALS = (5, 10)
 
 @dataclass(frozen=True)
 class TiffTags:
-    """Each field is None where the tag is missing or the file is not a TIFF.
-
-    Attributes:
-        make, model: of the camera.
-        noise_profile: (shot_var, read_var), the mean over colour planes.
-        mosaic_end: the byte after a DNG's mosaic; a smaller file is truncated.
-        black: a DNG's black levels, row by row of the cell at the top left of the active area, fractions kept; None
-            also where they repeat over more than two rows or columns. Of those that differ from row to row or from
-            column to column it is the mean.
-        black_rows, black_columns: by how much the black of a DNG's rows and columns is above that mean.
-        area: (top, left) of a DNG's active area.
-        gain_maps: a DNG's lens shading, empty without.
-    """
+    """Each field is None where the tag is missing or the file is not a TIFF."""
 
     make: str | None = None
     model: str | None = None

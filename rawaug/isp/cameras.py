@@ -51,13 +51,7 @@ LARGEST_ENTRY = 2.0
 
 
 class CameraMatrices(NamedTuple):
-    """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65.
-
-    Args:
-        names: maker and model, one a matrix.
-        xyz_to_camera: ``(N, 3, 3)`` float64.
-        rejected: rows of the published tables left out, by reason.
-    """
+    """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65."""
 
     names: tuple[str, ...]
     xyz_to_camera: Tensor
@@ -68,15 +62,7 @@ class CameraMatrices(NamedTuple):
         return torch.unique(self.xyz_to_camera, dim=0)
 
     def named(self, names: Sequence[str]) -> Tensor:
-        """The matrices ``(len(names), 3, 3)`` of these cameras, whatever the case of the letters.
-
-        Raises:
-            ValueError: if one is not listed; similar names are suggested.
-
-        Example:
-            >>> published_cameras().named(["nikon d750"]).shape
-            torch.Size([1, 3, 3])
-        """
+        """The matrices ``(len(names), 3, 3)`` of these cameras, whatever the case of the letters."""
         return self.xyz_to_camera[[self.names.index(spelled(name, self.names)) for name in names]]
 
 
@@ -156,14 +142,7 @@ DUV_SPREAD = 0.003
 
 
 class LightRange(NamedTuple):
-    """What lights are drawn from, as the arguments of :func:`sample_lights`.
-
-    Args:
-        kelvin: lowest and highest colour temperature.
-        lamps: share of electric lamps.
-        among: chromaticities ``(N, 2)`` of these lamps.
-        by_day: share of daylight among the others.
-    """
+    """What lights are drawn from, as the arguments of :func:`sample_lights`."""
 
     kelvin: tuple[float, float] = (WARMEST, COLDEST)
     lamps: float = LAMP_SHARE
@@ -172,15 +151,7 @@ class LightRange(NamedTuple):
 
 
 def light_range(light: float | str | None) -> LightRange:
-    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default.
-
-    Raises:
-        ValueError: if there is no such lamp, or the temperature is outside 2,000 to 10,000 K.
-
-    Example:
-        >>> light_range(5500).kelvin
-        (5500.0, 5500.0)
-    """
+    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default."""
     if light is None:
         return LightRange()
     if isinstance(light, str):
@@ -215,12 +186,7 @@ def off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
 
 
 def white_point(xy: Array | tuple[float, float]) -> Tensor:
-    """XYZ ``(..., 3)`` with Y = 1, float64, of chromaticities ``(..., 2)``.
-
-    Example:
-        >>> [round(value, 3) for value in white_point(D65).tolist()]
-        [0.95, 1.0, 1.089]
-    """
+    """XYZ ``(..., 3)`` with Y = 1, float64, of chromaticities ``(..., 2)``."""
     return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
 
 
@@ -236,17 +202,6 @@ def sample_lights(
 
     Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
     ``among`` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
-
-    Args:
-        batch: number of lights.
-        generator: on the CPU.
-        kelvin: lowest and highest colour temperature, within 1,000 to 15,000.
-        lamps: share of fluorescent and LED lamps, in [0, 1].
-        among: chromaticities ``(N, 2)`` of the lamps that are drawn from, each as often as the others.
-        by_day: share of daylight of :data:`DAYLIGHT_MIRED` among the others, in [0, 1].
-
-    Raises:
-        ValueError: if a limit is outside its range.
     """
     if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1 and 0 <= by_day <= 1):
         wrong = f"{kelvin}, {lamps} and {by_day}"

@@ -35,14 +35,7 @@ def with_white_balance(
     white_balance: Tensor | tuple[float, ...] | None,
     digital_gain: Tensor | float | None,
 ) -> ISPParams:
-    """Put the camera's own gains, and the colour atoms of such light, in place of the chosen ones.
-
-    Args:
-        isp: whose dictionaries are used.
-        params: chosen parameters.
-        white_balance: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``, as in the file; scaled to green 1.
-        digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
-    """
+    """Put the camera's own gains, and the colour atoms of such light, in place of the chosen ones."""
     batch = len(params.gains)
     if white_balance is not None:
         balance = torch.as_tensor(white_balance, dtype=params.gains.dtype, device=params.gains.device)
@@ -77,13 +70,6 @@ def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: 
     """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
 
     Clipped readings are left out; a channel without any reading keeps its gain.
-
-    Args:
-        isp: whose reverse pass is used.
-        x: sRGB ``(B, 3, H, W)``, float.
-        params: chosen parameters.
-        raw_samples: ``(B, K, 3)`` of (row, column, value).
-        place: coordinates of the pixels, ``(1 or B, 2, H, W)``.
     """
     _require_places(raw_samples, x)
     rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
@@ -98,15 +84,7 @@ def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: 
 def with_readings(
     isp: StagedISP, pixels: Tensor, where: Tensor, own: Tensor, value: Tensor, params: ISPParams
 ) -> ISPParams:
-    """As :func:`with_raw_samples`, for pixels that are at hand.
-
-    Args:
-        isp: whose reverse pass is used.
-        pixels, where: sRGB ``(B, 3, 1, K)``, float, and its coordinates ``(1 or B, 2, 1, K)``.
-        own: ``(B, 3, K)`` 1 in the channel that is read, else 0.
-        value: the readings ``(B, K)``.
-        params: chosen parameters.
-    """
+    """As :func:`with_raw_samples`, for pixels that are at hand."""
     params = _solve(isp, pixels, where, own, value, params)
     if isp.tone is not None and isinstance(isp.colour, CameraDictionary):
         for _ in range(ROUNDS):

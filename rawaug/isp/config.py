@@ -124,13 +124,7 @@ class ISPResult:
 
 
 class ReverseISP(nn.Module, ABC):
-    """A way from sRGB to RAW, and back where the method has one.
-
-    Attributes:
-        name: of the method.
-        bidirectional: whether it renders RAW as well, so that there is a :meth:`cycle`.
-        info: how it was fitted.
-    """
+    """A way from sRGB to RAW, and back where the method has one."""
 
     name: ClassVar[str]
     bidirectional: ClassVar[bool] = True
@@ -151,13 +145,7 @@ class ReverseISP(nn.Module, ABC):
 
     @abstractmethod
     def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to the mosaic ``(B, 1, H, W)``.
-
-        Args:
-            srgb: pictures with even sides.
-            setting: of the camera, as the method takes it; its own choice by default.
-            place: coordinates in the full frame ``(1 or B, 2, H, W)``, for methods that depend on them.
-        """
+        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to the mosaic ``(B, 1, H, W)``."""
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
         """The mosaic under a setting drawn at random; the one of :meth:`make` where the method has no other."""

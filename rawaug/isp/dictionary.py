@@ -73,12 +73,6 @@ class ColourDictionary(nn.Module):
 
     Each atom stores the light it was seen in, so that a known white balance can choose among them, as with a DNG's
     two illuminants.
-
-    Attributes:
-        matrices: ``(N, 3, 3)``, normalised on use.
-        light: ``(N, 2)`` log of the as-shot red and blue multipliers over green.
-        neutral: ``(N, 3)`` log of what the channels' gains are beyond as-shot balance and matrix: the digital gain.
-        spread: width of the kernel in ``light``; infinite where the light is uninformative.
     """
 
     light: Tensor
@@ -117,12 +111,6 @@ class CameraDictionary(ColourDictionary):
 
     ``M = diag(r) C S^-1`` with ``C = sum_i w_i C_i``, ``r = sum_i w_i r_i``, the response to D65 (green 1), and S from
     linear sRGB to XYZ.
-
-    Attributes:
-        matrices: ``(N, 3, 3)``, rows divided by their sums on use.
-        light: ``(N, 2)`` log of the red and blue multipliers in D65.
-        known: ``(P, N)`` weights of the cameras that the hull was made for. Atoms are the odd ones among them: they
-            make the hull wide, but few cameras are like these.
     """
 
     known: Tensor
@@ -244,11 +232,7 @@ def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
 
 
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, to ``points`` ``(P, D)``.
-
-    Returns:
-        Weights ``(..., P, N)`` on the simplex, and squared distances ``(..., P)``.
-    """
+    """The nearest convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, to ``points`` ``(P, D)``."""
     gram, correlation = atoms @ atoms.mT, points @ atoms.mT
     rate = 1.0 / torch.linalg.eigvalsh(gram)[..., -1:, None]
     weights = torch.full_like(correlation, 1.0 / atoms.shape[-2])
@@ -294,16 +278,7 @@ def extreme_points(points: Tensor) -> Tensor:
 
 
 class CameraSampler:
-    """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU.
-
-    Args:
-        cameras: the colour atoms.
-        tone_atoms: number of tone curves; 0 if the tone is learned.
-        cameras_mixed, tones_mixed: how many cameras and curves are mixed in a draw, at most; drawn with replacement.
-        lights: what the light is drawn from.
-        consistent: gains follow from the camera and its light; otherwise they belong to another draw, as if colour and
-            gains were drawn independently.
-    """
+    """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU."""
 
     def __init__(
         self,
@@ -324,11 +299,7 @@ class CameraSampler:
         self.lights, self.consistent = lights, consistent
 
     def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
-        """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light.
-
-        Raises:
-            ValueError: if no light gives a camera plausible gains.
-        """
+        """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light."""
         weights, balance = self._cameras_in_light(batch, generator)
         if not self.consistent:
             _, balance = self._cameras_in_light(batch, generator)

@@ -49,21 +49,7 @@ CURVE_NODES = 4097
 
 
 class BakedISP(nn.Module):
-    """The reverse pass of an ISP as it is now; later changes of the ISP do not reach it.
-
-    Args:
-        isp: the fitted ISP, its stages in the usual order (any may be left out).
-        nodes: of the table along an axis.
-
-    Raises:
-        ValueError: if the stages are in another order.
-
-    Example:
-        >>> isp = DictionaryISP()
-        >>> baked, srgb = BakedISP(isp), torch.randint(256, (2, 3, 32, 32), dtype=torch.uint8)
-        >>> baked(srgb, baked.choose(srgb)).shape
-        torch.Size([2, 4, 16, 16])
-    """
+    """The reverse pass of an ISP as it is now; later changes of the ISP do not reach it."""
 
     table: Tensor
     attention: Tensor
@@ -91,18 +77,7 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
-        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to clean packed RAW ``(B, 4, H/2, W/2)``, float32.
-
-        Args:
-            srgb: pictures with even sides.
-            params: camera settings.
-            place: ``(B, 4)`` top, left, height, width of the full frames, or ``(B, 5)`` with the view that the crop was
-                turned to (:func:`rawaug.bayer.turn`); untouched full frames by default.
-            white: where the sensor saturates; it does not by default.
-
-        Raises:
-            ValueError: if the shape is not ``(B, 3, H, W)``, a side is odd, or ``params`` are for another batch size.
-        """
+        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to clean packed RAW ``(B, 4, H/2, W/2)``, float32."""
         _require_batch(srgb, params, place)
         return _pass(srgb, self._camera(srgb, params, place), white)
 
@@ -132,22 +107,7 @@ class BakedISP(nn.Module):
 
 
 class FastForward(nn.Module):
-    """The forward pass of an ISP as it is now, after demosaicing; later changes of the ISP do not reach it.
-
-    Args:
-        isp: the fitted ISP, its stages in the usual order (any may be left out).
-        nodes: of the table along an axis, where tone is a network.
-
-    Raises:
-        ValueError: if the stages are in another order.
-
-    Example:
-        >>> isp = DictionaryISP.from_pretrained("universal")
-        >>> develop, raw = FastForward(isp), torch.rand(2, 1, 32, 32)
-        >>> setting = isp.draw_setting(2, torch.Generator().manual_seed(0))
-        >>> develop(demosaic(raw, isp.cfa, "malvar"), setting).shape
-        torch.Size([2, 3, 32, 32])
-    """
+    """The forward pass of an ISP as it is now, after demosaicing; later changes of the ISP do not reach it."""
 
     table: Tensor
     attention: Tensor
@@ -171,14 +131,6 @@ class FastForward(nn.Module):
         Balanced light is clipped at the least gain, where a saturated sensor is neutral, as RAW developers do; the
         ISP's own pass clips sRGB alone, and its saturated highlights are magenta.
         Differentiable with respect to ``linear`` and to the matrix and gains of ``params``.
-
-        Args:
-            linear: demosaiced RAW, black 0 and white 1.
-            params: camera settings.
-            place: as :class:`BakedISP` takes it.
-
-        Raises:
-            ValueError: if the shape is not ``(B, 3, H, W)``, or ``params`` are for another batch size.
         """
         _require_batch(linear, params, place)
         display, linear = self._display(linear, params, place), linear.float()

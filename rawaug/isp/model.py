@@ -160,11 +160,7 @@ class DictionaryISP(StagedISP):
         return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
 
     def _float32(self, like: Tensor) -> torch.autocast:
-        """RAW is float32, in mixed precision too.
-
-        Raises:
-            ValueError: if the ISP is not, or is on another device.
-        """
+        """RAW is float32, in mixed precision too."""
         own = self.gain.log_gains
         if own.dtype != torch.float32:
             raise ValueError(f"RAW is float32, but this ISP was converted to {own.dtype}; call isp.float()")

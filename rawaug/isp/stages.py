@@ -151,13 +151,7 @@ def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
 def place_in_frame(
     height: int, width: int, offset: tuple[int, int] = (0, 0), frame: tuple[int, int] | None = None
 ) -> Tensor:
-    """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame: centre 0, half the diagonal 1.
-
-    Args:
-        height, width: of the crop.
-        offset: (top, left) of the crop in the frame.
-        frame: (height, width) of the frame; the crop itself by default.
-    """
+    """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame: centre 0, half the diagonal 1."""
     full_height, full_width = frame or (height, width)
     half_diagonal = 0.5 * (full_height**2 + full_width**2) ** 0.5
     y = (torch.arange(height, dtype=torch.float32) + (offset[0] + 0.5 - full_height / 2)) / half_diagonal
@@ -225,13 +219,7 @@ class AttentionMask(nn.Module):
 
 
 class Tables(NamedTuple):
-    """What the baked pass looks up, at the nodes of an N x N x N cube.
-
-    Args:
-        cube: ``(1, 3, N, N * N)`` the nodes' colours.
-        x2: ``(1, 3, N, N * N)`` what the stages so far make of them.
-        attention: ``(1, 1, N, N * N)`` a gain for linear colours, or None.
-    """
+    """What the baked pass looks up, at the nodes of an N x N x N cube."""
 
     cube: Tensor
     x2: Tensor
@@ -239,15 +227,7 @@ class Tables(NamedTuple):
 
 
 class BatchParams(NamedTuple):
-    """What the baked pass takes from the settings of a batch.
-
-    Args:
-        matrix: ``(B, 3, 3)`` x2 to x3.
-        floor: ``(B, 1, 3)`` one over the gains.
-        frame: ``(B, 6)`` see :class:`rawaug.kernels.reference.Camera`.
-        curves: ``(B, 1021)`` x to x2, in place of the table; or ``(B, 0)``.
-        shading: ``(3,)`` of the mask ``2^-(a y^2 + b x y + c x^2)``, or empty.
-    """
+    """What the baked pass takes from the settings of a batch."""
 
     matrix: Tensor
     floor: Tensor
@@ -273,13 +253,7 @@ class Stage(nn.Module, ABC):
 
     @abstractmethod
     def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        """``x_(k-1)`` to ``x_k``.
-
-        Args:
-            x: the image.
-            params: the pictures' settings; None where the setting is not chosen yet, for stages up to x2.
-            place: coordinates in the full frame ``(1 or B, 2, H, W)``; ``x`` is a full frame by default.
-        """
+        """``x_(k-1)`` to ``x_k``."""
 
     @abstractmethod
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:

@@ -52,15 +52,7 @@ def tone_names() -> list[str]:
 
 
 def tone_tables(names: Sequence[str] | None = None) -> Tensor:
-    """Tables ``(K, 1021)`` float32 from 0 to 1, not decreasing; all curves by default.
-
-    Raises:
-        ValueError: if a name is unknown.
-
-    Example:
-        >>> round(tone_tables(["linear"])[0, 128 * STEPS].item(), 4)
-        0.2159
-    """
+    """Tables ``(K, 1021)`` float32 from 0 to 1, not decreasing; all curves by default."""
     tables = _tables()
     unknown = [name for name in names or () if name not in tables]
     if unknown:
@@ -117,12 +109,7 @@ def _inverse(curve: Callable[[np.ndarray], np.ndarray], display: Tensor) -> Tens
 
 
 class ToneDictionary(nn.Module):
-    """K inverse tone curves, sRGB code to linear light; at first all are the curve of sRGB itself.
-
-    Attributes:
-        curves: ``(K, 1021)`` tables, not decreasing, from 0 to 1.
-        typical: ``(K,)`` weights where nothing is known of the picture.
-    """
+    """K inverse tone curves, sRGB code to linear light; at first all are the curve of sRGB itself."""
 
     curves: Tensor
     typical: Tensor

@@ -50,13 +50,7 @@ class Choice(NamedTuple):
 
 
 def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_atoms: int = 16) -> DictionaryISP:
-    """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB.
-
-    Args:
-        colour_atoms: N, cameras.
-        tone_atoms: K, curves; all that are published by default.
-        gain_atoms: M.
-    """
+    """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB."""
     cameras, names, tables = published_cameras(), tone_names(), tone_tables()
     distinct = cameras.distinct()
     points = camera_points(distinct)
@@ -97,16 +91,7 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
 
 @torch.no_grad()
 def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones.
-
-    Raises:
-        ValueError: if one is not listed, or the ISP's atoms are no cameras.
-
-    Example:
-        >>> universal = DictionaryISP.from_pretrained("universal")
-        >>> len(of_cameras(universal, "Nikon D750").colour.atoms())
-        1
-    """
+    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones."""
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
     listed = published_cameras()

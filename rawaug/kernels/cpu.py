@@ -434,15 +434,7 @@ def _small_rows(srgb, rows, columns, table, x2, start, stop):  # type: ignore[no
 def shot_read(
     clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Noisy RAW and its variance map, float32 ``(B, 4, h, w)`` on the CPU.
-
-    Args:
-        clean: float32 ``(B, 4, h, w)`` on the CPU.
-        levels: ``(B, 2)`` shot_var and read_var.
-        keys: one per picture, below 2^64.
-        white: where the noisy signal is clipped; infinity for nowhere.
-        with_variance: without it, the second result is empty.
-    """
+    """Noisy RAW and its variance map, float32 ``(B, 4, h, w)`` on the CPU."""
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
     signal, out = clean.detach().contiguous().numpy(), noisy.numpy()

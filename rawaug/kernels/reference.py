@@ -62,14 +62,7 @@ class Camera(NamedTuple):
 
 
 def frame_of(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
-    """One row of :attr:`Camera.frame`.
-
-    Args:
-        place: top, left, height, width of the full frame, the view in which the crop was turned, and how many rows
-            were enlarged to it (neither if left out).
-        height, width: of the picture as it is, turned.
-        centre: y and x of the mask's centre in the coordinates of :func:`rawaug.isp.stages.place_in_frame`.
-    """
+    """One row of :attr:`Camera.frame`."""
     top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
     step = rows / height if rows else 1.0
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
@@ -127,16 +120,7 @@ def _take(curves: Tensor, index: Tensor) -> Tensor:
 
 
 class Display(NamedTuple):
-    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures.
-
-    Args:
-        table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
-        curves: ``(B, T)`` sRGB code over the root of x2, one curve a picture for all of its channels; or empty.
-        attention: of the same form as ``table``, a gain in the first of the four over the cube of x5; or empty.
-        matrix: ``(B, 3, 3)`` x3 to x2.
-        gains: ``(B, 4)`` of R, G and B, then the least of them.
-        frame, shading: as of :class:`Camera`.
-    """
+    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures."""
 
     table: Tensor
     curves: Tensor
@@ -202,12 +186,7 @@ def _fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Te
 
 
 def words(key: int, counters: Tensor) -> Tensor:
-    """Philox4x32-10 of int64 ``counters`` ``(n,)`` below 2^32, under a key below 2^64: int64 ``(4, n)`` below 2^32.
-
-    Example:
-        >>> [hex(word) for word in words(0, torch.zeros(1, dtype=torch.int64))[:, 0].tolist()]
-        ['0x6627e8d5', '0xe169c58d', '0xbc57ac4c', '0x9b00dbd8']
-    """
+    """Philox4x32-10 of int64 ``counters`` ``(n,)`` below 2^32, under a key below 2^64: int64 ``(4, n)`` below 2^32."""
     zero = torch.zeros_like(counters)
     a, b, c, d = counters, zero, zero, zero
     low, high = key & _LOW, key >> 32

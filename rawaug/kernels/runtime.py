@@ -28,23 +28,7 @@ KINDS = ("auto", "cpu", "cuda", "gpu", "mps")
 
 
 def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
-    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``.
-
-    Args:
-        name: of the device.
-        key: starts the error messages.
-        count: how many such devices are needed.
-
-    Raises:
-        ValueError: if the name is unknown, or this machine does not have that many.
-
-    Example:
-        >>> find_device("cpu")
-        device(type='cpu')
-        >>> find_device("cdua")
-        Traceback (most recent call last):
-        ValueError: device 'cdua' is unknown; use one of auto, cpu, cuda, gpu, mps (nearest: cuda)
-    """
+    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``."""
     kind, _, number = name.partition(":")
     if kind not in KINDS or (number and not number.isdigit()):
         raise ValueError(f"{key} {name!r} is unknown; use one of {', '.join(KINDS)}{nearest(kind, KINDS)}")
@@ -59,13 +43,7 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch's CPU loops use one thread within this block, or within the decorated function.
-
-    Example:
-        >>> with one_thread():
-        ...     torch.get_num_threads()
-        1
-    """
+    """PyTorch's CPU loops use one thread within this block, or within the decorated function."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -137,13 +115,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
-    """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on ``torch.get_num_threads()`` threads.
-
-    Example:
-        >>> done = []
-        >>> over_rows(3, 4, lambda start, stop: done.extend(range(start, stop)))
-        >>> done
-        [0, 1, 2]
+    """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on ``torch.get_num_threads()``
+    threads.
     """
     threads = torch.get_num_threads()
     pieces = min(threads * _PIECES, rows, rows * width // _GRAIN)

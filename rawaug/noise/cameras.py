@@ -72,15 +72,7 @@ READ_ON_MOSAIC = 6.2
 
 
 class Profiles(NamedTuple):
-    """The usable rows of darktable's N cameras.
-
-    Args:
-        names: maker and model.
-        table: ``(3, N, R)`` float64, logarithms of ISO, shot_var and read_var, ISO increasing and then infinite.
-        rows: ``(N,)`` number of each camera's rows.
-        rows_left_out: number of rows with a variance that is not positive.
-        cameras_left_out: cameras with no other row.
-    """
+    """The usable rows of darktable's N cameras."""
 
     names: tuple[str, ...]
     table: Tensor
@@ -125,25 +117,7 @@ def profile_names() -> list[str]:
 
 
 class ProfileLevels:
-    """Levels of one camera, or of any, each weighted alike.
-
-    Args:
-        camera: maker and model, whatever the case of the letters, or ``"any camera"``.
-        iso: one ISO, limits, or None for the whole profile. Of ``"any camera"``, whose profiles end at different ISOs,
-            every camera keeps its share of the limits; one without a share is not drawn.
-
-    Attributes:
-        cameras: indices into :func:`published_profiles` of those that are drawn, ``(M,)``.
-        limits: logarithms of their lowest and highest ISO, ``(M, 2)``.
-
-    Raises:
-        ValueError: if the camera is unknown, or the ISO outside what was measured.
-
-    Example:
-        >>> shot_var, read_var = ProfileLevels("Sony ILCE-7M3", iso=800).sample(1, torch.Generator())
-        >>> round(shot_var.item(), 7)
-        6.72e-05
-    """
+    """Levels of one camera, or of any, each weighted alike."""
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
         profiles = published_profiles()

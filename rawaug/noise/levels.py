@@ -80,15 +80,7 @@ class FixedLevels:
 
 
 class MixedLevels:
-    """Levels of a random one of several laws, each picture's own; all weighted alike.
-
-    Example:
-        >>> shot_var, read_var = MixedLevels([FixedLevels(1e-3, 0.0), FixedLevels(2e-3, 0.0)]).sample(
-        ...     8, torch.Generator().manual_seed(0)
-        ... )
-        >>> sorted(set(shot_var.tolist())) == torch.tensor([1e-3, 2e-3]).tolist()
-        True
-    """
+    """Levels of a random one of several laws, each picture's own; all weighted alike."""
 
     def __init__(self, laws: Sequence[NoiseLevels]) -> None:
         if not laws:
@@ -132,11 +124,7 @@ Iso = float | tuple[float, float] | None
 
 
 def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[float, float]:
-    """The limits of the draw that ``iso`` asks for.
-
-    Raises:
-        ValueError: if they leave the measured range.
-    """
+    """The limits of the draw that ``iso`` asks for."""
     if iso is None:
         return measured
     low, high = (iso, iso) if isinstance(iso, (int, float)) else (iso[0], iso[1])

@@ -126,15 +126,7 @@ def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, confi
 
 
 class MadeCrops:
-    """Crops of pictures, turned at random, made RAW by any function.
-
-    Args:
-        pictures: ``(3, H, W)`` uint8.
-        make: sRGB ``(1, 3, h, w)`` in [0, 1] and a generator to the mosaic ``(1, 1, h, w)``.
-        cfa: of that mosaic.
-        noise: drawn anew for every crop.
-        crop: side, even.
-    """
+    """Crops of pictures, turned at random, made RAW by any function."""
 
     def __init__(
         self,

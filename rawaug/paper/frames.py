@@ -39,17 +39,7 @@ LUMA = (0.2126, 0.7152, 0.0722)
 
 
 def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
-    """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own.
-
-    Args:
-        pictures: uint8 ``(3, H, W)``, at least as large as a frame; larger ones are averaged down.
-        cameras: names, as :func:`rawaug.isp.cameras.published_cameras` has them.
-        seed: of lights, exposures and crops.
-        part: begins the frames' names, and keys their draws.
-
-    Raises:
-        ValueError: if a camera is not published, or a picture is smaller than a frame.
-    """
+    """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own."""
     published = published_cameras()
     matrices = published.named(cameras)
     frames = []

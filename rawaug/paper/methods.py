@@ -64,13 +64,7 @@ Maker = Callable[[Tensor, Tensor], Tensor]
 
 
 class Fitted(NamedTuple):
-    """A fitted family.
-
-    Args:
-        model: what was fitted.
-        seconds: that it took, reading not counted.
-        parameters: of its reverse pass.
-    """
+    """A fitted family."""
 
     model: ReverseISP
     seconds: float
@@ -233,11 +227,7 @@ PARTS = 3
 
 @torch.no_grad()
 def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float:
-    """Mean over the pieces; ``make`` maps sRGB ``(1, 3, h, w)`` and its place in the frame to RAW ``(1, 1, h, w)``.
-
-    Raises:
-        ValueError: if the pair is not registered pixel by pixel.
-    """
+    """Mean over the pieces; ``make`` maps sRGB ``(1, 3, h, w)`` and its place in the frame to RAW ``(1, 1, h, w)``."""
     if not pair.registered:
         raise ValueError(f"{pair.name}: is not registered pixel by pixel, so it has no balanced PSNR")
     height, width = pair.raw.shape[-2:]

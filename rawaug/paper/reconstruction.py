@@ -173,12 +173,7 @@ def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[s
 
 
 class PreparedComparison:
-    """A comparison whose data are open and checked; nothing is written yet.
-
-    Args:
-        settings: of the comparison.
-        overwrite: it may replace another of its name.
-    """
+    """A comparison whose data are open and checked; nothing is written yet."""
 
     def __init__(self, settings: Comparison, overwrite: bool = False) -> None:
         require_free(settings, overwrite)

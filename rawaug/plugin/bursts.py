@@ -19,16 +19,7 @@ from rawaug.noise.models import new_seeds
 
 
 class Burst:
-    """How many frames there are, and how they move.
-
-    Args:
-        frames: N, at least 1.
-        motion: largest shift along each axis in pixels, and largest rotation in degrees, both drawn uniformly.
-        stops: exposure of each frame relative to the first's setting, for brackets; all alike by default.
-
-    Raises:
-        ValueError: if a setting is out of range, or the stops are not N.
-    """
+    """How many frames there are, and how they move."""
 
     def __init__(self, frames: int, motion: tuple[float, float], stops: Sequence[float] | None) -> None:
         if not isinstance(frames, int) or frames < 1:

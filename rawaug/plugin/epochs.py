@@ -117,11 +117,6 @@ class Visits(_Epochs):
     A pass that is broken off counts what its workers had fetched ahead. A picture drawn with replacement counts each
     time, in the order in which workers come to it. Distributed processes take turns with a picture, so counted draws
     also have the rank as a key.
-
-    Example:
-        >>> visits = Visits(3)
-        >>> [visits.key(i) for i in (0, 1, 0)]
-        [(0, 0), (0, 1), (1, 0)]
     """
 
     def __init__(self, size: int) -> None:
@@ -165,11 +160,6 @@ class Passes(_Epochs):
 
     Worker w of W counts in row W, column w; row 0 is the main process. Passes with another number of workers are those
     that their first worker has begun.
-
-    Example:
-        >>> passes = Passes()
-        >>> [passes.begin(0, 0), passes.begin(2, 0), passes.begin(2, 1), passes.begin(0, 0)]
-        [(0, 0), (1, 0), (1, 0), (2, 0)]
     """
 
     def __init__(self) -> None:

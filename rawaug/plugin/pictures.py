@@ -32,10 +32,6 @@ def to_rgb_tensor(picture: Any) -> Tensor:
     The axis of 1, 3 or 4 is taken for the channels; where both ends could be, the first of a tensor and the last of an
     array. 8 bits and floats keep their values. Floats may pass half an 8-bit level beyond [0, 1], as resizing leaves
     them; they are looked at on the CPU only, elsewhere that would stall the device.
-
-    Raises:
-        ValueError: if the shape is not that of a picture, the type is another, the values leave [0, 1], or a PIL
-            picture is in CMYK, CIELAB, HSV or 32-bit integers.
     """
     image = _as_tensor(picture)
     if image.ndim == 2:
@@ -46,11 +42,7 @@ def to_rgb_tensor(picture: Any) -> Tensor:
 
 
 def to_rgb_batch(pictures: Any) -> Tensor:
-    """A batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one.
-
-    Raises:
-        ValueError: as :func:`to_rgb_tensor`, and if listed pictures differ in size.
-    """
+    """A batch to ``(B, 3, H, W)``, uint8 or float32; a single picture is a batch of one."""
     if is_picture(pictures):
         return to_rgb_tensor(pictures)[None]
     if isinstance(pictures, Sequence):
@@ -94,9 +86,6 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
 
     Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first. A batch that is a list of
     pictures is not taken apart.
-
-    Raises:
-        ValueError: if a mapping has no such key, or nothing could have it.
     """
     if isinstance(sample, Mapping):
         if key not in sample:

@@ -20,23 +20,7 @@ def draw_key(seed: int, name: str, number: int) -> torch.Generator:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them.
-
-    Args:
-        isp: ISP file, or the name of a shipped ISP.
-        camera: maker and model of a published camera, in place of the ISP's cameras.
-        light: colour temperature in kelvin, or a lamp such as LED-B3 or FL11.
-        tone: one tone curve of the ISP, by name (rawaug info lists them).
-        exposure: fixed exposure in stops, instead of a draw from the ISP's range.
-        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
-        iso: ISO of a measured camera's noise, instead of a draw from its measured range.
-        sampling: how camera settings are drawn.
-        cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
-
-    Example:
-        >>> Drawing(camera="Nikon D750", light=5500, noise="Nikon D750", iso=800).make().light
-        5500
-    """
+    """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them."""
 
     isp: str = "universal"
     camera: str | None = None
@@ -50,11 +34,7 @@ class Drawing:
 
     @property
     def noise_spec(self) -> Spec | Sequence[float]:
-        """Noise and ISO, as :func:`rawaug.noise.noise_model` takes them.
-
-        Raises:
-            ValueError: if the noise is not that of a measured camera, and an ISO is given.
-        """
+        """Noise and ISO, as :func:`rawaug.noise.noise_model` takes them."""
         if self.iso is None:
             return self.noise if isinstance(self.noise, str) else tuple(self.noise)
         if not isinstance(self.noise, str) or self.noise == "camera":
@@ -75,11 +55,7 @@ class Drawing:
         return {**{key: value for key, value in made_for.items() if value is not None}, **self.draws()}
 
     def make(self) -> RawAugment:
-        """The augmentation.
-
-        Raises:
-            FileNotFoundError, ValueError: as :meth:`rawaug.RawAugment.from_pretrained`.
-        """
+        """The augmentation."""
         return RawAugment.from_pretrained(self.isp, **self.arguments())
 
     def stored(self) -> dict[str, Any]:

@@ -54,29 +54,14 @@ class MeasuredFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """What was measured.
-
-    Attributes:
-        law: the levels over ISO.
-        estimates: the line and points of each ISO; None is the ISO of files without one.
-    """
+    """What was measured."""
 
     law: MeasuredLevels
     estimates: dict[float | None, NoiseEstimate]
 
 
 def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
-    """(shot_var, read_var) of one camera at each ISO of its files, with the measured points.
-
-    Args:
-        pairs: frames of one camera; at most :data:`MOST_FRAMES` are used, evenly spaced. Of
-            :class:`rawaug.data.folders.Readable` those that cannot be read are left out.
-        dark: folder of dark frames of the same ISO values to measure the read variance.
-
-    Raises:
-        ValueError: if the frames are of several cameras or only some have an ISO, an ISO has too few flat regions or
-            follows no line, or the dark frames lack an ISO or are clipped at black.
-    """
+    """(shot_var, read_var) of one camera at each ISO of its files, with the measured points."""
     by_iso = _by_iso(_frames(pairs))
     dark_by_iso = None if dark is None else _by_iso(_frames(RawFolder(dark)))
     estimates = {iso: _measured(iso, frames, dark_by_iso) for iso, frames in by_iso.items()}

@@ -99,17 +99,6 @@ def weights_key(network: DenoiserConfig, config: TrainConfig, samples: Any, vali
     """What the weights of a training depend on, as a short hash: files with this key need no new training.
 
     The device and the number of processes are no part of it, nor is anything that is used after the training.
-
-    Args:
-        network, config: what is trained, and how.
-        samples: identifies the training samples, as a value that JSON can hold.
-        validation: identifies the frames by which weights are chosen; None if those of the end are kept, which makes
-            ``validate_every`` irrelevant too.
-
-    Example:
-        >>> few, more = TrainConfig(workers=0), TrainConfig(workers=8)
-        >>> weights_key(DenoiserConfig(), few, "demo", None) == weights_key(DenoiserConfig(), more, "demo", None)
-        True
     """
     left_out = SAME_WEIGHTS if validation is not None else SAME_WEIGHTS | {"validate_every"}
     settings = {key: value for key, value in asdict(config).items() if key not in left_out}

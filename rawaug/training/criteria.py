@@ -94,10 +94,8 @@ WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
 
 
 def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
-    """``loss`` with light and shade weighed as ``weigh`` says, for the noise of ``sample``'s pictures ``(B, 4, h, w)``.
-
-    Raises:
-        ValueError: if there is no such weighing.
+    """``loss`` with light and shade weighed as ``weigh`` says, for the noise of ``sample``'s pictures ``(B, 4, h,
+    w)``.
     """
     if weigh not in WEIGHINGS:
         raise ValueError(f"train.weigh {weigh!r} is unknown; use one of {', '.join(WEIGHINGS)}")

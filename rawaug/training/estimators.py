@@ -65,14 +65,7 @@ class Supervised:
 
 
 class NoisyCrop(NamedTuple):
-    """What is known of one scene.
-
-    Args:
-        shots: packed noisy crops ``(K, 4, h, w)`` of it.
-        signal: the scene without noise ``(4, h, w)``, known or estimated; the first shot for an estimator whose
-            ``adds_noise`` is False.
-        shot_var, read_var: the levels of the noise.
-    """
+    """What is known of one scene."""
 
     shots: Tensor
     signal: Tensor
@@ -90,12 +83,7 @@ class NoisyCrop(NamedTuple):
 
 
 class SelfSupervised(Supervised, ABC):
-    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
-
-    Attributes:
-        shots: how many noisy frames of one scene it needs.
-        adds_noise: whether it uses a crop's ``signal``, which has to be estimated for a real frame.
-    """
+    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames."""
 
     shots: ClassVar[int] = 1
     adds_noise: ClassVar[bool] = False
@@ -196,12 +184,7 @@ class Noise2Noise(SelfSupervised):
 
 
 class NeighborSample(NamedTuple):
-    """A noisy frame and, for each 2 x 2 cell of a plane, which two neighbours make the pair.
-
-    Args:
-        noisy, variance: packed ``(4, h, w)``, in a batch ``(B, 4, h, w)``.
-        choice: ``(1, h/2, w/2)`` from 0 to 7, see :data:`NEIGHBOURS`.
-    """
+    """A noisy frame and, for each 2 x 2 cell of a plane, which two neighbours make the pair."""
 
     noisy: Tensor
     variance: Tensor

@@ -163,12 +163,7 @@ def _status(row: dict[str, float], kept: int) -> str:
 
 
 def require_trainable(device: str, devices: int, precision: str) -> None:
-    """Check a training's libraries, device and precision before any work.
-
-    Raises:
-        MissingExtra: if a library of the extra ``train`` is not installed.
-        ValueError: if device or precision is unknown or absent, or the device is one GPU by number.
-    """
+    """Check a training's libraries, device and precision before any work."""
     with extra("train"):
         for name in ("torch.utils.tensorboard.writer", "matplotlib", "skimage", "PIL"):
             import_module(name)

@@ -36,11 +36,7 @@ from rawaug.training.stream import turned_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
-    """The signal of a mosaic ``(1, H, W)``; the mosaic itself without shot noise, where the variance needs no signal.
-
-    Raises:
-        ImportError: if scikit-image is not installed.
-    """
+    """The signal of a mosaic ``(1, H, W)``; the mosaic itself without shot noise, where the variance needs no signal."""
     if not shot_var > 0:
         return noisy
     packed = bayer.pack(noisy[None], cfa)
@@ -54,15 +50,7 @@ CACHED = 64
 
 @dataclass(frozen=True, eq=False)
 class NoisyFrame:
-    """One scene.
-
-    Args:
-        name: for reports.
-        shots: noisy mosaics of it ``(K, H, W)``.
-        shot_var, read_var: the levels of their noise.
-        cfa: their pattern.
-        clean: the scene without noise ``(1, H, W)``, where it was made from a picture; None for a real frame.
-    """
+    """One scene."""
 
     name: str
     shots: Tensor
@@ -95,15 +83,7 @@ def noisy_only(pair: Pair) -> Pair:
 
 
 def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float]:
-    """(shot_var, read_var) of a real noisy frame.
-
-    Args:
-        pair: as :func:`noisy_only` leaves it.
-        camera: the noise law of the camera as its ISP's file holds it, for pairs without levels of their own.
-
-    Raises:
-        ValueError: if the levels are unknown, or the law does not reach the pair's ISO.
-    """
+    """(shot_var, read_var) of a real noisy frame."""
     if pair.shot_var is not None and pair.read_var is not None:
         return pair.shot_var, pair.read_var
     if camera is None:
@@ -120,17 +100,7 @@ def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
 
 
 class FrozenPictures(Sequence[NoisyFrame]):
-    """sRGB pictures as noisy RAW frames that never change.
-
-    Args:
-        pictures: a Dataset of pictures.
-        augment: the camera and its noise.
-        seed: with a picture's index it determines the picture's frame.
-        shots: noisy frames of each scene, of independent noise.
-
-    Raises:
-        ValueError: if the noise is not of the shot and read kind, whose levels the estimators need.
-    """
+    """sRGB pictures as noisy RAW frames that never change."""
 
     def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
         if not isinstance(augment.noise, ShotReadModel):
@@ -167,9 +137,6 @@ class NoisyCrops:
     """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
 
     Where the estimator adds noise, the signal of real frames is estimated here, before processes share them.
-
-    Raises:
-        ValueError: if a real frame is smaller than the crop, or has fewer shots than the estimator needs.
     """
 
     def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:

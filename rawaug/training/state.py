@@ -38,11 +38,7 @@ class Start(NamedTuple):
 
 
 def start_of(config: DenoiserConfig) -> Start | None:
-    """What ``config.start`` names; None if the training starts from nothing.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such denoiser, or the file is not one.
-    """
+    """What ``config.start`` names; None if the training starts from nothing."""
     if config.start is None:
         return None
     path = find(config.start)
@@ -50,16 +46,7 @@ def start_of(config: DenoiserConfig) -> Start | None:
 
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
-    """The network before its first step, in train mode.
-
-    Args:
-        config: with ``start``, name and settings may be left at their defaults: the file's are taken.
-        seed: draws the weights of a network without ``start``.
-
-    Raises:
-        FileNotFoundError: if there is no such denoiser.
-        ValueError: if name or settings are unknown, or differ from those of the file.
-    """
+    """The network before its first step, in train mode."""
     if config.start is None:
         drawn = {"seed": derived_seed(seed, "network") % 2**31, **config.settings}
         return denoisers.build(config.name, **drawn)
@@ -77,13 +64,7 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
 
 
 class TrainingState:
-    """A network in training, with the running average of its weights, Adam and the schedule of its rate.
-
-    Attributes:
-        step: steps already taken.
-        losses: sum and number of the losses not yet logged.
-        best: validation PSNR, step and weights of the average that is kept.
-    """
+    """A network in training, with the running average of its weights, Adam and the schedule of its rate."""
 
     def __init__(self, net: Denoiser, config: TrainConfig) -> None:
         self.net, self.config, self.step = net, config, 0
@@ -104,11 +85,7 @@ class TrainingState:
         return {"net": self.net, "average": self.average, "optimiser": self.optimiser, "schedule": self.schedule}
 
     def load(self, path: Path, key: str) -> None:
-        """Resume from the checkpoint at ``path``, if there is one that was saved with the same ``key``.
-
-        Raises:
-            ValueError: if it is damaged.
-        """
+        """Resume from the checkpoint at ``path``, if there is one that was saved with the same ``key``."""
         if not path.is_file():
             return
         try:
@@ -132,11 +109,7 @@ class TrainingState:
             partial.write_bytes(content.getbuffer())
 
     def place(self, fabric: Any) -> Any:
-        """Move it to Fabric's device.
-
-        Returns:
-            The network as a step calls it.
-        """
+        """Move it to Fabric's device."""
         placed = fabric.setup(self.net.to(memory_format=self.layout), self.optimiser)  # type: ignore[call-overload]
         self.fabric, (self.model, self.optimiser) = fabric, placed
         self.average.to(fabric.device)
@@ -144,11 +117,7 @@ class TrainingState:
         return torch.compile(self.model) if self.config.compile else self.model
 
     def update(self, loss: Tensor) -> float:
-        """Take a step down the gradient of ``loss``.
-
-        Returns:
-            Its learning rate.
-        """
+        """Take a step down the gradient of ``loss``."""
         self.optimiser.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
         if self.config.clip_norm:
@@ -176,11 +145,7 @@ class TrainingState:
             self.best = {"psnr": score, "step": self.step, "net": copy.deepcopy(self.averaged.state_dict())}
 
     def kept(self, label: str) -> Any:
-        """The network with the weights that are kept, on the CPU.
-
-        Raises:
-            ValueError: if no score was a number; ``label`` opens the message.
-        """
+        """The network with the weights that are kept, on the CPU."""
         if not math.isfinite(self.best["psnr"]):
             raise ValueError(f"{label}: diverged, every validation score is NaN; lower train.learning_rate")
         self.averaged.load_state_dict(self.best["net"])

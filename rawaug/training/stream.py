@@ -30,14 +30,7 @@ class Source(Protocol):
 
 
 class RealCrops:
-    """Crops of real RAW pairs, in eight turns that keep the CFA.
-
-    Args:
-        pairs: the frames; kept in memory. All are brought to ``cfa`` by leaving out a first row or column.
-        noise: drawn anew for every crop of a frame without a noisy capture; a capture's own noise is never renewed.
-        crop: side in mosaic pixels, even.
-        cfa: the pattern that the network is trained for.
-    """
+    """Crops of real RAW pairs, in eight turns that keep the CFA."""
 
     def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
         self.pairs = [pair.with_levels() for pair in pairs]
@@ -94,15 +87,7 @@ def turned_crop(mosaics: Sequence[Tensor], crop: int, cfa: CFA, generator: torch
 
 
 class TrainingStream(Dataset[Any]):
-    """Sample i of an arm: the first ``augmented`` of every batch from pictures, the rest real.
-
-    Args:
-        real: crops of the few frames; may be None if everything is augmented.
-        pictures: crops from sRGB pictures, or the RawPairs of these; may be None if nothing is augmented.
-        batch: samples in a step.
-        augmented: share from pictures.
-        seed: of all samples.
-    """
+    """Sample i of an arm: the first ``augmented`` of every batch from pictures, the rest real."""
 
     def __init__(
         self, real: Source | None, pictures: Source | RawPairs | None, batch: int, augmented: float, seed: int

@@ -25,12 +25,7 @@ PANEL = 96
 
 
 class Watched(NamedTuple):
-    """A frozen frame.
-
-    Args:
-        noisy, clean, variance: packed RAW ``(1, 4, h, w)``.
-        develop: packed RAW to sRGB ``(3, 2h, 2w)``, where the camera is known.
-    """
+    """A frozen frame."""
 
     noisy: Tensor
     clean: Tensor

@@ -126,19 +126,7 @@ class BestScore(NamedTuple):
 
 
 class Descent:
-    """Runs the stages of a fit.
-
-    Args:
-        path: where the state is kept between runs; None keeps none.
-        key: what the state belongs to; a file with another key is not used.
-        seed: of what the steps draw.
-        progress: show progress bars.
-        report_steps: a stage reports, and is watched, this often.
-        save_seconds: between two writes of the state.
-
-    Attributes:
-        watched: what the watched stages scored, by name.
-    """
+    """Runs the stages of a fit."""
 
     def __init__(
         self,
@@ -167,18 +155,7 @@ class Descent:
         report: Callable[[], str] | None = None,
         watch: Callable[[], float] | None = None,
     ) -> None:
-        """Minimise ``loss`` over ``tensors`` in place, from where a stopped run left off.
-
-        Args:
-            stage: its name, in the file and on the progress bar.
-            loss: of one step, given the step's generator.
-            tensors: what is optimised.
-            steps: of Adam.
-            learning_rate: at the start; falls to 0 by half a cosine.
-            report: called every ``report_steps`` steps and after the last; its text goes to the progress bar, after the
-                mean loss.
-            watch: a score, taken at the start and as often; the tensors come back that had the highest.
-        """
+        """Minimise ``loss`` over ``tensors`` in place, from where a stopped run left off."""
         start, state = self._restored(stage, tensors)
         if watch is not None and stage not in self.watched:
             self._note(stage, 0, watch(), tensors)

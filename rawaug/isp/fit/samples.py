@@ -54,12 +54,7 @@ class FramePair(Protocol):
 
 
 class FrameSummary(NamedTuple):
-    """What is kept of a frame besides its pixels.
-
-    Args:
-        srgb, raw: thumbnails ``(1, 3, h, w)``, the longer side :data:`rawaug.isp.staged.THUMBNAIL` at most; the RAW is
-            not white-balanced.
-    """
+    """What is kept of a frame besides its pixels."""
 
     name: str
     camera: str
@@ -71,17 +66,7 @@ class FrameSummary(NamedTuple):
 
 
 class PixelSamples(NamedTuple):
-    """F frames of P pixels each.
-
-    Args:
-        srgb: ``(F, 3, 1, P)`` in [0, 1].
-        target: ``(F, 3, 1, P)`` RAW readings, 0 where the mosaic has another colour.
-        site: ``(F, 3, 1, P)`` 1 where there is a reading.
-        known: ``(F, 3, 1, P)`` 1 where the reading is there and neither it nor the sRGB pixel is clipped, else 0.
-        place: ``(F, 2, 1, P)`` coordinates in the full frame.
-        cell_srgb, cell_raw: ``(F, 3, 1, P)`` averages over the cell.
-        cell_weight: ``(F, 1, 1, P)`` low where the cell is not flat, 0 where it is clipped.
-    """
+    """F frames of P pixels each."""
 
     srgb: Tensor
     target: Tensor
@@ -100,11 +85,7 @@ class PixelSamples(NamedTuple):
 def sample_pixels(
     pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False
 ) -> tuple[PixelSamples, list[FrameSummary]]:
-    """Draw ``pixels`` from each frame with replacement, keyed by ``seed`` and its name; the frames are read once.
-
-    Raises:
-        ValueError: if there is no pair, a frame's colours are unknown, or ``noisy`` is given and it has no noisy RAW.
-    """
+    """Draw ``pixels`` from each frame with replacement, keyed by ``seed`` and its name; the frames are read once."""
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")

@@ -70,11 +70,7 @@ class FrameColour:
 
 
 class Tie:
-    """What draws the frames of one camera together.
-
-    Args:
-        shots: the frames, in order.
-    """
+    """What draws the frames of one camera together."""
 
     def __init__(self, shots: Sequence[FrameSummary]) -> None:
         cameras = [shot.camera for shot in shots]

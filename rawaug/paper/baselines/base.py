@@ -86,13 +86,7 @@ class BaselineISP(ReverseISP):
 
 
 class Crops(NamedTuple):
-    """A training batch, in the CFA of the model that is trained.
-
-    Args:
-        srgb: ``(B, 3, h, w)`` in [0, 1].
-        raw: ``(B, 1, h, w)``.
-        white_balance: ``(B, 3)`` as-shot multipliers, green 1.
-    """
+    """A training batch, in the CFA of the model that is trained."""
 
     srgb: Tensor
     raw: Tensor

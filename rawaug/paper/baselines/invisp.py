@@ -47,12 +47,7 @@ class DenseBlock(nn.Module):
 
 
 class InvertibleBlock(nn.Module):
-    """An invertible 1 x 1 convolution, then an affine coupling of one channel with two.
-
-    Args:
-        growth: of the dense blocks.
-        shift: the convolution starts as this cyclic exchange of the channels.
-    """
+    """An invertible 1 x 1 convolution, then an affine coupling of one channel with two."""
 
     def __init__(self, growth: int, shift: int) -> None:
         super().__init__()

@@ -49,12 +49,7 @@ RED, BLUE = (1.9, 2.4), (1.5, 1.9)
 
 
 class UPIParams(NamedTuple):
-    """One camera setting a picture; replays a pass.
-
-    Args:
-        matrix: ``(B, 3, 3)`` linear sRGB to camera, rows of sum 1.
-        gains: ``(B, 3)`` digital gain times white balance, forward direction.
-    """
+    """One camera setting a picture; replays a pass."""
 
     matrix: Tensor
     gains: Tensor
@@ -220,13 +215,7 @@ class TunedUPI(SmoothstepISP):
 
 
 class Moments(NamedTuple):
-    """What the frames' squared errors depend on, in double precision, as means over each frame's known readings.
-
-    Args:
-        a: ``(F, 3, 3, 3)`` channel by channel, of linear sRGB with itself.
-        b: ``(F, 3, 3)`` of linear sRGB with the readings.
-        energy: ``(F,)`` of the readings.
-    """
+    """What the frames' squared errors depend on, in double precision, as means over each frame's known readings."""
 
     a: Tensor
     b: Tensor
