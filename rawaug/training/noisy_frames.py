@@ -36,7 +36,7 @@ from rawaug.training.stream import turned_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
-    """The signal of a mosaic ``(1, H, W)``; the mosaic itself without shot noise, where the variance needs no signal."""
+    """The signal of a mosaic ``(1, H, W)``; the mosaic itself where there is no shot noise to know it for."""
     if not shot_var > 0:
         return noisy
     packed = bayer.pack(noisy[None], cfa)

@@ -203,7 +203,7 @@ def test_replay_wants_what_the_pair_was_made_of(tmp_path: Path, pictures: Path) 
 
 def test_the_first_pair_that_is_not_finite_ends_the_run(tmp_path: Path, pictures: Path) -> None:
     isp = DictionaryISP.from_pretrained("universal")
-    isp.colour.known.fill_(3e38)
+    isp.get_buffer("colour.known").fill_(3e38)
     isp.save(tmp_path / "absurd.safetensors")
     with pytest.raises(ValueError, match="not finite: the ISP's weights are damaged"):
         synth(pictures, tmp_path / "out", format="npz", isp=str(tmp_path / "absurd.safetensors"), workers=0)
