@@ -48,7 +48,8 @@ def no_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "MPLCONFIGDIR"):
             patch.delenv(name, raising=False)
-        for name, value in {"HOME": home, "USERPROFILE": home, "TZ": "UTC", "LC_ALL": "C.UTF-8"}.items():
+        homes = dict.fromkeys(("HOME", "USERPROFILE", "TRITON_HOME"), home)  # Triton has read HOME when it was imported
+        for name, value in {**homes, "TZ": "UTC", "LC_ALL": "C.UTF-8"}.items():
             patch.setenv(name, value)
         yield
 
