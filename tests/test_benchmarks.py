@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks import augment, crops, denoise, equal_minutes, measure, networks, synth
+from benchmarks import augment, crops, denoise, equal_minutes, measure, networks, sensors, synth
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.demo.pairs import FRAME
 from rawaug.data.folders import RawFolder
+from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import frozen_levels, frozen_sample
 from rawaug.io import RawFrame, read_picture, write_dng
 from rawaug.noise import Compose, RowNoise, noise_model
@@ -162,3 +164,16 @@ def test_noise_without_levels_is_refused(shots: RawFolder, tmp_path: Path) -> No
     with pytest.raises(ValueError, match="shot: its pair needs noise with known shot_var"):
         write_pair(shots, 0, Compose([RowNoise(1e-6)]), 0, tmp_path)
     assert not list(tmp_path.glob("*.dng"))
+
+
+def test_sensors_scores_flat_patches_frames_and_cells_beside_lights() -> None:
+    clean = torch.full((1, 4, 40, 40), 0.25)
+    clean[..., 10:20, 10:20] = 1.0
+    as_it_is = Contestant("noisy", lambda noisy, *_: noisy)
+    black = Contestant("black", lambda noisy, *_: torch.zeros_like(noisy))
+    assert sensors.left_in_flat(as_it_is, (1e-3, 1e-5)) == 1.0
+    expected = -10 * math.log10(1e-3 * 0.25 + 1e-5)
+    assert sensors.mean_psnr(as_it_is, [("flat", torch.full((1, 4, 64, 64), 0.25))], (1e-3, 1e-5)) == pytest.approx(
+        expected, abs=0.15
+    )
+    assert sensors.beside_lights(black, [("light", clean)], (1e-6, 1e-9)) == (0.0, 12.04)
