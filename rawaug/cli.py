@@ -75,7 +75,12 @@ def _launch(
     quiet: bool = False,
     own: Annotated[list[Path] | None, Parameter(name="--import")] = None,
 ) -> None:
-    """Run a command."""
+    """Run a command.
+
+    Args:
+        quiet: do not print progress.
+        own: Python files to import first, whose classes recipes and options can then name.
+    """
     for file in own or ():
         _import(file)
     with without_progress(quiet):

@@ -30,7 +30,13 @@ _WILD = re.compile(r"[*?]")
 
 @dataclass
 class MosaicSettings:
-    """How the mosaics of ``pairs:PATH`` are read if their files do not state it."""
+    """How the mosaics of ``pairs:PATH`` are read if their files do not state it.
+
+    Args:
+        cfa: CFA of files in pairs:PATH that do not state it: RGGB, BGGR, GRBG or GBRG.
+        black: black level of files in pairs:PATH that do not state it; one value, or four for R, Gr, Gb, B.
+        white: white level of files in pairs:PATH that do not state it.
+    """
 
     cfa: str | None = None
     black: float | tuple[float, float, float, float] | None = None
@@ -39,7 +45,12 @@ class MosaicSettings:
 
 @dataclass
 class PairSettings(MosaicSettings):
-    """How noisy/clean pairs are found and read if ``pairs:PATH`` alone does not determine it."""
+    """How noisy/clean pairs are found and read if ``pairs:PATH`` alone does not determine it.
+
+    Args:
+        noisy: pattern of the noisy files' names in pairs:PATH, such as ``*_noisy.*``, as rawaug synth names them.
+        clean: pattern of the clean files' names in pairs:PATH; by default ``noisy`` with clean in place of noisy.
+    """
 
     noisy: str | None = None
     clean: str | None = None

@@ -20,7 +20,19 @@ def draw_key(seed: int, name: str, number: int) -> torch.Generator:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them."""
+    """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them.
+
+    Args:
+        isp: ISP file, or the name of a shipped ISP.
+        camera: maker and model of a published camera, in place of the ISP's cameras.
+        light: colour temperature in kelvin, or a lamp such as LED-B3 or FL11.
+        tone: one tone curve of the ISP, by name (rawaug info lists them).
+        exposure: fixed exposure in stops, instead of a draw from the ISP's range.
+        noise: a preset, a measured camera, camera (as measured by the fit), or [shot_var, read_var].
+        iso: ISO of a measured camera's noise, instead of a draw from its measured range.
+        sampling: how camera settings are drawn.
+        cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
+    """
 
     isp: str = "universal"
     camera: str | None = None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +17,10 @@ import pytest
 
 from rawaug.cli import COMMANDS, main
 from rawaug.data import demo_pictures
+from rawaug.data.pair_folder import PairSettings
 from rawaug.io import write_picture
+from rawaug.isp.fit.config import FitConfig
+from rawaug.plugin.sampling_config import Drawing
 from rawaug.registry import FILTERS
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
@@ -153,6 +158,13 @@ def test_keys_of_a_recipe_are_listed_with_its_values(capsys: pytest.CaptureFixtu
     assert "--train.learning-rate" in text and "--arms.NAME.augmented" in text and ":class:" not in text
     assert main(["run"]) == 0
     assert "sidd/fewshot" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [Drawing, PairSettings, FitConfig])
+def test_every_option_of_a_dataclass_has_help_of_its_own(options: type) -> None:
+    told = "".join(owner.__doc__ or "" for owner in options.__mro__)
+    for option in dataclasses.fields(options):
+        assert re.search(rf"^ +(\w+, )*{option.name}(, \w+)*: ", told, re.MULTILINE), option.name
 
 
 def test_help_is_quick() -> None:
