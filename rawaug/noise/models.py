@@ -81,8 +81,7 @@ class NoiseModel(ABC):
         The parameters may lie on another device than the picture. No gradient passes.
 
         Raises:
-            ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch
-            size.
+            ValueError: if ``clean`` is not packed RAW in float32 or float64, or ``params`` are for another batch size.
         """
         require_batch(clean, params)
         return self.disturb(clean, params).clamp_(max=1.0)

@@ -191,8 +191,8 @@ def wrap(
             :class:`RawPair` takes their place, all else passes through.
         augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
         device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
-            :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. Pictures travel there as uint8, if
-        they are.
+            :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. uint8 pictures travel
+            there as uint8.
         key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
         crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
             different sizes. By default whole pictures, without their last row or column where a side is odd.
