@@ -33,11 +33,14 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 def yaml_value(text: str) -> Any:
-    """Plain values of YAML, in which ``1e-4`` is a number, as in YAML 1.2."""
+    """Plain values of YAML 1.2, in which ``1e-4`` is a number, and ``on``, ``off``, ``yes`` and ``no`` are words."""
     import yaml
 
     class Loader(yaml.SafeLoader):
-        pass
+        yaml_implicit_resolvers = {
+            first: [(tag, words) for tag, words in known if first in "tTfF" or not tag.endswith(":bool")]
+            for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        }
 
     number = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+$")
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789"))

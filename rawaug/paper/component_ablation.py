@@ -33,7 +33,7 @@ from rawaug.metrics import psnr, worst_and_best_quarter
 from rawaug.paper.frames import synthetic_frames
 from rawaug.paper.methods import kept
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS
+from rawaug.registry import EXPERIMENTS, checked_settings
 from rawaug.seeding import keyed_generator
 
 CAMERAS = (
@@ -84,11 +84,10 @@ class ComponentAblation:
     def __post_init__(self) -> None:
         if min(self.frames, self.left_out, self.seeds, len(self.variants), len(self.cameras)) < 1:
             raise ValueError("frames, left_out, seeds, variants and cameras must each be at least one")
-        self.variants = {name: _switches_as_words(changes) for name, changes in self.variants.items()}
         for name, changes in self.variants.items():
-            if unknown := set(changes) - set(asdict(self.fit)) | {"seed"} & set(changes):
-                raise ValueError(f"variants: {name}: {sorted(unknown)} are no keys of fit that a variant can change")
-            replace(self.fit, **changes)
+            if "seed" in changes:
+                raise ValueError(f"variants: {name}: all variants of a run share its seed; set seed, not fit.seed")
+            replace(self.fit, **checked_settings(f"variants: {name}", FitConfig, changes))
 
     def shortest(self) -> ComponentAblation:
         """A few steps of every variant, on two frames."""
@@ -96,13 +95,6 @@ class ComponentAblation:
         return replace(
             self, frames=2, left_out=1, fit=replace(self.fit.shortest(), joint_steps=0), variants=few, seeds=1
         )
-
-
-def _switches_as_words(changes: dict[str, Any]) -> dict[str, Any]:
-    """YAML reads ``on`` and ``off`` as truth values."""
-    words = {True: "on", False: "off"}
-    switches = {key: words[changes[key]] for key in ("encoders", "shading") if isinstance(changes.get(key), bool)}
-    return changes | switches
 
 
 @EXPERIMENTS.register("learned")

@@ -151,6 +151,14 @@ def test_null_or_a_setting_that_nobody_means_is_named(
     assert re.search(named, text)
 
 
+def test_on_and_off_are_words_and_truth_values_stay(tmp_path: Path) -> None:
+    content = "isp: {encoders: on, shading: off, attention: true}\nself_ensemble: off\narms: {real: {}}\n"
+    (tmp_path / "mine.yaml").write_text(content)
+    recipe = with_values(settings_of("training"), read_recipe(tmp_path / "mine.yaml"), "mine")
+    assert (recipe.isp.encoders, recipe.isp.shading) == ("on", "off")
+    assert recipe.isp.attention is True and recipe.self_ensemble is False
+
+
 def test_null_is_taken_where_the_types_have_it() -> None:
     content = {"camera": "universal", "steps": None, "arms": {"real": {"denoiser": None}}}
     recipe = with_values(settings_of("training"), content, "mine")

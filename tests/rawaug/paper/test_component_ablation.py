@@ -89,10 +89,10 @@ def test_too_few_pictures_and_unknown_keys_are_refused(folder: Path, fits: list[
     with pytest.raises(ValueError, match=r"has 6 of 288 x 448 or more, but frames and left_out together need 7"):
         ablate_components(settings(folder, frames=5))
     assert fits == [] and len(PictureFolder(folder / "pictures", 2)) == 7
-    for changes in ({"encodres": "on"}, {"seed": 3}):
-        with pytest.raises(ValueError, match=r"variants: mine: \['(encodres|seed)'\] are no keys of fit"):
-            settings(folder, variants={"mine": changes})
-    assert settings(folder, variants={"bare": {"encoders": False}}).variants == {"bare": {"encoders": "off"}}
+    wrong = {"encodres": "nearest: encoders", "seed": "share its seed", "encoders": "must be auto", "attention": "bool"}
+    for key, reason in wrong.items():
+        with pytest.raises(ValueError, match=reason):
+            settings(folder, variants={"mine": {key: "maybe"}})
     with pytest.raises(ValueError, match="must each be at least one"):
         settings(folder, variants={})
 
