@@ -22,7 +22,7 @@ from rawaug.data.dnd import Dnd
 from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Pair
-from rawaug.data.published import CAMERAS, Rawir, Zurich, fivek_numbers
+from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission
 from rawaug.data.sidd.frames import SiddFrames, is_scene
 from rawaug.errors import printable
@@ -135,9 +135,7 @@ def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         for split in ("train", "test"):
             yield f"Zurich RAW to RGB, {split}", partial(Zurich, path, split)
     elif any(name.endswith(".npy") for name in files):
-        splits = [
-            s for s, name in {"train": "train", "validation": "val", "test": "test"}.items() if (path / name).is_dir()
-        ]
+        splits = [split for split, name in RAWIR_FOLDERS.items() if (path / name).is_dir()]
         for split in splits or ["train"]:
             yield f"RAWIR or AIM 2022{', ' + split if splits else ''}", partial(Rawir, path, split)
 
@@ -149,7 +147,7 @@ def _files(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
         yield "noisy/clean pairs", partial(PairFolder, path)
         return
     raws = sorted(file for file in files if file.suffix.lower() in RAW_EXTENSIONS)
-    numbers = {found[1] for file in raws if (found := re.fullmatch(r"a(\d{4})-.*\.dng", file.name, re.IGNORECASE))}
+    numbers = {found[1] for file in raws if (found := FIVEK_DNG.fullmatch(file.name))}
     if raws:
         yield f"RAW files{_fivek(numbers)}", partial(_RawFrames, path)
     if any(file.suffix.lower() in PICTURE_EXTENSIONS for file in files) and path.is_dir():

@@ -28,7 +28,7 @@ from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs
 from rawaug.errors import printable
-from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop
+from rawaug.io import read_picture, read_raw, read_raw_and_develop
 from rawaug.io.pictures import MAX_PIXELS, through_jpeg
 
 PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
@@ -358,12 +358,12 @@ class RawFolder(LazyPairs):
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _JPEG_MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
                 frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
-                return _pair(self.names[index], frame, _centre(srgb, *size), registered=False)
+                return Pair.of_frame(self.names[index], frame, _centre(srgb, *size), registered=False)
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
         frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
         srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
-        return _pair(self.names[index], frame, srgb, registered=True)
+        return Pair.of_frame(self.names[index], frame, srgb)
 
 
 def _centre(image: Tensor, height: int, width: int) -> Tensor:
@@ -379,20 +379,6 @@ def _names(files: Sequence[Path]) -> list[str]:
         above = os.path.commonpath([file.resolve().parent for file in files])
         names = [file.resolve().relative_to(above).as_posix() for file in files]
     return names
-
-
-def _pair(name: str, frame: RawFrame, srgb: Tensor, registered: bool) -> Pair:
-    return Pair(
-        name=name,
-        srgb=srgb,
-        raw=frame.mosaic,
-        cfa=frame.cfa,
-        white_balance=frame.white_balance,
-        color_matrix=frame.color_matrix,
-        camera=frame.camera,
-        registered=registered,
-        iso=frame.iso,
-    )
 
 
 def _raw_files(path: str | Path) -> list[Path]:

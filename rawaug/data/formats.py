@@ -174,9 +174,6 @@ def _read_mat(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
 
 
 def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
-    with extra("raw"):
-        pass
-
     try:
         with damage_as_os_error(file, "cannot be read as TIFF", OSError), opened_tiff(file) as tiff:
             page = tiff.pages[0]
@@ -240,7 +237,7 @@ class Mosaic(NamedTuple):
 
 
 def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> Mosaic:
-    """Read a mosaic."""
+    """The noisy or clean mosaic (``which``) of a file, which is ``alone`` if it holds both by these names."""
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
         return _camera_file(file, given)

@@ -125,9 +125,12 @@ class PairFolder(LazyPairs):
         ):
             if one != other:
                 raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
-        stated = next((m for m in (clean, noisy) if m.white_balance is not None and m.color_matrix is not None), None)
-        gains = (1.0, 1.0, 1.0) if stated is None else stated.white_balance or (1.0, 1.0, 1.0)
-        matrix = torch.eye(3) if stated is None or stated.color_matrix is None else stated.color_matrix
+        stated = [
+            (mosaic.white_balance, mosaic.color_matrix)
+            for mosaic in (clean, noisy)
+            if mosaic.white_balance is not None and mosaic.color_matrix is not None
+        ]
+        gains, matrix = stated[0] if stated else ((1.0, 1.0, 1.0), torch.eye(3))
         shot_var, read_var = noisy.levels or (None, None)
         return Pair(
             name=name,
@@ -140,7 +143,7 @@ class PairFolder(LazyPairs):
             shot_var=shot_var,
             read_var=read_var,
             camera=noisy.camera,
-            color_known=stated is not None,
+            color_known=bool(stated),
             iso=noisy.iso,
         )
 

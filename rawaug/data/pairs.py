@@ -29,6 +29,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, bin_mosaic
 from rawaug.files import digest
+from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
 
 
@@ -94,6 +95,12 @@ class Pair:
         if (self.shot_var is None) != (self.read_var is None) or (self.noisy is None and self.shot_var is not None):
             raise ValueError(f"pair {self.name}: shot_var and read_var must be given together, with a noisy mosaic")
 
+    @classmethod
+    def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **known: Any) -> Pair:
+        """What a RAW file states and its picture, with further attributes that are ``known``."""
+        stated = (frame.mosaic, frame.cfa, frame.white_balance, frame.color_matrix)
+        return cls(name, srgb, *stated, camera=frame.camera, iso=frame.iso, **known)
+
     @property
     def balance_known(self) -> bool:
         """Whether ``white_balance`` is the camera's."""
@@ -107,11 +114,7 @@ class Pair:
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
     def require_rendered(self) -> None:
-        """Raise ValueError if the colours of the pair are unknown.
-
-        Raises:
-            ValueError: if ``srgb`` is no rendering in the camera's colours.
-        """
+        """Raise ValueError if ``srgb`` is no rendering in the camera's colours."""
         if not self.rendered:
             raise ValueError(
                 f"{self.name}: has no sRGB picture, and its white balance and colour matrix are unknown; "
@@ -217,6 +220,7 @@ class LazyPairs(Sequence[Pair], ABC):
     """A sequence of pairs that reads one at a time; the last one stays in memory."""
 
     max_pixels: int = MAX_PIXELS
+    """sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)

@@ -36,6 +36,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
@@ -55,7 +56,7 @@ from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
 
 CAMERAS = ("canon", "nikon")
-_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
+FIVEK_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
 
 @DATASETS.register("fivek")
@@ -83,7 +84,7 @@ def fivek_pairs(
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such folder of FiveK")
     wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
-    files = {found[1]: file for file in files_below(path) if (found := _DNG.fullmatch(file.name))}
+    files = {found[1]: file for file in files_below(path) if (found := FIVEK_DNG.fullmatch(file.name))}
     missing = [number for number in wanted if number not in files]
     if missing:
         raise FileNotFoundError(
@@ -126,7 +127,8 @@ WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 _ARRAYS = (".npy", ".npz")
 _MAGIC = b"\x93NUMPY"
 
-_SPLITS = {"train": "train", "validation": "val", "test": "test"}
+RAWIR_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
+"""By split."""
 
 
 @DATASETS.register("rawir")
@@ -150,12 +152,12 @@ class Rawir(LazyPairs):
 
     def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
         folder, self.white = Path(path), white
-        if split not in _SPLITS:
-            raise ValueError(f"rawir: no split {split}; use one of {', '.join(_SPLITS)}")
+        if split not in RAWIR_FOLDERS:
+            raise ValueError(f"rawir: no split {split}; use one of {', '.join(RAWIR_FOLDERS)}")
         if not folder.is_dir():
             raise FileNotFoundError(f"{path}: no such folder of RAWIR")
-        if any((folder / name).is_dir() for name in _SPLITS.values()):
-            folder = folder / _SPLITS[split]
+        if any((folder / name).is_dir() for name in RAWIR_FOLDERS.values()):
+            folder = folder / RAWIR_FOLDERS[split]
         self.files = sorted(files_below(folder, _ARRAYS))
         if not self.files:
             raise ValueError(f"{folder}: contains no .npy or .npz file of RAWIR")
@@ -174,8 +176,6 @@ class Rawir(LazyPairs):
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             camera=self.camera_of(file),
-            white_balance=(1.0, 1.0, 1.0),
-            color_matrix=torch.eye(3),
             registered=not _is_p20(file),
         )
 
@@ -318,8 +318,6 @@ class Zurich(LazyPairs):
             srgb=read_picture(self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),
             raw=torch.from_numpy(np.minimum(light, 1))[None],
             cfa=CFA.RGGB,
-            white_balance=(1.0, 1.0, 1.0),
-            color_matrix=torch.eye(3),
             camera="Huawei P20 (picture: Canon 5D Mark IV)",
             registered=False,
         )
@@ -374,15 +372,7 @@ class RawBench(LazyPairs):
         whole = (noisy.mosaic < _UNCLIPPED) & (dark < _UNCLIPPED)
         ratio = noisy.mosaic[whole].mean() / dark[whole].mean().clamp_min(1e-6)
         raw = (dark * ratio).clamp(max=1.0)
-        return Pair(
-            name=self.names[index],
-            srgb=develop_mosaic(raw, noisy.cfa, noisy.white_balance, noisy.color_matrix),
-            raw=raw,
-            cfa=noisy.cfa,
-            white_balance=noisy.white_balance,
-            color_matrix=noisy.color_matrix,
-            noisy=noisy.mosaic,
-            camera=noisy.camera,
-            color_known=noisy.color_known,
-            iso=noisy.iso,
-        )
+        srgb = develop_mosaic(raw, noisy.cfa, noisy.white_balance, noisy.color_matrix)
+        clean_frame = replace(noisy, mosaic=raw)
+        known = {"noisy": noisy.mosaic, "color_known": noisy.color_known}
+        return Pair.of_frame(self.names[index], clean_frame, srgb, **known)

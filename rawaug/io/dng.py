@@ -30,14 +30,13 @@ from rawaug.errors import extra
 from rawaug.files import replacing
 from rawaug.io.gain_map import opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
-from rawaug.io.tiff import all_pages, main_mosaic, opened_tiff, tag_damage
+from rawaug.io.tiff import ACTIVE_AREA, CFA_PHOTOMETRIC, DNG_VERSION, all_pages, main_mosaic, opened_tiff, tag_damage
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
 _LARGEST = 2.0**31 - 2
 _LARGEST_ISO = 65535
-_CFA_PHOTOMETRIC = 32803
-_DNG_VERSION, _UNIQUE_CAMERA_MODEL = 50706, 50708
+_UNIQUE_CAMERA_MODEL = 50708
 _D65 = 21
 _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
 """By LibRaw's flip."""
@@ -74,7 +73,7 @@ def write_dng(
     # write an Exif directory if the source has none
     directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
     directories = {name: entries for name, entries in directories.items() if entries}
-    own = _camera(frame) if _DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
+    own = _camera(frame) if DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
     tags = own | carried.tags | _tags_of_the_pixels(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
@@ -93,7 +92,7 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
         path,
         numbers,
         byteorder="<" if byte_order == "<" else ">",
-        photometric=_CFA_PHOTOMETRIC,
+        photometric=CFA_PHOTOMETRIC,
         extratags=tags,
         software=software,
         metadata=None,
@@ -140,7 +139,7 @@ def _camera(frame: RawFrame) -> dict[int, Tag]:
 def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
     """Tags that are only written if the source is not a DNG."""
     tags: list[Tag] = [
-        (_DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
+        (DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
         (50707, BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0)), True),
         (50721, SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel()), True),
         (50728, RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance]), True),
@@ -233,7 +232,6 @@ _DIGESTS = (50781, 50828, 50972, 50973, 51111, 51114)
 _REPLACED = (274, 305, 347, 37500, *_SUB_DIRECTORIES.values())
 _DROPPED = frozenset((*_LAYOUT, *_PREVIEW, *_LEVELS, *_DIGESTS, *_REPLACED))
 _CROP = (50718, 50719, 50720, 51125)
-_ACTIVE_AREA = 50829
 
 Tag = tuple[Any, int, int, Any, bool]
 """As tifffile takes them: code, type, count, value, once."""
@@ -269,7 +267,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
         with opened_tiff(path) as tiff, path.open("rb") as file:
             pages = list(all_pages(tiff.pages))
             first = pages[0].tags
-            dng = any(_DNG_VERSION in page.tags for page in pages)
+            dng = any(DNG_VERSION in page.tags for page in pages)
             mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []
             tags: dict[int, Tag] = {}
             for page in (pages[0], *mosaics):
@@ -292,7 +290,7 @@ def _value(tag: Any) -> Any:
 
 
 def _fills_active_area(mosaic: Any, size: tuple[int, int]) -> bool:
-    area = mosaic.tags.valueof(_ACTIVE_AREA) or (0, 0, mosaic.imagelength, mosaic.imagewidth)
+    area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0, mosaic.imagelength, mosaic.imagewidth)
     return bool((area[2] - area[0], area[3] - area[1]) == size)
 
 

@@ -32,9 +32,8 @@ from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.pictures import require_utf8
-from rawaug.io.tiff import TiffTags, read_tiff_tags
+from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_tiff_tags
 
-_EXIF_MAKE, _EXIF_MODEL = 271, 272
 _SENSE = 1e6
 
 
@@ -85,7 +84,7 @@ def _thumbnail_camera(raw: Any) -> tuple[str | None, str | None]:
         exif = Image.open(BytesIO(thumbnail.data)).getexif()
     except (OSError, SyntaxError, TypeError, ValueError, LookupError, struct.error):  # the mosaic may be whole
         return None, None
-    return exif.get(_EXIF_MAKE), exif.get(_EXIF_MODEL)
+    return exif.get(MAKE), exif.get(MODEL)
 
 
 XYZ_FROM_SRGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])

@@ -100,9 +100,9 @@ def _number(file: BinaryIO, form: str, place: int) -> int:
     return int(struct.unpack(form, data)[0]) if len(data) == struct.calcsize(form) else 0
 
 
-_MAKE, _MODEL, _DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
+MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
 _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
-_ACTIVE_AREA = 50829
+ACTIVE_AREA = 50829
 _OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC = 32803
 _RATIONALS = (5, 10)
@@ -131,8 +131,8 @@ def read_tiff_tags(path: Path) -> TiffTags:
     try:
         with opened_tiff(path) as tiff:
             pages = list(all_pages(tiff.pages))
-            make, model = (pages[0].tags.valueof(code) if pages else None for code in (_MAKE, _MODEL))
-            if not any(_DNG_VERSION in page.tags for page in pages):
+            make, model = (pages[0].tags.valueof(code) if pages else None for code in (MAKE, MODEL))
+            if not any(DNG_VERSION in page.tags for page in pages):
                 return TiffTags(make, model)
             mosaic = main_mosaic(pages)
             profile = _noise_profile(pages)
@@ -140,7 +140,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
                 return TiffTags(make, model, profile)
             rows, columns = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
             black = _black(mosaic, _mean(rows) + _mean(columns))
-            area = mosaic.tags.valueof(_ACTIVE_AREA) or (0, 0)
+            area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
             rows, columns = _about_zero(rows), _about_zero(columns)
             return TiffTags(
                 make, model, profile, _mosaic_end(mosaic), black, _gain_maps(mosaic), rows, columns, area[:2]

@@ -23,7 +23,7 @@ import base64
 import csv
 import sys
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
@@ -257,9 +257,6 @@ class SiddBenchmark(Sequence[NoisyBlock]):
         scene, block = divmod(range(len(self))[index], BLOCKS)
         frame = SiddScene.parse(HELD_BACK[scene])
         return NoisyBlock(f"{frame.name}_{block:02d}", self._all()[scene, block], frame.cfa)
-
-    def __iter__(self) -> Iterator[NoisyBlock]:
-        return (self[index] for index in range(len(self)))
 
 
 @DATASETS.register("sidd")
