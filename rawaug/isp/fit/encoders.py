@@ -70,25 +70,25 @@ def _train(
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        chosen = torch.randint(len(frames), (how.frames,), generator=generator).tolist()
-        pixels = torch.randint(samples.srgb.shape[-1], (how.pixels,), generator=generator)
-        each = [_frame_loss(isp, samples, shots, frames[k], pixels, config, generator) for k in chosen]
-        return torch.stack(each).mean()
+        drawn = _some_frames(samples, frames, how.frames, how.pixels, generator)
+        return torch.stack([_frame_loss(isp, part, shots[k], config, generator) for k, part in drawn]).mean()
 
     descent.run(stage, loss, tensors, how.steps, how.learning_rate)
 
 
+def _some_frames(
+    samples: PixelSamples, frames: Sequence[int], count: int, pixels: int, generator: torch.Generator
+) -> list[tuple[int, PixelSamples]]:
+    """``count`` of the frames, with replacement, each with the same random pixels."""
+    chosen = torch.randint(len(frames), (count,), generator=generator).tolist()
+    index = torch.randint(samples.srgb.shape[-1], (pixels,), generator=generator)
+    return [(frames[k], samples.pick(index, torch.tensor([frames[k]]))) for k in chosen]
+
+
 def _frame_loss(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    frame: int,
-    pixels: Tensor,
-    config: FitConfig,
-    g: torch.Generator,
+    isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig, generator: torch.Generator
 ) -> Tensor:
-    part = samples.pick(pixels, torch.tensor([frame]))
-    srgb, raw = _same_piece(shots[frame].srgb, isp.unshaded(shots[frame].raw, None), g)
+    srgb, raw = _same_piece(shot.srgb, isp.unshaded(shot.raw, None), generator)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
     return (errors[0] + errors[1]).sum() + config.consistency * weight_distance(ours, theirs)
@@ -155,9 +155,8 @@ def train_jointly(
     trained = [k for k in range(len(shots)) if k not in watched]
 
     def loss(generator: torch.Generator) -> Tensor:
-        chosen = torch.randint(len(trained), (FRAMES_A_STEP,), generator=generator).tolist()
-        pixels = torch.randint(samples.srgb.shape[-1], (config.batch,), generator=generator)
-        return torch.stack([_joint_frame_loss(isp, samples, shots, trained[k], pixels, config) for k in chosen]).mean()
+        drawn = _some_frames(samples, trained, FRAMES_A_STEP, config.batch, generator)
+        return torch.stack([_joint_frame_loss(isp, part, shots[k], config) for k, part in drawn]).mean()
 
     def watch() -> float:
         return decibels(isp, samples, shots, watched)
@@ -167,16 +166,8 @@ def train_jointly(
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 
-def _joint_frame_loss(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    frame: int,
-    pixels: Tensor,
-    config: FitConfig,
-) -> Tensor:
-    part = samples.pick(pixels, torch.tensor([frame]))
-    ours, theirs = isp.choose(shots[frame].srgb), isp.choose_forward(isp.unshaded(shots[frame].raw, None))
+def _joint_frame_loss(isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig) -> Tensor:
+    ours, theirs = isp.choose(shot.srgb), isp.choose_forward(isp.unshaded(shot.raw, None))
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, config)
