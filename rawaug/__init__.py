@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
     from rawaug.isp.model import DictionaryISP as DictionaryISP
+    from rawaug.plugin import adapters as adapters
     from rawaug.plugin.adapters import isp_model as isp_model
     from rawaug.plugin.augment import RawAugment as RawAugment
     from rawaug.plugin.dataset import RawPairs as RawPairs
@@ -32,7 +33,7 @@ _PUBLIC = {
     "rawaug.bayer": ("CFA",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
-    "rawaug.plugin.adapters": ("isp_model",),
+    "rawaug.plugin.adapters": ("adapters", "isp_model"),
     "rawaug.plugin.augment": ("RawAugment",),
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.loader": ("WrappedLoader", "wrap"),
@@ -47,7 +48,8 @@ __all__ = [*_MODULE_OF, "__version__"]
 def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
+    module = import_module(_MODULE_OF[name])
+    value = globals()[name] = module if name == "adapters" else getattr(module, name)
     return value
 
 
