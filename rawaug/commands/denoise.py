@@ -131,7 +131,25 @@ def denoise_file(
     preview: str | Path | None = None,
     overwrite: bool = False,
 ) -> Denoised:
-    """Denoise one RAW file of any kind that :func:`rawaug.io.read_raw` reads, to a DNG."""
+    """Denoise one RAW file of any kind that :func:`rawaug.io.read_raw` reads, to a DNG.
+
+    Args:
+        source: the RAW file.
+        out: the DNG to write; its folder is made.
+        method: what denoises, as :func:`frame_denoiser` makes it; or a network's file, or the name of a shipped one.
+        noise: see :data:`Noise`; ignored by networks without a noise map.
+        strength: in [0, 1], the share of what the denoiser changes that is applied.
+        preview: picture of the result to write besides, developed by LibRaw.
+        overwrite: replace what is there.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing or cannot be read or written.
+        ValueError: if the source is no Bayer RAW, its noise is unknown, ``strength`` is not in [0, 1], or ``out`` is
+            no DNG, the source itself, or there already.
+
+    Example:
+        >>> denoise_file("shot.dng", "shot-denoised.dng")  # doctest: +SKIP
+    """
     source, out = Path(source), Path(out)
     if out.suffix.lower() != ".dng":
         raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
@@ -210,6 +228,11 @@ def denoise_folder(
 
     A file that cannot be read, or whose decoder crashes or hangs, is named and counted; arguments are those of
     :func:`denoise_file`.
+
+    Raises:
+        OSError: if a result cannot be written, such as to a full disk; those that were are kept.
+        ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
+            of another denoiser or other settings.
     """
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
