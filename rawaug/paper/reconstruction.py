@@ -96,14 +96,16 @@ class Comparison:
         data: the pairs, of one CFA; methods that train on crops need them registered. A dataset's split is ``train``.
         test: score on these pairs, of the split ``test``, instead of on frames left out of ``data``; frames of any
             pattern are brought to that of the first training frame.
-        count, select: of ``data``, as in recipes that train, see :mod:`rawaug.data.pairs`.
+        count: number of pairs of ``data`` to use; null for all.
+        select: which, as ``data.select`` of recipes that train.
         test_count: number of test pairs; null for all.
         noise: preset added once to every frame; the dictionary ISP is then fitted to these noisy
             frames and never sees a clean one, and the scores are against the clean frames. Null: no noise.
         methods: families to fit: dictionary, dictionary-encoders and the baselines; or ISPs to take as they are, by
             a shipped one's name or a file.
         seconds: training budget of methods trained by gradient descent, without file reading.
-        crop, batch: of these methods' training: small ones give more steps to a short budget.
+        crop: side of the crops that these methods train on: small ones give more steps to a short budget.
+        batch: crops in a step of them.
         longer: factor of a second, longer budget for them; 0 for none.
         longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.

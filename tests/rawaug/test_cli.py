@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rawaug.cli import COMMANDS, main
+from rawaug.cli import COMMANDS, app, main
+from rawaug.commands.run import keys_of
 from rawaug.data import demo_pictures
-from rawaug.data.pair_folder import PairSettings
+from rawaug.experiment.kinds import settings_of
 from rawaug.io import write_picture
-from rawaug.isp.fit.config import FitConfig
-from rawaug.plugin.sampling_config import Drawing
-from rawaug.registry import FILTERS
+from rawaug.registry import EXPERIMENTS, FILTERS
 
 QUICK_FIT = ["--steps", "4", "--curve-steps", "10", "--prior-steps", "10", "--pixels", "512", "--batch", "128"]
 TINY = [
@@ -160,11 +158,19 @@ def test_keys_of_a_recipe_are_listed_with_its_values(capsys: pytest.CaptureFixtu
     assert "sidd/fewshot" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("options", [Drawing, PairSettings, FitConfig])
-def test_every_option_of_a_dataclass_has_help_of_its_own(options: type) -> None:
-    told = "".join(owner.__doc__ or "" for owner in options.__mro__)
-    for option in dataclasses.fields(options):
-        assert re.search(rf"^ +(\w+, )*{option.name}(, \w+)*: ", told, re.MULTILINE), option.name
+@pytest.mark.parametrize("command", ["", *COMMANDS, "data check"])
+def test_every_option_says_what_it_does(command: str) -> None:
+    found = reduce(lambda above, word: above[word], command.split(), app) if command else app.meta
+    options = found.assemble_argument_collection(parse_docstring=True)
+    said = {option.name: option.parameter.help for option in options if option.show}
+    assert all(said.values()), said
+    shared = [text for text in said.values() if list(said.values()).count(text) > 1]
+    assert set(shared) <= {"pixels of each frame in a step."}, "the text of a whole group of options"
+
+
+@pytest.mark.parametrize("kind", EXPERIMENTS)
+def test_every_key_of_a_recipe_says_what_it_does(kind: str) -> None:
+    assert not [key.name for key in keys_of(settings_of(kind)) if not key.meaning]
 
 
 def test_help_is_quick() -> None:
