@@ -65,15 +65,16 @@ def run(
         print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
     told = {name: row["scores"][TOLD] for name, row in result["rows"].items()}
     shares = {f"{name} ({at})": scores[at] for name, scores in told.items() for at in scores if name != "noisy input"}
-    if note := own_noise_note(shares):
-        print(note)
-    print("GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development.")
-    print(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
+    notes = ["GMAC and s: a megapixel of the mosaic. sRGB: after one fixed development."]
+    notes += filter(None, [own_noise_note(shares)])
+    notes.append(f"noisy input: {result['hash']} (equal hashes, comparable figures)")
+    print("\n".join(notes))
     if json:
         write_json(result, json)
     if report:
-        page = Page(f"Denoisers on {data}, noisy input {result['hash']}")
+        page = Page(f"Denoisers on {data}", [Part(texts=notes)])
         page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
+        page.parts.append(Part("Pictures", texts=["Strong noise, levels told; PSNR of RAW."]))
         for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed):
             page.add_frame(row, cfa)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}

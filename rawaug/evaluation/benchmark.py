@@ -29,6 +29,7 @@ from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import compared
 from rawaug.evaluation.tables import METRICS, Row
+from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, SensorNoise, ShotReadNoise, estimate_noise
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -208,7 +209,7 @@ def crops(
         row = Row(frame.middle(crop), {"noisy": sample.noisy}, {})
         for one in contestants:
             row.panels[one.name] = denoised_by(one, sample, frame.cfa)
-        row.panels["clean"] = sample.clean
         for name, panel in row.panels.items():
-            row.captions[name] = f"{compared(panel, sample.clean, frame.cfa, row.pair)[0]:.2f} dB"
+            row.captions[name] = f"{psnr(panel, sample.clean).item():.2f} dB"
+        row.panels["clean"] = sample.clean
         yield row, frame.cfa
