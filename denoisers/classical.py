@@ -54,7 +54,16 @@ class Classical(ABC):
         """``(h, w, 4)`` with white noise of deviation 1 to the estimate without it, same shape."""
 
     def __call__(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise ``(B, 4, h, w)``; a picture without noise is returned as it is."""
+        """Denoise ``(B, 4, h, w)``; a picture without noise is returned as it is.
+
+        Args:
+            noisy: packed RAW, float.
+            variance: the noise variance, shape of ``noisy`` or broadcast to it; its mean over each picture is used.
+
+        Raises:
+            ValueError: if ``variance`` is missing, or ``noisy`` is not packed RAW or too small for the method.
+            ImportError: if a library that the method needs is not installed.
+        """
         name, least = type(self).__name__, self.smallest
         if noisy.ndim != 4 or noisy.shape[1] != 4 or min(noisy.shape[-2:]) < least:
             raise ValueError(f"{name} takes packed RAW (B, 4, h >= {least}, w >= {least}), got {tuple(noisy.shape)}")
@@ -196,7 +205,16 @@ class Stabilised:
         shot_var: float | Tensor | None = None,
         read_var: float | Tensor | None = None,
     ) -> Tensor:
-        """Denoise ``(B, 4, h, w)``."""
+        """Denoise ``(B, 4, h, w)``.
+
+        Args:
+            noisy: packed RAW, float.
+            variance: its map ``shot_var max(noisy, 0) + read_var``, from which both are derived if not given.
+            shot_var, read_var: numbers, or ``(B,)``; without shot noise nothing is transformed.
+
+        Raises:
+            ValueError: if neither is given, or the map is no such line.
+        """
         if shot_var is None or read_var is None:
             shot_var, read_var = _line(noisy, variance)
         shot, read = (torch.as_tensor(level).to(noisy).expand(len(noisy)) for level in (shot_var, read_var))

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from denoisers.network import PACKED, Denoiser, require_width
+from denoisers.network import PACKED, Denoiser, require_bounded, require_width
 from rawaug.registry import DENOISERS
 
 RENAMED = (("head.0.", "head."), ("SA.spatial.conv.", "spatial."), ("CA.conv_du.", "channel."), ("conv1x1.", "merge."))
@@ -122,12 +122,13 @@ def _own_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
 class CycleISPDenoiser(Denoiser):
     """Zamir's denoiser for RAW: four groups of eight dual-attention blocks on ``[noisy, variance]``, without pooling.
 
-    Settings that are not named below are those of :class:`denoisers.Denoiser`. 2.84 M parameters as published.
+    It has 2.84 M parameters as published.
 
     Args:
         width: features, a multiple of ``reduction``; 64 as published.
-        groups, blocks: 4 groups of 8 blocks as published.
+        groups, blocks: 4 groups of 8 blocks as published, at most 1000 blocks in all.
         reduction: of the features in channel attention.
+        channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(1, 4, 20, 30)
@@ -152,6 +153,7 @@ class CycleISPDenoiser(Denoiser):
         require_width(width, multiple=max(reduction, 1))
         if min(groups, blocks, reduction) < 1:
             raise ValueError(f"groups, blocks and reduction must be at least 1, got {groups}, {blocks}, {reduction}")
+        require_bounded(seed, blocks=groups * blocks)
         config = {"width": width, "groups": groups, "blocks": blocks, "reduction": reduction}
         super().__init__(channels, variance_map, deviation, 1, config, domain)
         with torch.random.fork_rng(devices=[]):  # every weight is drawn anew below, from the seed

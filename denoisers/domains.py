@@ -34,7 +34,7 @@ _LEAST_RATIO = 1e-3
 
 
 def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """The levels behind a noise map ``shot_var max(noisy, 0) + read_var``, by least squares."""
+    """shot_var and read_var ``(B, 1, 1, 1)`` of a noise map ``(B, C, h, w)``, by least squares; neither is negative."""
     light, axes = noisy.clamp_min(0.0), (1, 2, 3)
     mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
     spread = (light - mean).square().mean(axes, keepdim=True)

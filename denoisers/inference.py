@@ -12,7 +12,6 @@ from torch.nn import functional as F
 
 from denoisers.domains import levels_of
 from rawaug import bayer
-from rawaug.bayer import noise_variance
 
 
 def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
@@ -91,10 +90,8 @@ def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
 
 def from_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
     """The inverse of :func:`to_view`."""
-    rows, columns = cfa.turned(view).shift_to(cfa)
-    turned = bayer.unpack(packed, cfa)
-    height, width = turned.shape[-2:]
-    return bayer.pack(bayer.turn_back(turned[..., rows : height - rows, columns : width - columns], view), cfa)
+    turned = bayer.aligned(bayer.unpack(packed, cfa), cfa, cfa.turned(view))
+    return bayer.pack(bayer.turn_back(turned, view), cfa)
 
 
 class SelfEnsemble(nn.Module):
@@ -164,6 +161,12 @@ class Recorrupted(nn.Module):
     A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
     added noise costs. ``m`` has the noise's variance at ``f(y)``: at ``y`` it would follow the noise. Source: Pang et
     al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
+
+    Args:
+        model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
+        alpha: standard deviation of the extra noise over that of the noise, as in training.
+        draws: how many.
+        seed: of the extra noise, which is the same in every call.
     """
 
     def __init__(
@@ -179,12 +182,12 @@ class Recorrupted(nn.Module):
         """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
         shot_var, read_var = levels_of(noisy, variance)
         signal = self.model(noisy, variance)
-        deviation = self.alpha * noise_variance(signal, shot_var, read_var).sqrt()
+        deviation = self.alpha * bayer.noise_variance(signal, shot_var, read_var).sqrt()
         generator = torch.Generator().manual_seed(self.seed)
         total = torch.zeros_like(noisy)
         for _ in range(self.draws):
             drawn = torch.randn(noisy.shape, generator=generator).to(noisy)
             noisier = (noisy + deviation * drawn).clamp(max=1.0)
-            noise_map = (1.0 + self.alpha**2) * noise_variance(noisier, shot_var, read_var)
+            noise_map = (1.0 + self.alpha**2) * bayer.noise_variance(noisier, shot_var, read_var)
             total += self.model(noisier, noise_map)
         return total / self.draws

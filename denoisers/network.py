@@ -106,10 +106,12 @@ def mended(signal: Tensor) -> Tensor:
 
 
 class Denoiser(nn.Module, ABC):
-    """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``.
+    """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``, white = 1.
+
+    The networks also take ``seed``, from which :meth:`initialise` draws their weights.
 
     Args:
-        channels: of the picture, 4 for packed RAW.
+        channels: of the picture, 4 for packed RAW, at most 65536.
         variance_map: feed the noise map as ``channels`` more inputs; calls must then pass ``variance``.
         deviation: feed the standard deviation, sqrt(variance), in place of the variance; matters to a noise map only.
         stride: sides are padded to multiples of this inside.

@@ -1,7 +1,6 @@
 """Convolutional networks from the literature, each ``denoised = noisy + residual([noisy, noise map])``.
 
-All settings that they share (``channels``, ``variance_map``, ``deviation``, ``domain``) are those of
-:class:`denoisers.Denoiser`; ``seed`` is that of the initial weights. Any height and width from 2 on.
+The settings that they share are those of :class:`denoisers.Denoiser`. Any height and width from 2 on.
 """
 
 from __future__ import annotations
@@ -15,14 +14,11 @@ from torch.nn import functional as F
 from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS, require_between
 
-MEAN_OVER = 8
-"""Sides of the squares whose mean DRUNet's signal is without."""
-
 PUBLISHED_WIDTH = 32
-"""Features of the first scale in the paper."""
+"""Features of the U-Net's first scale in the paper."""
 
 
-def _block(inputs: int, features: int) -> nn.Sequential:
+def _triple_conv(inputs: int, features: int) -> nn.Sequential:
     """Three convolutions, each with its leaky ReLU."""
     layers: list[nn.Module] = []
     for size in (inputs, features, features):
@@ -38,8 +34,9 @@ class UNet(Denoiser):
     down, bilinear interpolation up, skips by concatenation. As published, ``deviation=False``.
 
     Args:
-        width: features of the first scale; the last has ``width * 2**(scales - 1)``.
-        scales: of the pyramid; sides are padded to multiples of ``2**(scales - 1)``.
+        width: features of the first scale, 32 as published; the last has ``width * 2**(scales - 1)``.
+        scales: of the pyramid, 1 to 12; sides are padded to multiples of ``2**(scales - 1)``.
+        channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -65,8 +62,8 @@ class UNet(Denoiser):
         config = {"width": width, "scales": scales}
         super().__init__(channels, variance_map, deviation, 2 ** (scales - 1), config, domain)
         sizes = [width * 2**k for k in range(scales)]
-        self.encoder = nn.ModuleList(_block(a, b) for a, b in zip([self.inputs, *sizes], sizes, strict=False))
-        self.decoder = nn.ModuleList(_block(3 * size, size) for size in reversed(sizes[:-1]))
+        self.encoder = nn.ModuleList(_triple_conv(a, b) for a, b in zip([self.inputs, *sizes], sizes, strict=False))
+        self.decoder = nn.ModuleList(_triple_conv(3 * size, size) for size in reversed(sizes[:-1]))
         self.last = conv(width, channels)
         self.initialise(seed, self.last)
 
@@ -82,6 +79,7 @@ class UNet(Denoiser):
 
 
 LEVELS = 4
+"""Of DHDN's pyramid."""
 
 
 class DCRBlock(nn.Module):
@@ -120,6 +118,7 @@ class DHDN(Denoiser):
 
     Args:
         width: features of the first level, even. 16 (2.6 M parameters) suits a CPU; 128 is the published width.
+        channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(1, 4, 20, 30)
@@ -180,11 +179,11 @@ class DnCNN(Denoiser):
 
     Args:
         width: features.
-        depth: convolutions; 17 in the paper for one noise level, 20 for a range of them.
+        depth: convolutions, 2 to 1000; 17 in the paper for one noise level, 20 for a range of them.
         batch_norm: as published. Denoise in eval mode: in train mode a picture's result depends on its batch.
+        channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
-        >>> import torch
         >>> noisy = torch.rand(1, 4, 20, 30)
         >>> DnCNN(width=8, depth=5, variance_map=False)(noisy).shape
         torch.Size([1, 4, 20, 30])
@@ -231,14 +230,14 @@ class ChannelNorm(nn.Module):
         return normed.permute(0, 3, 1, 2)
 
 
-def gate(x: Tensor) -> Tensor:
+def _gated(x: Tensor) -> Tensor:
     """The first half of the channels times the second."""
     first, second = x.chunk(2, dim=1)
     return first * second
 
 
-class Block(nn.Module):
-    """NAFNet's block."""
+class NAFBlock(nn.Module):
+    """Two gated residuals; see :class:`NAFNet`."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -250,9 +249,9 @@ class Block(nn.Module):
         self.gamma = nn.Parameter(torch.zeros(1, width, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        y = gate(self.conv2(self.conv1(self.norm1(x))))
+        y = _gated(self.conv2(self.conv1(self.norm1(x))))
         x = x + self.beta * self.conv3(y * self.attention(y.mean((2, 3), keepdim=True)))
-        return x + self.gamma * self.conv5(gate(self.conv4(self.norm2(x))))
+        return x + self.gamma * self.conv5(_gated(self.conv4(self.norm2(x))))
 
 
 @DENOISERS.register("NAFNet")
@@ -266,9 +265,10 @@ class NAFNet(Denoiser):
 
     Args:
         width: features of the first scale, doubled at each further one; 32 and 64 are published.
-        encoder: blocks of each scale going down; their number is that of the scales above the middle.
+        encoder: blocks of each scale going down, 1 to 12 scales of up to 1000 blocks.
         middle: blocks of the middle.
         decoder: blocks of each scale going up, as many as ``encoder``.
+        channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -321,7 +321,11 @@ class NAFNet(Denoiser):
 
 
 def _blocks(width: int, number: int) -> nn.Sequential:
-    return nn.Sequential(*(Block(width) for _ in range(number)))
+    return nn.Sequential(*(NAFBlock(width) for _ in range(number)))
+
+
+MEAN_OVER = 8
+"""Side of the squares over which DRUNet takes the mean of its signal."""
 
 
 class ResidualBlock(nn.Module):
@@ -347,10 +351,9 @@ class DRUNet(Denoiser):
 
     Args:
         width: features of the first scale, doubled at each further one; 64 is published.
-        scales: of the pyramid; 4 is published.
-        blocks: of each scale, going down and going up; 4 is published.
-        limits: feed how near black and white the transformed signal is; not in the domain linear.
-        mend: replace single hot and dead pixels first; not in the domain linear.
+        scales: of the pyramid, 1 to 12; 4 is published.
+        blocks: of each scale, going down and going up, at most 1000; 4 is published.
+        limits, mend, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)

@@ -78,7 +78,7 @@ class DecoderStage(nn.Module):
 
 @DENOISERS.register("PMRID")
 class PMRID(Denoiser):
-    """PMRID. Settings that are not named below are those of :class:`denoisers.Denoiser`.
+    """PMRID's network (Wang et al., ECCV 2020).
 
     Four encoder stages of 2, 2, 4, 4 bottleneck blocks (depthwise 5 x 5 and pointwise, twice), each at half the size of
     the one before; four decoder stages of a residual of two separable 3 x 3 convolutions, a transposed convolution
@@ -87,6 +87,7 @@ class PMRID(Denoiser):
     Args:
         width: features of the first convolution; the encoder has 4, 8, 16 and 32 times as many.
         domain: linear, ksigma (as published) or anscombe.
+        channels, variance_map, deviation, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)

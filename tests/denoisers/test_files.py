@@ -93,6 +93,7 @@ GOOD = {"format": "rawaug", "kind": "denoiser", "model": "DnCNN", "config": '{"w
         ({"config": '{"width": 4, "depth": 2, "seed": 1' + "0" * 30 + "}"}, "seed must be a whole number"),
         ({"model": "UNet", "config": '{"scales": 1000000000}'}, "scales must be a whole number from 1 to 12"),
         ({"model": "NAFNet", "config": '{"encoder": [1, 9999999], "decoder": [1, 1]}'}, "encoder must be"),
+        ({"model": "CycleISPDenoiser", "config": '{"groups": 500, "blocks": 500}'}, "blocks must be a whole number"),
         ({"info": '{"a":' * 10000 + "1" + "}" * 10000}, "too deeply nested"),
         ({"info": '{"noise": [Infinity, 0]}'}, "metadata 'info': Infinity is not a finite number"),
         ({"info": '{"noise": [1e999, 0]}'}, "1e999 is not a finite number"),
