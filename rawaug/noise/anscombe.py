@@ -6,8 +6,8 @@ with s = ``shot_var`` and r = ``read_var``, makes Poisson-Gaussian noise of vari
 which a denoiser for white Gaussian noise can take (Starck, Murtagh and Bijaoui 1998). A denoiser gives the mean of z;
 the algebraic inverse of a mean is biased, because the root is concave. The exact unbiased inverse maps E[z | y] back
 to y (Makitalo and Foi, "Optimal inversion of the generalized Anscombe transformation for Poisson-Gaussian noise",
-2013). Below :data:`TABLE_COUNTS`
-photons it is a table made by integration; above, it is its limit :math:`y = s (z^2/4 - 1/8) - r/s`.
+2013). Below :data:`TABLE_COUNTS` photons it is a table made by integration; above, its limit
+:math:`y = s (z^2/4 - 1/8) - r/s`.
 """
 
 from __future__ import annotations

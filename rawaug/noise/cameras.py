@@ -69,10 +69,16 @@ from rawaug.seeding import keyed_generator
 ANY_CAMERA = "any camera"
 SHOT_ON_MOSAIC = 8.6
 READ_ON_MOSAIC = 6.2
+_ROUNDING = 1e-9  # of logarithms that are the same ISO
+_LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
 
 class Profiles(NamedTuple):
-    """The usable rows of darktable's N cameras."""
+    """The usable rows of darktable's N cameras.
+
+    ``table`` ``(3, N, R)`` has the logarithms of ISO, shot_var and read_var; a camera has ``rows`` ``(N,)`` of the R,
+    ISO ascending, and infinite in the others.
+    """
 
     names: tuple[str, ...]
     table: Tensor
@@ -117,7 +123,11 @@ def profile_names() -> list[str]:
 
 
 class ProfileLevels:
-    """Levels of one camera, or of any, each weighted alike."""
+    """Levels of one camera's profile, or of any, each weighted alike.
+
+    With ``any camera``, whose profiles end at different ISOs, a camera is drawn within its share of the limits; one
+    without a share is not drawn.
+    """
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
         profiles = published_profiles()
@@ -146,10 +156,6 @@ class ProfileLevels:
         (x0, x1), (s0, s1), (r0, r1) = ((y.gather(1, right - 1), y.gather(1, right)) for y in (iso, shot, read))
         t = ((at[:, None] - x0) / (x1 - x0)).clamp(0.0, 1.0)
         return torch.exp(torch.lerp(s0, s1, t))[:, 0].float(), torch.exp(torch.lerp(r0, r1, t))[:, 0].float()
-
-
-_ROUNDING = 1e-9  # of logarithms that are the same ISO
-_LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
 
 class IsoLevel(NamedTuple):

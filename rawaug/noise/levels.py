@@ -45,20 +45,27 @@ def published() -> dict[str, Any]:
     return data
 
 
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    """Draws from [0, 1), float32 on the generator's device."""
+    return torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32)
+
+
+def normal(generator: torch.Generator, *shape: int) -> Tensor:
+    """Standard normals, float32 on the generator's device."""
+    return torch.randn(shape, generator=generator, device=generator.device, dtype=torch.float32)
+
+
 def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)`` numbers whose logarithms are uniform between those of ``limits``."""
     low, high = (math.log(limit) for limit in limits)
-    return torch.exp(
-        low + (high - low) * torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32)
-    )
-
-
-def _normal(batch: int, generator: torch.Generator) -> Tensor:
-    return torch.randn(batch, generator=generator, device=generator.device, dtype=torch.float32)
+    return torch.exp(low + (high - low) * uniform(generator, batch))
 
 
 class FixedLevels:
     """The same levels for every picture: those of one camera at one ISO.
+
+    Raises:
+        ValueError: if a variance is negative or not finite.
 
     Example:
         >>> shot_var, read_var = FixedLevels(1e-3, 1e-5).sample(2, torch.Generator())
@@ -113,7 +120,7 @@ class Preset:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         shot_var = log_uniform(self.shot_range, batch, generator)
-        scatter = self.line["sigma"] * _normal(batch, generator)
+        scatter = self.line["sigma"] * normal(generator, batch)
         # The slope is the same in any base; intercept and scatter are exponents of the preset's own.
         exponent = (self.line["intercept"] + scatter) * math.log(self.base)
         return shot_var, shot_var ** self.line["slope"] * torch.exp(exponent)
@@ -151,6 +158,13 @@ def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
 class SiddLevels:
     """One of SIDD's phones: interpolated in the logarithms of ISO and variance between the tabulated ISOs.
 
+    Args:
+        phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
+        iso: one ISO, the limits of a log-uniform draw, or None for all that was tabulated.
+
+    Raises:
+        ValueError: if the phone is unknown, or the ISO outside the table.
+
     Example:
         >>> shot_var, read_var = SiddLevels("Google Pixel", iso=1200).sample(2, torch.Generator())
     """
@@ -168,7 +182,7 @@ class SiddLevels:
 
 
 class PmridLevels:
-    """The OPPO Reno 10x of PMRID: gain linear, read variance quadratic in the ISO."""
+    """The OPPO Reno 10x of PMRID: gain linear, read variance quadratic in the ISO, one or limits within 100 to 6400."""
 
     def __init__(self, iso: Iso = None) -> None:
         self.law: dict[str, Any] = published()["pmrid"]
@@ -183,7 +197,8 @@ class PmridLevels:
 class EldLevels:
     """One of ELD's cameras: every scale s is log-linear in the gain, log s = slope log K + bias + N(0, sigma^2).
 
-    As levels they give the Gaussian law of read noise; :class:`rawaug.noise.sensor.EldNoise` is the full model.
+    As levels they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise`, whose arguments these are, is
+    the full model.
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
@@ -202,7 +217,7 @@ class EldLevels:
     def sample_scale(self, law: str, gain: Tensor, generator: torch.Generator) -> Tensor:
         """The scale of ``row``, ``gaussian`` or ``tukey_lambda`` noise at these gains, ``(B,)``, white = 1."""
         line = self.camera[law]
-        scatter = line["sigma"] * torch.randn(gain.shape, generator=generator, device=gain.device, dtype=gain.dtype)
+        scatter = line["sigma"] * normal(generator, *gain.shape)
         return torch.exp(line["slope"] * gain.log() + line["bias"] + scatter - math.log(self.white_dn))
 
     def typical(self) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from rawaug.noise.levels import NoiseLevels
 from rawaug.seeding import derived_seed, keyed_generator
 
 Params = dict[str, Tensor]
+"""By name, tensors whose first dimension is the batch."""
 
 _NO_SHOT = 1e-30
 """Replaces a shot_var of 0 to avoid division by zero; too small to affect the picture."""
@@ -42,7 +43,7 @@ _CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
 
 
 class NoiseModel(ABC):
-    """What turns clean packed RAW into noisy.
+    """Base: ``noisy = model.apply(clean, model.sample(B, generator))``, packed RAW ``(B, 4, h, w)``, black 0, white 1.
 
     ``stream`` names the model's random stream: models composed on one picture draw from its one seed without
     correlation.
@@ -130,7 +131,8 @@ class ShotReadModel(NoiseModel):
     """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
 
     Args:
-        levels: what samples (shot_var, read_var), such as ``Preset("cycleisp_sidd")`` or ``FixedLevels(1e-3, 1e-5)``.
+        levels: what samples (shot_var, read_var), white = 1, such as ``Preset("cycleisp_sidd")`` or
+            ``FixedLevels(1e-3, 1e-5)``.
     """
 
     stream = "shot_read"

@@ -24,7 +24,7 @@ from torch import Tensor
 from rawaug.bayer import pack
 from rawaug.noise.cameras import noise_levels
 from rawaug.noise.estimate import from_dark_frames
-from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform
+from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform, normal, uniform
 from rawaug.noise.models import (
     NoiseModel,
     Params,
@@ -56,10 +56,6 @@ def draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
     return torch.full((batch,), float(value), device=generator.device, dtype=torch.float32)
 
 
-def _normal(generator: torch.Generator, *shape: int) -> Tensor:
-    return torch.randn(shape, generator=generator, device=generator.device, dtype=torch.float32)
-
-
 def tukey_lambda_variance(shape: float) -> float:
     """The variance of the Tukey lambda distribution of scale 1, infinite for shapes up to -1/2, which are refused."""
     from scipy.stats import tukeylambda
@@ -74,7 +70,7 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
 
     Args:
         levels: what samples (shot_var, read_var).
-        shape: lambda, or a range from which it is drawn uniformly. ELD measured -0.24 to 0.2.
+        shape: lambda, above -0.5, or a range from which it is drawn uniformly. ELD measured -0.24 to 0.2.
     """
 
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
@@ -84,14 +80,14 @@ class TukeyLambdaNoise(PoissonGaussianNoise):
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         low, high = self.shape
-        uniform = torch.rand(batch, generator=generator, device=generator.device, dtype=torch.float32)
-        return super().sample(batch, generator) | {"tukey_lambda": low + (high - low) * uniform}
+        shape = low + (high - low) * uniform(generator, batch)
+        return super().sample(batch, generator) | {"tukey_lambda": shape}
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)
         shapes, variances = params["tukey_lambda"].tolist(), params["read_var"].tolist()
         for picture, shape, read_var, generator in zip(noise, shapes, variances, generators, strict=True):
-            u = torch.rand(picture.shape, generator=generator, device=like.device, dtype=torch.float32)
+            u = uniform(generator, *picture.shape)
             picture.copy_(_tukey_lambda(u, shape).mul_(math.sqrt(read_var / tukey_lambda_variance(shape))))
         return noise
 
@@ -105,7 +101,7 @@ def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
 
 
 class RowNoise(NoiseModel):
-    """Banding: one Gaussian offset of variance ``row_var`` a row of the sensor.
+    """Banding: each row of the sensor has a Gaussian offset of variance ``row_var``, a number or a range, white = 1.
 
     R and Gr lie in one row of the mosaic and share its offset; Gb and B share that of the next.
     """
@@ -130,7 +126,10 @@ class RowNoise(NoiseModel):
 
 
 class ColumnNoise(NoiseModel):
-    """The same of columns, of which R and Gb share one, and Gr and B the next."""
+    """Banding: each column of the sensor has a Gaussian offset of variance ``column_var``, as in :class:`RowNoise`.
+
+    R and Gb share the offset of one column, Gr and B that of the next.
+    """
 
     stream = "column"
 
@@ -159,7 +158,7 @@ class _FixedPattern(NoiseModel):
 
 
 class BlackOffset(_FixedPattern):
-    """A black level that is off by N(0, sd^2) in each picture, the same for all colours."""
+    """A black level that is off by N(0, sd^2) in each picture, the same for all colours; ``sd`` with white = 1."""
 
     stream = "black_offset"
 
@@ -168,14 +167,14 @@ class BlackOffset(_FixedPattern):
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"black_offset": self.sd * _normal(generator, batch)}
+        return {"black_offset": self.sd * normal(generator, batch)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         return torch.add(clean, per_picture(params["black_offset"], clean), out=out)
 
 
 class ColourBias(_FixedPattern):
-    """An offset N(0, sd^2) of each of R, Gr, Gb and B in each picture; it shows as a cast in the shadows."""
+    """An offset N(0, sd^2) of each of R, Gr, Gb and B in each picture, ``sd`` with white = 1: a cast in the shadows."""
 
     stream = "colour_bias"
     by_plane = True
@@ -185,7 +184,7 @@ class ColourBias(_FixedPattern):
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"colour_bias": self.sd * _normal(generator, batch, 4)}
+        return {"colour_bias": self.sd * normal(generator, batch, 4)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         return torch.add(clean, params["colour_bias"].to(clean)[:, :, None, None], out=out)
@@ -194,10 +193,14 @@ class ColourBias(_FixedPattern):
 class DefectPixels(_FixedPattern):
     """Dead pixels read black; hot ones add a dark current of U(0, 1), so that many reach white.
 
+    ``variance`` leaves them out: they are not noise of a pixel's signal but pixels to be found.
+
     Args:
-        dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it. ``variance`` leaves them out: they are
-            not noise of a pixel's signal but pixels to be found.
-        clusters: the share of these whose whole 2 x 2 cell is alike.
+        dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it.
+        clusters: the share of these, 0 to 1, whose whole 2 x 2 cell is defective.
+
+    Raises:
+        ValueError: if a share is negative, or the shares add up to more than 1.
     """
 
     stream = "defects"
@@ -217,10 +220,9 @@ class DefectPixels(_FixedPattern):
         noisy = clean.clone() if out is None else out.copy_(clean)
         for i, generator in enumerate(self.generators(params, clean.device)):
             dead, hot = float(params["dead_share"][i]), float(params["hot_share"][i])
-            drawn = torch.rand((2, *clean.shape[1:]), generator=generator, device=clean.device, dtype=torch.float32)
-            place, current = drawn.to(clean)
+            place, current = uniform(generator, 2, *clean.shape[1:]).to(clean)
             if self.clusters:
-                cell = torch.rand(clean.shape[-2:], generator=generator, device=clean.device, dtype=torch.float32)
+                cell = uniform(generator, *clean.shape[-2:])
                 place = torch.where(cell < self.clusters, place[:1], place)
             noisy[i].masked_fill_(place < dead, 0.0)
             noisy[i] += torch.where(place >= 1 - hot, current, 0.0)
@@ -231,7 +233,7 @@ class Quantisation(NoiseModel):
     """Rounding to the sensor's digital numbers.
 
     Args:
-        bits: the sensor's depth, or several, of which each picture has one.
+        bits: the sensor's depth, 1 to 16, or several, of which each picture has one.
         black_level: in digital numbers; the grid has 2^bits - 1 - black_level steps from black to white.
 
     The claimed variance, a twelfth of a squared step, holds where the other noise is at least half a step strong.
@@ -309,15 +311,18 @@ class SensorNoise(Compose):
         levels: what samples (shot_var, read_var), or a name or pair that :func:`noise_levels` knows.
         poisson: exact photon statistics instead of the Gaussian.
         tukey_lambda: shape of heavy-tailed read noise instead of Gaussian, or a range of it. Implies ``poisson``.
-        row_var, column_var: variance of banding along rows and columns, or a range of it.
-        black_offset_sd: standard deviation of the black level's error.
-        colour_bias_sd: standard deviation of the colours' offsets.
-        dead, hot: shares of defect pixels, or ranges of them.
-        clusters: share of the defects whose whole 2 x 2 cell is defect.
-        bits, black_level: the grid of digital numbers; of several depths each picture has one.
-        told: range of the factor by which the variance map is wrong, as levels in tags are.
-        share: of the pictures that have an effect, drawn for each effect on its own; all have shot and read noise. So
-            that a denoiser meets sensors as they are without forgetting ideal ones.
+        row_var, column_var: variance of banding along rows and columns, white = 1, or a range of it.
+        black_offset_sd: standard deviation of the black level's error, white = 1.
+        colour_bias_sd: standard deviation of the colours' offsets, white = 1.
+        dead, hot: shares of defective pixels, or ranges of them; see :class:`DefectPixels`.
+        clusters: share of the defects, 0 to 1, whose whole 2 x 2 cell is defective.
+        bits, black_level: the grid of digital numbers; see :class:`Quantisation`.
+        told: range of a factor that the variance map is off by, as the levels in a file's tags can be.
+        share: of the pictures that have an effect, 0 to 1, drawn for each effect on its own. All have shot and read
+            noise: below 1 a denoiser learns real sensors without forgetting ideal ones.
+
+    Raises:
+        ValueError: if a variance or share is out of its range, or the levels are unknown.
 
     Example:
         >>> from rawaug.noise import Preset
@@ -367,10 +372,9 @@ class SensorNoise(Compose):
         params = super().sample(batch, generator)
         if self.told != (1.0, 1.0):
             params["told"] = log_uniform(self.told, batch, generator)
-        for name, none in _ABSENT.items() if self.share < 1 else ():
-            if name in params:
-                absent = torch.rand(batch, generator=generator, device=generator.device) >= self.share
-                params[name][absent] = none
+        if self.share < 1:
+            for name in [key for key in _ABSENT if key in params]:
+                params[name][uniform(generator, batch) >= self.share] = _ABSENT[name]
         return params
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
@@ -387,12 +391,13 @@ class DarkFrames(PoissonGaussianNoise):
 
     Args:
         path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
-        shot_var: of the photons at the frames' ISO, or limits that it is drawn between; by default that of each file's
-            NoiseProfile tag.
+        shot_var: of the photons at the frames' ISO, white = 1, or limits that it is drawn between; by default that of
+            each file's NoiseProfile tag.
 
     Raises:
         FileNotFoundError, OSError: if there is no such file, or it cannot be read.
-        ValueError: if there is no RAW file, one is clipped at black, or ``shot_var`` is neither given nor in the tags.
+        ValueError: if there is no RAW file, one is clipped at black, or ``shot_var`` is negative, or neither given nor
+            in the tags.
 
     Example:
         >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
@@ -404,13 +409,14 @@ class DarkFrames(PoissonGaussianNoise):
         from rawaug.data.folders import RawFolder
         from rawaug.io import read_raw
 
+        _require_not_negative(shot_var=0.0 if shot_var is None else shot_var)
         frames = [read_raw(file) for file in RawFolder(path).files]
         untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
         if untagged:
             raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
         self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
         self.read_var = torch.tensor([from_dark_frames([frame.mosaic], frame.cfa).read_var for frame in frames])
-        self.shot_var = [shot_var or frame.noise_profile[0] for frame in frames]  # type: ignore[index]
+        self.shot_var = [frame.noise_profile[0] if shot_var is None else shot_var for frame in frames]  # type: ignore[index]
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
