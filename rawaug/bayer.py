@@ -19,14 +19,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
-
-X = TypeVar("X", bound=Tensor)
 
 N_VIEWS = 8  # flips and quarter turns of a picture: the dihedral group of the square
 
@@ -219,13 +217,10 @@ def turn_back(image: Tensor, view: int) -> Tensor:
 def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped."""
     _require_even(*raw.shape[-2:])
-    cfa = CFA(cfa)
-    rows, columns = cfa.turned(view).shift_to(cfa)
-    turned = turn(raw, view)
-    height, width = turned.shape[-2:]
-    if height <= 2 * rows or width <= 2 * columns:
-        raise ValueError(f"a mosaic of {height} x {width} is too small to turn while keeping its CFA")
-    return turned[..., rows : height - rows, columns : width - columns]
+    kept = aligned(turn(raw, view), CFA(cfa).turned(view), CFA(cfa))
+    if not all(kept.shape[-2:]):
+        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping its CFA")
+    return kept
 
 
 def turn_packed(packed: Tensor, view: int) -> Tensor:
@@ -248,6 +243,10 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
     if top % 2 or left % 2 or height % 2 or width % 2:
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
+    return _cropped(raw, top, left, height, width)
+
+
+def _cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     if min(top, left) < 0 or min(height, width) < 1 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
         raise ValueError(
             f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {tuple(raw.shape[-2:])}"
@@ -449,19 +448,14 @@ class Pattern:
         planes, inverse = (kept.to(raw) for kept in _sites(self.name, *raw.shape[-2:]))
         return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
 
-    def crop(self, raw: X, top: int, left: int, height: int, width: int) -> Tensor:
+    def crop(self, raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
         """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size."""
         if top % self.period or left % self.period:
             raise ValueError(f"offset ({top}, {left}) must be a multiple of {self.period} to keep {self.name}")
-        inside = 0 <= top <= top + height <= raw.shape[-2] and 0 <= left <= left + width <= raw.shape[-1]
-        if not inside or min(height, width) < 1:
-            size = tuple(raw.shape[-2:])
-            raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {size}")
-        return raw[..., top : top + height, left : left + width]
+        return _cropped(raw, top, left, height, width)
 
     def shift_after(self, view: int) -> tuple[int, int]:
-        """Rows and columns, less than the period, from which a mosaic of whole cells reads the pattern again after
-        :func:`turn`."""
+        """Rows and columns, less than the period, from which a turned mosaic of whole cells reads the pattern again."""
         cell = self.channels(self.period, self.period)
         turned = turn(cell, view)
         sites = [(i, j) for i in range(self.period) for j in range(self.period)]
