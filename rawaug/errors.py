@@ -1,11 +1,8 @@
-"""Names of files as text for terminals, logs and tables: a name may hold any byte but ``/`` and NUL.
+"""Errors as one line that says what to do: a library that is not installed, or a machine that is short of something.
 
-Libraries of the extras, as ``[raw]`` and ``[train]``: what is not installed is named with its extra.
-
-What PyTorch reports when the machine lacks something, as one line with a way out.
-
-PyTorch raises a RuntimeError of several lines where a worker was killed, or shared memory, file descriptors or memory
-have run out: no fault of a program, so no traceback either.
+Where a worker was killed, or shared memory, file descriptors or memory have run out, PyTorch raises a RuntimeError of
+several lines: no fault of a program, so no traceback either. Names of files, which may hold any byte but ``/`` and NUL,
+are made printable for terminals, logs and tables.
 """
 
 from __future__ import annotations
@@ -16,8 +13,7 @@ from contextlib import contextmanager
 
 
 def printable(text: object) -> str:
-    r"""The text with what is not printed as its escape: line breaks, terminal codes, marks that turn the direction of
-    writing, and bytes of a name that are not UTF-8.
+    r"""The text with line breaks, terminal codes, bidirectional marks and bytes that are not UTF-8 as escapes.
 
     Example:
         >>> printable("a\nb\x1b[2Jc ü 写真")

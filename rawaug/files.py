@@ -134,7 +134,7 @@ def _finite(value: Any) -> Any:
 
 
 def parse_object(text: str) -> dict[str, Any]:
-    """A JSON object from a file of others."""
+    """A JSON object from a file of others; ValueError if it is anything else, or a number in it is not finite."""
 
     def refuse(number: str) -> float:
         raise ValueError(f"{number} is not a finite number")
@@ -189,7 +189,11 @@ def write_tensors(tensors: Mapping[str, Tensor], header: Mapping[str, str], path
 def read_tensors(
     path: str | Path, advice: str, infinite: Collection[str] = ()
 ) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Header and tensors of a safetensors file, on the CPU."""
+    """Header and tensors of a safetensors file, on the CPU; those named in ``infinite`` may hold infinity.
+
+    Raises:
+        ValueError: if it cannot be read, or a value is not finite; ``advice`` ends the message.
+    """
     header, tensors = _opened(path, advice, tensors=True)
     for name, tensor in tensors.items():
         values = tensor.float() if tensor.is_floating_point() else tensor  # 8 bits have no test of their own

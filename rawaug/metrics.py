@@ -32,7 +32,11 @@ def _compared(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal."""
+    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal.
+
+    Raises:
+        ValueError: if shapes differ, a picture has no values, or they are not floating point.
+    """
     a, b = _compared(a, b)
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 
@@ -50,7 +54,11 @@ def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of each picture of a batch: ``(B, C, H, W)`` to ``(B,)``."""
+    """SSIM of each picture of a batch: ``(B, C, H, W)`` to ``(B,)``.
+
+    Raises:
+        ValueError: as :func:`psnr`, and if a side is shorter than the window.
+    """
     a, b = _compared(a, b)
     if a.ndim != 4 or min(a.shape[-2:]) < WINDOW:
         raise ValueError(f"SSIM needs (B, C, H, W) with sides of at least {WINDOW}, got {tuple(a.shape)}")

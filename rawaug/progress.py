@@ -1,7 +1,7 @@
 """Progress on stderr: a bar in a terminal; elsewhere, as in the log of a job, one plain line every 30 seconds.
 
 A line of a log covers everything under way, as the images of an evaluation and the tiles of one of them. The
-environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. What is over within it prints no line.
+environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. What takes less prints no line.
 """
 
 from __future__ import annotations

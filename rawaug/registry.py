@@ -1,12 +1,11 @@
-"""What one file adds: networks, filters, noise, datasets, estimators, losses and baselines, by name.
+"""Things by name: the networks, filters, noise models, datasets, estimators, losses, ... that one file adds.
 
 A class or function with ``@KIND.register("name")`` above it, in a module of the kind's package, is found by that name;
 so is one that another installed package offers as an entry point in the group ``rawaug.KIND``. The modules are imported
 when a name is first asked for, an entry point when its own name is: importing this module loads nothing.
 
 Recipes name a thing as ``{name: r2r, settings: {alpha: 0.5}}``; the settings are the keyword arguments of the class.
-
-Names of cameras, as published tables spell them: maker and model. Look-up ignores case and spaces.
+A name that is nearly right is answered with the nearest one.
 """
 
 from __future__ import annotations
@@ -262,7 +261,7 @@ method ``shortest()`` gives the settings with one step of everything."""
 
 
 def spelled(name: str, known: Iterable[str]) -> str:
-    """The one of ``known`` that ``name`` is; of several the first.
+    """The camera of ``known``, maker and model, that ``name`` is but for case and spaces; of several the first.
 
     Raises:
         ValueError: if there is no such name; similar ones are suggested.

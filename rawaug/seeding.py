@@ -25,7 +25,7 @@ def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> tor
 
 
 def rank_key() -> tuple[int, ...]:
-    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and without any."""
+    """The rank as a key that separates the draws of distributed processes; empty for rank 0 and for a single one."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     rank = torch.distributed.get_rank() if distributed else 0
     return (rank,) if rank else ()
@@ -33,9 +33,7 @@ def rank_key() -> tuple[int, ...]:
 
 @contextmanager
 def initialised_from(seed: int) -> Iterator[None]:
-    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then what it
-    was.
-    """
+    """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then restored."""
     default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)

@@ -434,7 +434,10 @@ def _small_rows(srgb, rows, columns, table, x2, start, stop):  # type: ignore[no
 def shot_read(
     clean: Tensor, levels: Tensor, keys: list[int], white: float, with_variance: bool
 ) -> tuple[Tensor, Tensor]:
-    """Noisy RAW and its variance map, float32 ``(B, 4, h, w)`` on the CPU."""
+    """Noisy RAW, clipped at ``white``, and its variance map (without it: empty), float32 ``(B, 4, h, w)`` on the CPU.
+
+    ``levels`` is ``(B, 2)``, shot_var and read_var; ``keys`` has one number below 2^64 a picture.
+    """
     noisy = torch.empty_like(clean, memory_format=torch.contiguous_format)
     variance = torch.empty_like(noisy if with_variance else noisy[:, :, :0])
     signal, out = clean.detach().contiguous().numpy(), noisy.numpy()
@@ -467,7 +470,7 @@ def _log(x):  # type: ignore[no-untyped-def]
     """Natural logarithm of a positive, normal float32: exponent, and a polynomial in the mantissa about 1."""
     bits = np.float32(x).view(np.int32)
     exponent = (bits - np.int32(0x3F3504F3)) >> np.int32(23)  # mantissa in [1 / sqrt(2), sqrt(2))
-    m = np.int32(bits - (exponent << np.int32(23))).view(np.float32) - np.float32(1)
+    m = np.int32(bits - (exponent << np.int32(23))).view(np.float32) - _ONE
     p = _LOG[0]
     for k in range(1, len(_LOG)):
         p = p * m + _LOG[k]
@@ -494,7 +497,7 @@ def _normals(words, count, normals):  # type: ignore[no-untyped-def]
         for i in range(count):
             u = (np.float32(words[pair, i]) + np.float32(0.5)) * np.float32(2.0**-32)
             square = np.float32(-2) * _log(u)
-            radius = np.sqrt(square if square > np.float32(0) else np.float32(0))
+            radius = np.sqrt(square if square > _ZERO else _ZERO)
             turn = np.int32(words[pair + 1, i])
             normals[pair, i] = radius * _sine(np.int32(turn + _QUARTER_TURN))
             normals[pair + 1, i] = radius * _sine(turn)
@@ -504,7 +507,7 @@ def _normals(words, count, normals):  # type: ignore[no-untyped-def]
 def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-untyped-def]
     for j in range(len(signal)):
         y = signal[j]
-        light = y if y > np.float32(0) else np.float32(0)
+        light = y if y > _ZERO else _ZERO
         value = y + np.sqrt(shot * light + read) * normals[j]
         noisy[j] = white if value > white else value
 
@@ -512,7 +515,7 @@ def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-unty
 @part
 def _law(noisy, shot, read, variance):  # type: ignore[no-untyped-def]
     for j in range(len(noisy)):
-        light = noisy[j] if noisy[j] > np.float32(0) else np.float32(0)
+        light = noisy[j] if noisy[j] > _ZERO else _ZERO
         variance[j] = shot * light + read
 
 

@@ -62,7 +62,11 @@ class Camera(NamedTuple):
 
 
 def frame_of(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
-    """One row of :attr:`Camera.frame`."""
+    """One row of :attr:`Camera.frame`, for a picture of ``height`` x ``width`` with the mask's centre at (y, x).
+
+    ``place`` is top, left, height and width of the full frame, and, if the crop was turned or enlarged, its view and
+    how many rows became ``height``.
+    """
     top, left, frame_height, frame_width, view, rows = (*place, 0, 0)[:6]
     step = rows / height if rows else 1.0
     half_diagonal = 0.5 * math.hypot(frame_height, frame_width)
@@ -120,7 +124,16 @@ def _take(curves: Tensor, index: Tensor) -> Tensor:
 
 
 class Display(NamedTuple):
-    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures."""
+    """What the way from camera colour to sRGB needs to know, float32 on the device of the pictures.
+
+    Args:
+        table: ``(N, N, N, 4)`` sRGB over the cube of roots of x2, axes B, G, R; empty if the pictures have curves.
+        curves: ``(B, T)`` sRGB code over the root of x2, one curve a picture for all of its channels; or empty.
+        attention: of the same form as ``table``, a gain in the first of the four over the cube of x5; or empty.
+        matrix: ``(B, 3, 3)`` x3 to x2.
+        gains: ``(B, 4)`` of R, G and B, then the least of them.
+        frame, shading: as of :class:`Camera`.
+    """
 
     table: Tensor
     curves: Tensor

@@ -28,7 +28,11 @@ KINDS = ("auto", "cpu", "cuda", "gpu", "mps")
 
 
 def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
-    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``."""
+    """The device called ``name``, one of :data:`KINDS` or a numbered one such as ``cuda:1``; ``key`` opens messages.
+
+    Raises:
+        ValueError: if the name is unknown, or this machine does not have ``count`` such devices.
+    """
     kind, _, number = name.partition(":")
     if kind not in KINDS or (number and not number.isdigit()):
         raise ValueError(f"{key} {name!r} is unknown; use one of {', '.join(KINDS)}{nearest(kind, KINDS)}")
@@ -115,9 +119,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
-    """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on ``torch.get_num_threads()``
-    threads.
-    """
+    """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on as many threads as PyTorch uses."""
     threads = torch.get_num_threads()
     pieces = min(threads * _PIECES, rows, rows * width // _GRAIN)
     if threads == 1 or pieces < 2:
