@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, Task, replayed
+from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, Task, noise_levels, replayed
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, read_header, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
@@ -130,9 +130,7 @@ def _beside(stem: Path, ending: str) -> Path:
 
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """Metadata of the mosaics; colour that cannot be inverted is not stored."""
-    noise = pair.params.noise
-    stated: dict[str, Any] = {"cfa": augment.cfa}
-    stated |= {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
+    stated: dict[str, Any] = {"cfa": augment.cfa, **noise_levels(pair)}
     try:
         white_balance, matrix, _ = _color(pair, augment)
     except (ValueError, RuntimeError):
@@ -156,12 +154,12 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
         "name": "",
         "gain_maps": _shading_maps(augment, pair),
     }
-    noise = pair.params.noise
-    levels = (float(noise["shot_var"]), float(noise["read_var"])) if {"shot_var", "read_var"} <= set(noise) else None
+    levels = noise_levels(pair)
+    profile = (levels["shot_var"], levels["read_var"]) if len(levels) == 2 else None
     clean, noisy = (augment.mosaic(raw) for raw in (pair.clean, pair.noisy))
     return (
         RawFrame(mosaic=clean, noise_profile=None, **metadata),
-        RawFrame(mosaic=noisy, noise_profile=levels, **metadata),
+        RawFrame(mosaic=noisy, noise_profile=profile, **metadata),
         stops,
     )
 

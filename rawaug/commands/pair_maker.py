@@ -118,6 +118,12 @@ class PairMaker:
         return self.origin(picture, content), made()
 
 
+def noise_levels(pair: RawPair) -> dict[str, float]:
+    """``shot_var`` and ``read_var`` of a pair, as far as its noise model has them."""
+    noise = pair.params.noise
+    return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
+
+
 def replayed(
     drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
 ) -> RawPair:

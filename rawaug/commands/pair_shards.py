@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, replayed
+from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, noise_levels, replayed
 from rawaug.files import parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 
@@ -114,9 +114,8 @@ def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, numbe
     """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
     own = {**vars(origin), "picture": name, "isp": Path(origin.isp).name, "number": number}
     height, width = maker.augment.mosaic(pair.clean).shape[-2:]
-    levels = {key: pair.params.noise[key].item() for key in ("shot_var", "read_var") if key in pair.params.noise}
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
-    return own | levels | {"height": height, "width": width, "params": params}
+    return own | noise_levels(pair) | {"height": height, "width": width, "params": params}
 
 
 def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:

@@ -248,7 +248,7 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-def _prepare(settings: Settings, max_pixels: int = MAX_PIXELS) -> None:
+def _prepare(settings: Settings, max_pixels: int) -> None:
     global _maker
     _maker = PairMaker(settings, max_pixels)
 

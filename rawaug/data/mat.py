@@ -8,6 +8,8 @@ naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +50,22 @@ def _variables(path: Path) -> list[str]:
 
         with damage_as_os_error(path, _UNREADABLE, _Missing):
             return [name for name, *_ in whosmat(path)]
+    with _hdf5(path) as file:
+        return _names(file)
+
+
+@contextmanager
+def _hdf5(path: Path) -> Iterator[Any]:
     with damage_as_os_error(path, _UNREADABLE, _Missing):
         with extra("data"):
             import h5py
 
         with h5py.File(path, "r") as file:
-            return [name for name in file if not name.startswith("#")]
+            yield file
+
+
+def _names(file: Any) -> list[str]:
+    return [name for name in file if not name.startswith("#")]
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
@@ -74,15 +86,11 @@ def read_value(path: str | Path, name: str) -> Any:
 def _read(path: Path, name: str, plain: bool) -> Any:
     if mat_version(path) == "5":
         return _read_5(path, name, plain)
-    with damage_as_os_error(path, _UNREADABLE, _Missing):
-        with extra("data"):
-            import h5py
-
-        with h5py.File(path, "r") as file:
-            if name not in file:
-                raise _missing(path, name, [key for key in file if not key.startswith("#")])
-            node = _member(file, name)
-            return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
+    with _hdf5(path) as file:
+        if name not in file:
+            raise _missing(path, name, _names(file))
+        node = _member(file, name)
+        return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
 
 
 def _read_5(path: Path, name: str, plain: bool) -> Any:
@@ -103,8 +111,7 @@ def _require_size(size: int, name: str) -> None:
 
 def _member(group: Any, name: str) -> Any:
     """A member of a group; HDF5 links are refused, since they can point to any file on this machine."""
-    with extra("data"):
-        import h5py
+    import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"{name} is a link, not a variable")
@@ -129,8 +136,7 @@ def _values(node: Any) -> Any:
 
 def _plain(node: Any, file: Any) -> Any:
     """An HDF5 node of a 7.3 file as plain values."""
-    with extra("data"):
-        import h5py
+    import h5py
 
     if isinstance(node, h5py.Group):
         fields = {key: _plain(_member(node, key), file) for key in node}
@@ -150,7 +156,6 @@ def _plain(node: Any, file: Any) -> Any:
 
 def _refers(node: Any) -> bool:
     """Whether a node holds references: a cell, or a field of a struct array."""
-    with extra("data"):
-        import h5py
+    import h5py
 
     return isinstance(node, h5py.Dataset) and h5py.check_ref_dtype(node.dtype) is not None

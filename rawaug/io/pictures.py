@@ -141,15 +141,7 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
 
 def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
     """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
-    with extra("raw"):
-        import OpenImageIO as oiio
-
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such picture file")
-    require_utf8(path)
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
+    source = _opened(path)
     spec = source.spec()
     spec.attribute(_FORMAT, source.format_name())
     _require_size(spec, path, max_pixels)
@@ -163,6 +155,19 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
     if pixels is None or error:
         raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(error)})")
     return pixels, spec
+
+
+def _opened(path: Path) -> Any:
+    with extra("raw"):
+        import OpenImageIO as oiio
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such picture file")
+    require_utf8(path)
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
+    return source
 
 
 def require_utf8(path: Path) -> None:
@@ -223,15 +228,7 @@ def read_exposure(path: str | Path) -> float:
 
     One stop more is twice the RAW value; unlike the exposure value of ISO 2720 it grows with exposure.
     """
-    with extra("raw"):
-        import OpenImageIO as oiio
-
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such picture file")
-    require_utf8(Path(path))
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {oiio.geterror().strip()})")
+    source = _opened(Path(path))
     spec = source.spec()
     source.close()
     iso = next((value for name in _ISO if (value := spec.get_int_attribute(name, 0))), 0)
