@@ -14,6 +14,9 @@ from torch.nn import functional as F
 from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS, require_between
 
+CONTEXT = 4
+"""Of the cells of DRUNet's last scale, the sides of the squares whose mean they are without."""
+
 PUBLISHED_WIDTH = 32
 """Features of the U-Net's first scale in the paper."""
 
@@ -380,14 +383,16 @@ class DRUNet(Denoiser):
         require_between("scales", scales, 1, MOST_SCALES)
         require_bounded(seed, blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        stride = max(MEAN_OVER, 2 ** (scales - 1))
-        super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend)
+        cell = 2 ** (scales - 1)
+        super().__init__(channels, variance_map, deviation, CONTEXT * cell, config, domain, limits, mend)
+        self.cell = cell
         sizes = [width * 2**k for k in range(scales)]
         self.head = conv(self.inputs, width, bias=False)
         self.encoder = nn.ModuleList(_residuals(size, blocks) for size in sizes)
         self.downs = nn.ModuleList(conv(c, 2 * c, 2, bias=False, stride=2, padding=0) for c in sizes[:-1])
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_residuals(size, blocks) for size in reversed(sizes[:-1]))
+        self.coarse = conv(channels, sizes[-1], bias=False)
         self.tail = conv(width, channels, bias=False)
         # As in DHDN: residual blocks one after another stay tame when each starts as the identity.
         ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
@@ -395,15 +400,23 @@ class DRUNet(Denoiser):
 
     def residual(self, features: Tensor) -> Tensor:
         signal, maps = features[:, : self.channels], features[:, self.channels :]
-        mean = F.interpolate(F.avg_pool2d(signal, MEAN_OVER), scale_factor=MEAN_OVER, mode="bilinear")
-        x, skips = self.head(torch.cat([signal - mean, maps], dim=1)), []
+        mean = F.avg_pool2d(signal, self.cell)
+        x, skips = self.head(torch.cat([_without(signal, mean), maps], dim=1)), []
+        # The mean over a cell has noise of deviation 1 / cell.
+        coarse = self.coarse(self.cell * _without(mean, F.avg_pool2d(mean, CONTEXT)))
         for k, blocks in enumerate(self.encoder):
-            x = blocks(self.downs[k - 1](x) if k else x)
+            x = self.downs[k - 1](x) if k else x
+            x = blocks(x + coarse if k == len(self.encoder) - 1 else x)
             skips.append(x)
         for up, blocks, skip in zip(self.ups, self.decoder, reversed(skips[:-1]), strict=True):
             x = blocks(F.pixel_shuffle(up(x), 2) + skip)
         correction: Tensor = self.tail(x)
         return correction
+
+
+def _without(signal: Tensor, mean: Tensor) -> Tensor:
+    """``signal`` less ``mean``, which has fewer pixels and is interpolated."""
+    return signal - F.interpolate(mean, signal.shape[-2:], mode="bilinear")
 
 
 def _residuals(width: int, number: int) -> nn.Sequential:

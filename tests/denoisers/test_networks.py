@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 import denoisers
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
@@ -175,10 +176,20 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
 @torch.no_grad()
 def test_drunet_s_correction_does_not_depend_on_brightness_away_from_the_limits() -> None:
     """Nor, having no biases, is it limited to the size of the errors that it was trained on."""
-    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False))
-    signal = torch.randn(1, 4, 32, 32, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(net.residual(signal + 100.0), net.residual(signal), rtol=0, atol=1e-4)
-    torch.testing.assert_close(net.residual(7.0 * signal), 7.0 * net.residual(signal), rtol=1e-4, atol=1e-4)
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False)).double()
+    signal = torch.randn(1, 4, 32, 32, generator=torch.Generator().manual_seed(0)).double()
+    torch.testing.assert_close(net.residual(signal + 100.0), net.residual(signal))
+    torch.testing.assert_close(net.residual(7.0 * signal), 7.0 * net.residual(signal))
+
+
+@torch.no_grad()
+def test_drunet_sees_noise_of_every_size() -> None:
+    """Through the last scale also what is the same in a whole cell."""
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False)).double()
+    cells = torch.randn(1, 4, 16, 16, generator=torch.Generator().manual_seed(0)).double()
+    correction = F.avg_pool2d(net.residual(F.interpolate(cells, scale_factor=4)), 4)
+    net.get_parameter("coarse.weight").zero_()
+    assert (correction - F.avg_pool2d(net.residual(F.interpolate(cells, scale_factor=4)), 4)).std() > 0.1
 
 
 @torch.no_grad()
