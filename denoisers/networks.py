@@ -14,9 +14,6 @@ from torch.nn import functional as F
 from denoisers.network import LEAK, MOST_SCALES, PACKED, RESIDUAL_GAIN, Denoiser, conv, require_bounded, require_width
 from rawaug.registry import DENOISERS, require_between
 
-CONTEXT = 4
-"""Of the cells of DRUNet's last scale, the sides of the squares whose mean they are without."""
-
 PUBLISHED_WIDTH = 32
 """Features of the U-Net's first scale in the paper."""
 
@@ -327,8 +324,8 @@ def _blocks(width: int, number: int) -> nn.Sequential:
     return nn.Sequential(*(NAFBlock(width) for _ in range(number)))
 
 
-MEAN_OVER = 8
-"""Side of the squares over which DRUNet takes the mean of its signal."""
+CONTEXT = 4
+"""Sides, in cells of DRUNet's last scale, of the squares whose mean that scale is without."""
 
 
 class ResidualBlock(nn.Module):
