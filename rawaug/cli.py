@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 from rawaug import __version__
-from rawaug.errors import MissingExtra, printable, shortage, without_traceback
+from rawaug.errors import MissingExtra, escape, resource_error, without_traceback
 from rawaug.progress import quiet as without_progress
 
 BAD_INPUT = 2
@@ -121,13 +121,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MissingExtra, CycloptsError) as error:
         said = _one_line(error)
     except (RuntimeError, MemoryError) as error:
-        if (reason := shortage(error)) is None:
+        if (reason := resource_error(error)) is None:
             raise
         said = reason + _being_read()
     except KeyboardInterrupt:
         print("rawaug: stopped; run the same command again to resume", file=sys.stderr)
         return 130
-    print(f"rawaug: {printable(said)}", file=sys.stderr)
+    print(f"rawaug: {escape(said)}", file=sys.stderr)
     return BAD_INPUT
 
 

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-def printable(text: object) -> str:
+def escape(text: object) -> str:
     r"""The text with line breaks, terminal codes, bidirectional marks and bytes that are not UTF-8 as escapes.
 
     Example:
-        >>> printable("a\nb\x1b[2Jc ü 写真")
+        >>> escape("a\nb\x1b[2Jc ü 写真")
         'a\\nb\\x1b[2Jc ü 写真'
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text))
@@ -62,11 +62,11 @@ _WAYS_OUT = (
 """By what the error says, in lower case, first match."""
 
 
-def shortage(error: BaseException) -> str | None:
+def resource_error(error: BaseException) -> str | None:
     """What is short and what to do about it, in one line; None for any other error.
 
     Example:
-        >>> shortage(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
+        >>> resource_error(RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed. "))
         'a worker process was killed, perhaps for its memory; use fewer workers, then run the same command again'
     """
     if isinstance(error, MemoryError):

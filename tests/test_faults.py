@@ -25,7 +25,7 @@ from rawaug.cli import main
 from rawaug.commands import pair_files, pair_maker
 from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
-from rawaug.errors import shortage
+from rawaug.errors import resource_error
 from rawaug.files import LOCK, locked, replacing, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.training.config import TrainConfig
@@ -303,10 +303,10 @@ def test_a_worker_that_the_system_kills_is_one_line(
     ],
 )  # fmt: skip
 def test_what_the_machine_lacks_is_said_in_one_line(said: str, way_out: str) -> None:
-    line = shortage(RuntimeError(said))
+    line = resource_error(RuntimeError(said))
     assert line is not None and way_out in line and "\n" not in line
-    assert shortage(RuntimeError("mat1 and mat2 shapes cannot be multiplied")) is None
-    assert "smaller batch" in str(shortage(MemoryError()))
+    assert resource_error(RuntimeError("mat1 and mat2 shapes cannot be multiplied")) is None
+    assert "smaller batch" in str(resource_error(MemoryError()))
 
 
 def test_64_descriptors_are_enough_for_two_workers() -> None:
@@ -338,7 +338,7 @@ def test_a_small_dev_shm_is_said_in_one_line(harness: Any) -> None:
         loader: DataLoader[Any] = DataLoader(pictures, batch_size=4, num_workers=2)
         with pytest.raises(RuntimeError) as error:
             list(loader)
-        assert "shared memory is full" in str(shortage(error.value))
+        assert "shared memory is full" in str(resource_error(error.value))
 
     assert in_child(load) == 0
 

@@ -35,7 +35,7 @@ from rawaug.commands.frame_denoisers import (
 )
 from rawaug.commands.pair_maker import require_same_settings
 from rawaug.data.folders import RAW_EXTENSIONS, files_below
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
 from rawaug.io.isolated import isolated
@@ -280,10 +280,10 @@ def print_denoised(result: DenoisedFolder) -> None:
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""
-        print(f"{printable(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
+        print(f"{escape(done.out)}: {levels}, {done.seconds:.1f} s{clipped}")
     if result.existing or result.broken:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for reason in result.broken.values():
-        print(printable(reason))
+        print(escape(reason))
     if result.unread:
-        print(printable(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))
+        print(escape(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))

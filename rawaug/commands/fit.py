@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.files import locked, require_writable
 from rawaug.isp.fit import FitConfig
 from rawaug.noise import camera_law
@@ -61,7 +61,7 @@ def run(
         isp.info["data"] = data
         isp.save(out)
     for line in isp.info.get("unreadable", []):
-        print(printable(line))
+        print(escape(line))
     print(f"fitted {len(isp.info['frames'])} frames in {isp.info['seconds']} s: {out}")
     for score in isp.info.get("held_out", [])[-1:]:
         print(f"held out: {score['blind']:.2f} dB blind, {score['as_shot']:.2f} dB with the as-shot white balance")

@@ -20,7 +20,7 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
-from rawaug.plugin.sampling_config import Drawing, draw_key
+from rawaug.plugin.sampling_config import SamplingConfig, draw_key
 from rawaug.registry import Spec
 
 
@@ -47,7 +47,7 @@ class Settings:
     """The settings that the files depend on, besides the pictures; stored in ``synth.json`` beside them."""
 
     format: Format
-    drawing: Drawing
+    drawing: SamplingConfig
     isp_sha256: str
     seed: int
 

@@ -28,12 +28,12 @@ from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import LOCK, find_weights, locked, sha256
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import Sampling
-from rawaug.plugin.sampling_config import Drawing
+from rawaug.plugin.sampling_config import SamplingConfig
 from rawaug.progress import progress
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "replay_sample", "synth"]
@@ -46,7 +46,7 @@ def run(
     *,
     format: Format = "dng",
     per_image: int = 1,
-    drawing: Annotated[Drawing, OPTIONS] | None = None,
+    drawing: Annotated[SamplingConfig, OPTIONS] | None = None,
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -68,7 +68,7 @@ def run(
         per_shard: pictures per tar file, with --format webdataset.
     """
     rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
-    drawn = vars(drawing or Drawing())
+    drawn = vars(drawing or SamplingConfig())
     noise = value_of(drawn["noise"]) if isinstance(drawn["noise"], str) else drawn["noise"]  # [shot_var, read_var]
     print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **drawn | {"noise": noise}))
 
@@ -117,7 +117,7 @@ def synth(
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
         drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso`` and ``cfa``, as in
-            :class:`rawaug.plugin.sampling_config.Drawing`.
+            :class:`rawaug.plugin.sampling_config.SamplingConfig`.
 
     Raises:
         FileNotFoundError: if there is no such folder, picture or ISP.
@@ -168,7 +168,7 @@ def _settings(format: Format, per_image: int, seed: int, **drawn: Any) -> Settin
         wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
         raise ValueError(f"{wanted}, got {format} and {per_image}")
     isp = drawn["isp"]
-    drawing = Drawing(**drawn | {"isp": str(isp) if not Path(isp).suffix else str(Path(isp).resolve())})
+    drawing = SamplingConfig(**drawn | {"isp": str(isp) if not Path(isp).suffix else str(Path(isp).resolve())})
     return Settings(format, drawing, sha256(find_weights(drawing.isp)), seed)
 
 
@@ -263,4 +263,4 @@ def print_synthesis(result: Synthesis) -> None:
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])
     for reason in result.broken.values():
-        print(f"unreadable: {printable(reason)}")
+        print(f"unreadable: {escape(reason)}")

@@ -25,7 +25,7 @@ from rawaug.data.pairs import Pair
 from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission
 from rawaug.data.sidd.frames import SiddFrames, is_scene
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import isolated
 
@@ -64,12 +64,12 @@ class PartReport:
             counts: Counter[str] = getattr(self, name)
             if counts:
                 more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
-                shown = ", ".join(f"{printable(value)} ({count})" for value, count in counts.most_common(_SHOWN))
+                shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
                 lines.append(f"  {name}: {shown}{more}")
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
-        return "\n".join([*lines, *(f"    {printable(line)}" for line in self.broken)])
+        return "\n".join([*lines, *(f"    {escape(line)}" for line in self.broken)])
 
 
 @dataclass
@@ -84,7 +84,7 @@ class DataReport:
         return [line for part in self.parts for line in part.broken]
 
     def __str__(self) -> str:
-        return "\n".join([printable(self.path), *map(str, self.parts)])
+        return "\n".join([escape(self.path), *map(str, self.parts)])
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:

@@ -27,7 +27,7 @@ from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 
 from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
 from rawaug.io.pictures import MAX_PIXELS, through_jpeg
 
@@ -151,10 +151,10 @@ class PictureFolder(Dataset[Tensor]):
     def report(self) -> str:
         """What was skipped so far, one line a file."""
         skipped = self.skipped
-        folder = printable(self.path)
+        folder = escape(self.path)
         if not skipped:
             return f"{folder}: none of {len(self)} pictures skipped so far"
-        lines = map(printable, skipped.values())
+        lines = map(escape, skipped.values())
         return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
 
     def being_read(self) -> list[Path]:
@@ -282,7 +282,7 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     reasons = pairs.reasons()
     if not reasons:
         return []
-    return [f"left out of {printable(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(printable, reasons)]
+    return [f"left out of {escape(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(escape, reasons)]
 
 
 def skip_broken(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:

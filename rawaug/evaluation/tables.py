@@ -18,7 +18,7 @@ from torch import Tensor
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
-from rawaug.errors import extra, printable
+from rawaug.errors import escape, extra
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
@@ -59,7 +59,7 @@ def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
         for axis, (title, packed) in zip(axes[first:].flat, row.panels.items(), strict=False):
             panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
-            caption = f"{printable(title)}\n{printable(row.captions.get(title, ''))}"
+            caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"
             axis.set_title(caption, fontsize=9, parse_math=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
@@ -133,12 +133,12 @@ def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=Text(printable(title)))
+    table = Table(title=Text(escape(title)))
     for k, column in enumerate(head):
         table.add_column(column, justify="right" if k else "left")
     for rows in sections:
         for row in rows:
-            table.add_row(*(Text(printable(cell)) for cell in row))  # Text: brackets are no markup
+            table.add_row(*(Text(escape(cell)) for cell in row))  # Text: brackets are no markup
         table.add_section()
     console = Console()
     (console if console.is_terminal else Console(width=WIDTH)).print(table)

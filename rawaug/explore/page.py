@@ -19,12 +19,12 @@ import numpy as np
 from jinja2 import Environment
 
 from rawaug.bayer import PATTERNS
-from rawaug.errors import MissingExtra, extra, printable
+from rawaug.errors import MissingExtra, escape, extra
 from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
 from rawaug.explore.views import VIEWS, Panel, denoised
 from rawaug.files import shipped_isps
 from rawaug.isp.cameras import LAMPS, published_cameras
-from rawaug.plugin.sampling_config import Drawing
+from rawaug.plugin.sampling_config import SamplingConfig
 
 STYLE = """
 .panels {display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); gap: 12px}
@@ -95,7 +95,7 @@ def look_of(values: Mapping[str, Any]) -> Look:
     if not picture:
         raise ValueError("choose a picture")
     light = values["light"]
-    drawing = Drawing(
+    drawing = SamplingConfig(
         isp=values["isp"],
         camera=_given(values["camera"]),
         light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
@@ -128,7 +128,7 @@ def shown(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
         return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
     except (ValueError, OSError, MissingExtra) as error:
         empty: dict[str, Any] = {tab: None, "compared": ""} if tab == DENOISE else {tab: ""}
-        return {"message": message(printable(str(error))), **empty, "python": "", "command": ""}
+        return {"message": message(escape(str(error))), **empty, "python": "", "command": ""}
 
 
 def _code(look: Look) -> dict[str, str]:
@@ -165,7 +165,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    isps, usual = shipped_isps(), Drawing()
+    isps, usual = shipped_isps(), SamplingConfig()
     cameras = sorted(set(published_cameras().names), key=str.casefold)
     with gr.Group():
         picture = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", elem_id="picture")
@@ -242,7 +242,7 @@ def _fitting(gr: Any, isp: str, tone: str, noise: str) -> list[Any]:
     """Cameras, lights and tones are those of published cameras; the noise of the ISP's own goes with it."""
     published, tones, noises = bool(loaded(isp).config.cameras), [ANY, *tones_of(isp)], noises_of(isp)
     toned = gr.update(interactive=published, choices=tones, **({} if tone in tones else {"value": ANY}))
-    usual = Drawing().noise
+    usual = SamplingConfig().noise
     noised = gr.update(choices=noises, **({} if noise in noises else {"value": usual}))
     return [gr.update(interactive=published), gr.update(interactive=published), toned, noised]
 

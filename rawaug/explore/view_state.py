@@ -18,7 +18,7 @@ from rawaug.noise.cameras import ProfileLevels
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair
 from rawaug.plugin.pictures import even_sided
-from rawaug.plugin.sampling_config import Drawing, draw_key
+from rawaug.plugin.sampling_config import SamplingConfig, draw_key
 from rawaug.registry import NOISE
 
 
@@ -33,7 +33,7 @@ class Look:
     """
 
     picture: str
-    drawing: Drawing = field(default_factory=Drawing)
+    drawing: SamplingConfig = field(default_factory=SamplingConfig)
     seed: int = 0
 
 
@@ -66,8 +66,8 @@ def opened(picture: str, changed: int) -> Tensor:
     return even_sided(read_picture(picture))
 
 
-def augmentation(drawing: Drawing) -> RawAugment:
-    """What :meth:`Drawing.make` makes, from an ISP that is baked once."""
+def augmentation(drawing: SamplingConfig) -> RawAugment:
+    """What :meth:`SamplingConfig.make` makes, from an ISP that is baked once."""
     return _baked(drawing.isp, drawing.camera, drawing.cfa).redrawn(**drawing.draws())
 
 
@@ -104,7 +104,7 @@ def iso_range(noise: str) -> tuple[float, float] | None:
     return limits
 
 
-def possible(drawing: Drawing) -> Drawing:
+def possible(drawing: SamplingConfig) -> SamplingConfig:
     """Without what does not apply: light, tone and camera of a fitted ISP, the ISO of noise that has none."""
     if not loaded(drawing.isp).config.cameras:
         drawing = replace(drawing, camera=None, light=None, tone=None)
@@ -119,11 +119,11 @@ def command(look: Look, out: str = "pairs") -> str:
     """The command that writes the pair as ``NAME_0.npz``; with ``--per-image 8`` all eight draws of the page.
 
     Example:
-        >>> command(Look("cat.png", Drawing(light=5500, exposure=-0.5), seed=3))
+        >>> command(Look("cat.png", SamplingConfig(light=5500, exposure=-0.5), seed=3))
         'rawaug synth cat.png pairs --format npz --light 5500 --exposure=-0.5 --seed 3'
     """
-    usual, words = Drawing(), ["rawaug", "synth", look.picture, out, "--format", "npz"]
-    for name in (option.name for option in fields(Drawing)):
+    usual, words = SamplingConfig(), ["rawaug", "synth", look.picture, out, "--format", "npz"]
+    for name in (option.name for option in fields(SamplingConfig)):
         value = getattr(look.drawing, name)
         if value != getattr(usual, name):
             text = _text(value)
@@ -135,7 +135,7 @@ def python(look: Look) -> str:
     """The Python that makes the pair.
 
     Example:
-        >>> print(python(Look("cat.png", Drawing(light=5500))))
+        >>> print(python(Look("cat.png", SamplingConfig(light=5500))))
         import rawaug
         from rawaug.io import read_picture
         from rawaug.plugin.sampling_config import draw_key

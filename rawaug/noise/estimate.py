@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, pack
-from rawaug.errors import extra, printable
+from rawaug.errors import escape, extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -397,7 +397,7 @@ def plot_noise(
             axes.legend(fontsize=8)
         else:
             axes.set(xlim=(line[0], 1.0), ylim=(variance[used].min() / 3, 3 * variance[used].max()))
-    figure.suptitle(printable(title), parse_math=False)
+    figure.suptitle(escape(title), parse_math=False)
     if path is not None:
         figure.savefig(Path(path), dpi=120)
     return figure

@@ -19,7 +19,7 @@ def draw_key(seed: int, name: str, number: int) -> torch.Generator:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class SamplingConfig:
     """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them.
 
     Args:

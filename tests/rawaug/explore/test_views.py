@@ -18,7 +18,7 @@ from rawaug.explore.figures import variance_by_signal
 from rawaug.explore.page import as_html, data_url, message
 from rawaug.explore.view_state import Look, command, drawn, iso_range, noises_of, possible, python
 from rawaug.io import read_picture, write_picture
-from rawaug.plugin.sampling_config import Drawing
+from rawaug.plugin.sampling_config import SamplingConfig
 
 LEVELS = (1e-4, 1e-6)
 
@@ -34,13 +34,13 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     "drawing",
     [
-        Drawing(),
-        Drawing("universal", "Nikon D750", 4000.0, "Nikon D750", -0.5, "Nikon D750", 1600.0, cfa="GRBG"),
-        Drawing(light="LED-B3", noise=LEVELS, cfa="XTRANS"),
-        Drawing("canon-powershot", exposure=0.25, noise="any camera"),
+        SamplingConfig(),
+        SamplingConfig("universal", "Nikon D750", 4000.0, "Nikon D750", -0.5, "Nikon D750", 1600.0, cfa="GRBG"),
+        SamplingConfig(light="LED-B3", noise=LEVELS, cfa="XTRANS"),
+        SamplingConfig("canon-powershot", exposure=0.25, noise="any camera"),
     ],
 )
-def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: Drawing, tmp_path: Path) -> None:
+def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: SamplingConfig, tmp_path: Path) -> None:
     look = Look(picture, drawing, seed=5)
     pair = drawn(look).pair
     words = shlex.split(command(look, str(tmp_path)))
@@ -54,7 +54,7 @@ def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: Dra
 
 def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
     for isp, most in (("universal", 2), ("gopro-hero", 6)):  # of a learned tone network the curve of greys alone
-        look = Look(picture, Drawing(isp, exposure=0.0, noise=(1e-12, 1e-12)))
+        look = Look(picture, SamplingConfig(isp, exposure=0.0, noise=(1e-12, 1e-12)))
         noisy, clean = views.pair(look)
         truth = read_picture(picture)[:, :96, :144].permute(1, 2, 0).numpy().astype(float)
         for panel in (noisy, clean):
@@ -64,7 +64,7 @@ def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
 
 
 def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> None:
-    look = Look(picture, Drawing(noise=LEVELS))
+    look = Look(picture, SamplingConfig(noise=LEVELS))
     panels = {name: view(look) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
         "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8
@@ -80,7 +80,7 @@ def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> No
 
 @pytest.mark.parametrize("cfa", ["XTRANS", "QUAD-BGGR"])
 def test_other_patterns_have_no_packed_planes_and_no_network(picture: str, cfa: str) -> None:
-    look = Look(picture, Drawing(cfa=cfa))
+    look = Look(picture, SamplingConfig(cfa=cfa))
     assert [panel.title.partition(":")[0] for panel in views.raw(look)] == [cfa, "histograms"]
     assert views.pair(look)[0].image.shape == (96, 144, 3)
     with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
@@ -88,7 +88,7 @@ def test_other_patterns_have_no_packed_planes_and_no_network(picture: str, cfa: 
 
 
 def test_the_shipped_network_removes_noise(picture: str) -> None:
-    look = Look(picture, Drawing(noise=(5e-3, 1e-4), exposure=0.0, light=5500.0, cfa="BGGR"))
+    look = Look(picture, SamplingConfig(noise=(5e-3, 1e-4), exposure=0.0, light=5500.0, cfa="BGGR"))
     noisy, denoised = views.denoised(look)
     before, after = (float(panel.title.split()[-2]) for panel in (noisy, denoised))
     assert after > before + 3
@@ -98,7 +98,7 @@ def test_the_shipped_network_removes_noise(picture: str) -> None:
 
 def test_large_pictures_are_shown_in_part(tmp_path: Path) -> None:
     write_picture(tmp_path / "large.png", demo_pictures(1)[0].repeat(1, 2, 2))
-    look = Look(str(tmp_path / "large.png"), Drawing())
+    look = Look(str(tmp_path / "large.png"), SamplingConfig())
     assert drawn(look).srgb.shape == (3, 1024, 1024)
     assert [panel.image.shape for panel in views.pair(look)] == [(512, 768, 3)] * 2
     assert {max(panel.image.shape) for panel in views.stages(look)} == {512}
@@ -117,11 +117,11 @@ def test_measured_variance_follows_the_law() -> None:
 
 
 def test_what_does_not_apply_is_left_out() -> None:
-    assert possible(Drawing("gopro-hero", "Nikon D750", 5500.0, "linear")) == Drawing("gopro-hero")
-    assert possible(Drawing("universal-small", tone="nokia like", noise="upi", iso=800.0)) == Drawing(
+    assert possible(SamplingConfig("gopro-hero", "Nikon D750", 5500.0, "linear")) == SamplingConfig("gopro-hero")
+    assert possible(SamplingConfig("universal-small", tone="nokia like", noise="upi", iso=800.0)) == SamplingConfig(
         "universal-small", noise="upi"
     )
-    kept = Drawing(noise="Nikon D750", iso=800.0, tone="linear")
+    kept = SamplingConfig(noise="Nikon D750", iso=800.0, tone="linear")
     assert possible(kept) == kept
     assert "camera" in noises_of("gopro-hero") and "camera" not in noises_of("universal")
     assert iso_range("any camera") is not None and iso_range("camera") is None

@@ -10,7 +10,7 @@ import torch
 
 from rawaug.commands.synth import print_synthesis, synth
 from rawaug.data import PictureFolder, check
-from rawaug.errors import printable
+from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import write_picture
 
@@ -69,5 +69,5 @@ def test_tables_show_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_what_can_be_printed_stays() -> None:
-    assert printable("é ü 写真 ½") == "é ü 写真 ½"
-    assert printable("a\udc80b\r") == r"a\udc80b\r"
+    assert escape("é ü 写真 ½") == "é ü 写真 ½"
+    assert escape("a\udc80b\r") == r"a\udc80b\r"

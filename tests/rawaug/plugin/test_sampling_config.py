@@ -10,7 +10,7 @@ import torch
 from rawaug.isp.cameras import LAMPS, light_range, published_cameras, sample_lights, white_balance, white_point
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.sampling_config import Drawing
+from rawaug.plugin.sampling_config import SamplingConfig
 
 PICTURE = torch.randint(256, (3, 16, 24), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
@@ -21,7 +21,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 def test_a_lamp_and_a_temperature_give_their_gains() -> None:
     camera = published_cameras().named(["Nikon D750"])
-    lamp = Drawing(camera="Nikon D750", light="LED-B1", exposure=0.0).make()
+    lamp = SamplingConfig(camera="Nikon D750", light="LED-B1", exposure=0.0).make()
     expected = white_balance(camera, white_point(LAMPS["LED-B1"]))
     drawn = torch.stack([lamp.sample(PICTURE, seeded(k)).isp.gains for k in range(20)])
     balance = drawn / drawn[:, 1:2]
@@ -33,7 +33,7 @@ def test_a_lamp_and_a_temperature_give_their_gains() -> None:
 
 
 def test_one_tone_curve_is_drawn_and_the_camera_stays() -> None:
-    augment = Drawing().make()
+    augment = SamplingConfig().make()
     names = augment.isp.info["tones"]
     any_tone = augment.sample(PICTURE, seeded())
     setting = augment.redrawn("cycleisp_sidd", tone="Nikon D750").sample(PICTURE, seeded())
@@ -44,11 +44,11 @@ def test_one_tone_curve_is_drawn_and_the_camera_stays() -> None:
 @pytest.mark.parametrize(
     "drawing",
     [
-        Drawing("universal", "Nikon D750", 4000, "linear", -0.5, "Nikon D750", iso=1600, cfa="BGGR"),
-        Drawing(isp="gopro-hero", noise=(1e-3, 1e-5), cfa="XTRANS", exposure=-1.0),
+        SamplingConfig("universal", "Nikon D750", 4000, "linear", -0.5, "Nikon D750", iso=1600, cfa="BGGR"),
+        SamplingConfig(isp="gopro-hero", noise=(1e-3, 1e-5), cfa="XTRANS", exposure=-1.0),
     ],
 )
-def test_redrawn_is_what_a_new_one_draws(drawing: Drawing) -> None:
+def test_redrawn_is_what_a_new_one_draws(drawing: SamplingConfig) -> None:
     new = drawing.make()
     shared = RawAugment.from_pretrained(drawing.isp, camera=drawing.camera, cfa=drawing.cfa).redrawn(**drawing.draws())
     first, second = (augment(PICTURE, seeded(3)) for augment in (new, shared))
@@ -71,7 +71,7 @@ def test_redrawn_is_what_a_new_one_draws(drawing: Drawing) -> None:
 )
 def test_what_cannot_be_drawn_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Drawing(**settings).make()
+        SamplingConfig(**settings).make()
 
 
 def test_a_curve_without_a_name_is_refused() -> None:
