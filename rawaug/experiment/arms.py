@@ -62,7 +62,10 @@ def training_stream(
 ) -> TrainingStream:
     """The training samples of one arm."""
     crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
-    augment = RawAugment(isp, noise, arm.sampling, arm.strength, exposure=arm.exposure) if arm.augmented else None
+    augment: RawAugment | None = None
+    if arm.augmented:
+        draws: dict[str, Any] = {"exposure": arm.exposure, "target": recipe.target, "jpeg": arm.jpeg}
+        augment = RawAugment(isp, noise, arm.sampling, arm.strength, **draws)
     real: Source | None = None
     made: Source | None = None
     if isinstance(estimator, SelfSupervised):
@@ -81,7 +84,7 @@ def validation_samples(
     recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
 ) -> list[Watched]:
     """The frozen samples by which weights are chosen, the same in every arm and run."""
-    augment = RawAugment(isp, noise)
+    augment = RawAugment(isp, noise, target=recipe.target)
     if recipe.self_supervised:
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
         return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]

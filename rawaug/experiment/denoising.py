@@ -49,6 +49,7 @@ from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import noisy_only
 from rawaug.training.state import first_network, start_of
+from rawaug.training.validation import Watched
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -81,11 +82,14 @@ def run(
     """
     given = {"pairs": pairs, "validation": validation, "test": test}
     given_frames = {key: frames for key, frames in given.items() if frames is not None}
-    return _Run(recipe, overwrite, given_frames).all_stages()
+    return TrainingRun(recipe, overwrite, given_frames).all_stages()
 
 
-class _Run:
-    """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted."""
+class TrainingRun:
+    """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted.
+
+    A kind of experiment with another target overrides :meth:`watched`, :meth:`evaluated` and :meth:`reported`.
+    """
 
     def __init__(self, recipe: Recipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
         recipe = with_given_pairs(recipe, given)
@@ -184,10 +188,9 @@ class _Run:
                 print(f"already trained: {path}")
                 return model
         stream = training_stream(recipe, recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed)
-        validation = validation_samples(recipe, self.frames["validation"], self.pictures, isp, noise)
         model = train(
             stream,
-            validation,
+            self.watched(isp, noise),
             network,
             config,
             place,
@@ -210,12 +213,16 @@ class _Run:
         (place / "last.pt").unlink(missing_ok=True)
         return model
 
+    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Watched]:
+        """The frozen samples by which the weights of every arm are chosen."""
+        return validation_samples(self.recipe, self.frames["validation"], self.pictures, isp, noise)
+
     def weights_key(self, arm: str, isp: DictionaryISP, seed: int) -> str:
         """What the weights of an arm depend on."""
         recipe, data, start = self.recipe, self.data, self.starts[arm]
         real = isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
         pictures = data.pictures, len(self.pictures), data.max_pixels
-        how = asdict(recipe.arms[arm]), self.estimators[arm].revision, start and start.sha256
+        how = recipe.target, asdict(recipe.arms[arm]), self.estimators[arm].revision, start and start.sha256
         validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)

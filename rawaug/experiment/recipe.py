@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import OWN_PICTURES, Pair
 from rawaug.files import yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
+from rawaug.plugin.targets import Target, Targets
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, name_and_settings, nearest, require_between
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
@@ -104,6 +105,7 @@ class ArmConfig:
             :class:`rawaug.RawPairs`; 1 for none.
         strength: of ``perturb``.
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
+        jpeg: of sRGB targets: lowest and highest quality of the JPEG that noisy pictures go through; null for none.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
@@ -120,6 +122,7 @@ class ArmConfig:
     zoom: float = 1.0
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
+    jpeg: tuple[int, int] | None = None
     estimator: str | dict[str, Any] = "supervised"
     search: dict[str, list[float]] | None = None
     candidate_of: str | None = None
@@ -164,7 +167,7 @@ class ArmConfig:
 
 @dataclass
 class Recipe:
-    """A whole experiment.
+    """A whole experiment; ``target``, which another kind of it overrides, says what its arms are trained on.
 
     Args:
         name: of the output folder within ``out``.
@@ -190,6 +193,7 @@ class Recipe:
         out: folder of all runs.
     """
 
+    target: ClassVar[Target] = "raw"
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)
@@ -225,6 +229,13 @@ class Recipe:
             raise ValueError(
                 "arms: supervised and self-supervised arms cannot be mixed; the latter must not see clean frames"
             )
+        if self.target != "raw" and any(arm.augmented < 1.0 or not arm.sees_clean for arm in self.arms.values()):
+            raise ValueError(f"arms: {self.target} targets are made from pictures; set augmented: 1 and no estimator")
+        for label, arm in self.arms.items():
+            try:
+                Targets(self.target, None, arm.jpeg, "RGGB")
+            except ValueError as error:
+                raise ValueError(f"arms.{label}: {error}") from None
 
     def network_of(self, arm: str) -> DenoiserConfig:
         """The arm's network, else the recipe's."""

@@ -58,7 +58,10 @@ class RealCrops:
 
 
 class PictureCrops:
-    """Clean RAW from sRGB pictures, with noise drawn anew: the samples of :class:`rawaug.RawPairs`."""
+    """Pairs from sRGB pictures, with noise drawn anew: the samples of :class:`rawaug.RawPairs`, in any target.
+
+    Those without a noise map, of sRGB, have zeros in its place, for networks that read none.
+    """
 
     def __init__(self, pairs: RawPairs) -> None:
         self.pairs = pairs
@@ -66,7 +69,7 @@ class PictureCrops:
     def draw(self, generator: torch.Generator) -> Sample:
         """One crop of a random picture."""
         pair = self.pairs.draw(int(torch.randint(len(self.pairs), (), generator=generator)), generator)
-        return Sample(pair.noisy, pair.clean, pair.variance)
+        return Sample(pair.noisy, pair.clean, pair.variance if pair.variance.numel() else torch.zeros_like(pair.noisy))
 
 
 def turned_crop(mosaics: Sequence[Tensor], crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:

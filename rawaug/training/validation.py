@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 import denoisers
 from rawaug.bayer import CFA
@@ -64,20 +65,25 @@ def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) ->
 def panels(net: nn.Module, frame: Watched) -> Tensor:
     """The middle of a frame noisy, denoised and clean, beside each other: sRGB ``(3, h, 3 w)`` in [0, 1].
 
-    Where the camera is not known the mean of the greens is shown, through the power 1/2.2.
+    Where the camera is not known the mean of the greens is shown, through the power 1/2.2; full colour as it is.
     """
     height, width = (min(side, PANEL) for side in frame.noisy.shape[-2:])
     top, left = ((side - size) // 2 for side, size in zip(frame.noisy.shape[-2:], (height, width), strict=True))
-    noisy, clean, variance = (x[..., top : top + height, left : left + width] for x in frame[:3])
+    noisy, variance = (x[..., top : top + height, left : left + width] for x in (frame.noisy, frame.variance))
+    scale = frame.clean.shape[-1] // frame.noisy.shape[-1]  # 2 where packed RAW becomes full colour
+    clean = frame.clean[..., scale * top : scale * (top + height), scale * left : scale * (left + width)]
     device = next((weights.device for weights in net.parameters()), noisy.device)
     net.eval()
     denoised = net(noisy.to(device), variance.to(device)).cpu().nan_to_num()  # black where the training has diverged
     net.train()
-    return torch.cat([(frame.develop or _grey)(packed) for packed in (noisy, denoised, clean)], dim=-1)
+    shown = [(frame.develop or _shown)(image) for image in (noisy, denoised, clean)]
+    return torch.cat([F.interpolate(image[None], shown[-1].shape[-2:])[0] for image in shown], dim=-1)
 
 
-def _grey(packed: Tensor) -> Tensor:
-    return packed[0, 1:3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
+def _shown(image: Tensor) -> Tensor:
+    if image.shape[1] == 3:
+        return image[0].clamp(0.0, 1.0)
+    return image[0, 1:3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
 
 
 def _by_part(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:

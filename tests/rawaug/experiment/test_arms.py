@@ -1,13 +1,49 @@
-"""A setting chosen on validation: what is trained for it, and which is named."""
+"""What an arm is trained on, and a setting chosen on validation: what is trained for it, and which is named."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+import torch
 
-from rawaug.experiment.arms import chosen
-from rawaug.experiment.recipe import ArmConfig, Recipe
+from rawaug.data import demo_pictures
+from rawaug.experiment.arms import chosen, training_stream, validation_samples
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import noise_model
+from rawaug.plugin.targets import Target
+from rawaug.training.config import TrainConfig
+
+
+@pytest.mark.parametrize(
+    ("aim", "noisy", "clean"), [("rgb", (4, 16, 16), (3, 32, 32)), ("srgb", (3, 32, 32), (3, 32, 32))]
+)
+def test_other_targets_are_trained_and_watched_on(aim: Target, noisy: tuple[int, ...], clean: tuple[int, ...]) -> None:
+    class Aimed(Recipe):
+        target: Target = aim  # type: ignore[misc]
+
+    arms = {"one": ArmConfig(1.0, jpeg=(10, 10) if aim == "srgb" else None), "other": ArmConfig(1.0)}
+    recipe = Aimed(data=DataConfig(pairs=None), camera="universal", arms=arms, train=TrainConfig(crop=32))
+    isp, noise, pictures = DictionaryISP(), noise_model((1e-4, 1e-6)), demo_pictures(2)
+    one, other = (training_stream(recipe, arm, [], pictures, isp, noise, 0)[0] for arm in recipe.arms.values())
+    assert one.noisy.shape == one.variance.shape == noisy and one.clean.shape == clean
+    assert torch.equal(one.noisy, other.noisy) == (aim == "rgb"), "through JPEG, if any"
+    watched = validation_samples(recipe, [], pictures, isp, noise)[0]
+    assert watched.noisy.shape == (1, *noisy) and watched.clean.shape == (1, *clean)
+
+
+def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
+    class Srgb(Recipe):
+        target: Target = "srgb"  # type: ignore[misc]
+
+    with pytest.raises(ValueError, match=r"arms\.one: demosaicing and jpeg are for target 'srgb', not 'raw'"):
+        Recipe(arms={"one": ArmConfig(1.0, jpeg=(40, 95))})
+    with pytest.raises(ValueError, match=r"arms\.one: jpeg must be .* within 1 to 100"):
+        Srgb(arms={"one": ArmConfig(1.0, jpeg=(40, 101))})
+    for arm in (ArmConfig(0.5), ArmConfig(1.0, estimator="noise2noise")):
+        with pytest.raises(ValueError, match="srgb targets are made from pictures"):
+            Srgb(arms={"one": arm})
 
 
 def searching(**search: list[float]) -> ArmConfig:

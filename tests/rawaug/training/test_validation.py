@@ -9,7 +9,7 @@ from torch import Tensor
 from rawaug.data import demo_pairs
 from rawaug.evaluation.scores import compared, frozen_sample
 from rawaug.noise import noise_model
-from rawaug.training.validation import Watched, validate, watched
+from rawaug.training.validation import Watched, panels, validate, watched
 
 CPU = torch.device("cpu")
 
@@ -33,6 +33,19 @@ def test_thirds_by_noise_whatever_the_order() -> None:
     assert scores["psnr_high"] == pytest.approx((40.0 + 20.0 + 20.0) / 3, abs=0.01)
     assert scores["psnr"] == pytest.approx((2 * 60.0 + 3 * 40.0 + 2 * 20.0) / 7, abs=0.01)
     assert set(validate(Nothing(), frames[:2], CPU)) == {"psnr"}
+
+
+class Doubled(torch.nn.Module):
+    """Full colour of packed RAW."""
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        return torch.nn.functional.interpolate(noisy[:, [0, 1, 3]], scale_factor=2)
+
+
+def test_full_colour_is_shown_beside_the_raw_that_it_is_made_of() -> None:
+    clean = torch.rand(1, 3, 200, 240, generator=torch.Generator().manual_seed(0))
+    shown = panels(Doubled(), Watched(torch.rand(1, 4, 100, 120), clean, torch.ones(1, 4, 100, 120)))
+    assert shown.shape == (3, 192, 3 * 192) and torch.equal(shown[..., 384:], clean[0, :, 4:196, 24:216])
 
 
 def test_srgb_is_that_of_the_evaluation() -> None:
