@@ -43,6 +43,16 @@ def a_frame(numbers: np.ndarray, cfa: CFA, black: tuple[float, ...], white: int,
     return RawFrame(raw.clamp(max=1), cfa, tuple(black), float(white), **{**usual, **fields})  # type: ignore[arg-type]
 
 
+def test_mosaics_are_compressed(tmp_path: Path) -> None:
+    numbers = np.add.outer(np.arange(64), np.arange(64)) + 1000
+    numbers[:, 1::2] += 8000  # neighbours of another colour differ much, those of the same colour by two
+    frame = a_frame(numbers, CFA.RGGB, (64,) * 4, 16383)
+    write_dng(tmp_path / "a.dng", frame)
+    with tifffile.TiffFile(tmp_path / "a.dng") as file:
+        assert file.pages.first.databytecounts[0] < 64 * 64 * 0.6
+    assert (numbers_in(tmp_path / "a.dng") == numbers).all()
+
+
 def numbers_in(path: Path) -> np.ndarray:
     with rawpy.imread(str(path)) as file:
         return file.raw_image_visible.copy()
