@@ -23,6 +23,7 @@ and so is a convolution of them: one of 3 maps, or 6, instead of 3 N, with the s
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from itertools import pairwise
 from typing import cast
@@ -39,7 +40,7 @@ from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
 from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, highlight_rise, node_colours
 from rawaug.isp.tone import STEPS, to_code
 from rawaug.kernels import fastest, runtime
-from rawaug.kernels.reference import Camera, Display, look_up, render, unprocess
+from rawaug.kernels.reference import Camera, Display, fall_off, look_up, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
 NODES = 65
@@ -82,17 +83,34 @@ class BakedISP(nn.Module):
         return _pass(srgb, self._camera(srgb, params, place), white)
 
     @torch.no_grad()
-    def colours(self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf) -> Tensor:
+    def colours(
+        self,
+        srgb: Tensor,
+        params: ISPParams,
+        place: Tensor | None = None,
+        white: float = math.inf,
+        shaded: bool = True,
+    ) -> Tensor:
         """RAW of all three colours at every site, ``(B, 3, H, W)``, for mosaics other than Bayer's.
 
-        Three passes, one a colour. Arguments and errors are those of the call.
+        Three passes, one a colour. Without ``shaded`` it is x4, for :meth:`shade`; all else is as in the call.
         """
         _require_batch(srgb, params, place)
         camera, rgb = self._camera(srgb, params, place), []
+        if not shaded:
+            camera = camera._replace(attention=camera.attention[:0], shading=camera.shading[:0])
         for colour in range(3):
             sites = torch.tensor([(i, j, colour) for i, j in CFA.RGGB.sites])
             rgb.append(unpack(_pass(srgb, camera._replace(sites=sites), white), CFA.RGGB))
         return torch.cat(rgb, dim=1)
+
+    @torch.no_grad()
+    def shade(self, x4: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
+        """x4 ``(B, 3, H, W)`` with the shading and attention of the lens, x5."""
+        camera = self._camera(x4, params, place)
+        mask = fall_off(camera, 0, *x4.shape[-2:])
+        x5 = x4 if mask is None else x4 * mask
+        return x5 * look_up(camera.attention, x5)[:, :1] if camera.attention.numel() else x5
 
     def _camera(self, srgb: Tensor, params: ISPParams, place: Tensor | None) -> Camera:
         table = self.table
@@ -115,6 +133,7 @@ class FastForward(nn.Module):
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
         _require_usual_order(isp)
+        self.cfa = CFA(isp.cfa)
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages)).requires_grad_(False)
         cube = node_colours(nodes)
         tables = Tables(cube, cube.square())
@@ -135,9 +154,20 @@ class FastForward(nn.Module):
         _require_batch(linear, params, place)
         display, linear = self._display(linear, params, place), linear.float()
         learning = linear.requires_grad or display.matrix.requires_grad or display.gains.requires_grad
-        if linear.device.type != "cpu" or not runtime.has_numba() or (learning and torch.is_grad_enabled()):
+        if learning and torch.is_grad_enabled():
             return render(linear, display)
         return fastest("render", linear, display, otherwise=lambda: render(linear, display))
+
+    @torch.no_grad()
+    def develop(self, raw: Tensor, methods: Sequence[str], params: ISPParams, place: Tensor | None = None) -> Tensor:
+        """Mosaics ``(B, 1, H, W)``, float32, sides at least 4, to sRGB, each by one of ``bayer.STENCILS``."""
+        display = self._display(raw, params, place)
+
+        def in_pytorch() -> Tensor:
+            pictures = zip(raw.split(1), methods, strict=True)
+            return render(torch.cat([bayer.demosaic(one, self.cfa, method) for one, method in pictures]), display)
+
+        return fastest("develop", raw, display, self.cfa, methods, otherwise=in_pytorch)
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)
@@ -148,13 +178,6 @@ class FastForward(nn.Module):
         gains = 1.0 / floor[:, 0]
         gains = torch.cat([gains, gains.amin(dim=1, keepdim=True)], dim=1)
         return Display(table, curves, self.attention, torch.linalg.pinv(matrix), gains, frame, shading)
-
-
-def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
-    """:func:`rawaug.bayer.demosaic` by compiled loops where it can; float32 ``(B, 1, H, W)`` to ``(B, 3, H, W)``."""
-    if raw.device.type != "cpu" or not runtime.has_numba() or (raw.requires_grad and torch.is_grad_enabled()):
-        return bayer.demosaic(raw, cfa, method)
-    return fastest("demosaic", raw, cfa, method, otherwise=lambda: bayer.demosaic(raw, cfa, method))
 
 
 def _require_usual_order(isp: DictionaryISP) -> None:

@@ -21,6 +21,7 @@ from rawaug.kernels import runtime
 
 R = TypeVar("R")
 
+_ON_GPU = ("unprocess", "shot_read")
 _failed: list[str] = []
 """Names of the errors that Triton's kernels have raised; after one they are not tried again."""
 
@@ -32,7 +33,7 @@ def triton_usable(image: Tensor) -> bool:
 
 def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
     """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
-    if triton_usable(image):
+    if name in _ON_GPU and triton_usable(image):
         return kernel_or(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
     if image.device.type == "cpu" and runtime.has_numba():
         result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)

@@ -8,6 +8,8 @@ colours of two neighbouring nodes at a time. Exponential, logarithm and sine are
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -68,27 +70,44 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
-    srgb = torch.empty_like(linear, memory_format=torch.contiguous_format)
-    batch, _, height, width = linear.shape
+    return _rendered(linear.detach().contiguous(), None, np.empty(0, np.int64), linear.shape, display)
+
+
+def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str]) -> Tensor:
+    """Mosaics ``(B, 1, H, W)``, float32 on the CPU, each demosaiced by its own method, to sRGB in [0, 1]."""
+    used = sorted(set(methods))
+    weights = np.stack([_site_weights(CFA(cfa), method) for method in used])
+    padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites: the pattern stays
+    which = np.array([used.index(method) for method in methods])
+    return _rendered(padded, weights, which, (len(raw), 3, *raw.shape[2:]), display)
+
+
+def _rendered(
+    source: Tensor, weights: np.ndarray | None, methods: np.ndarray, shape: Sequence[int], display: Display
+) -> Tensor:
+    srgb = torch.empty(tuple(shape), dtype=torch.float32)
     if not srgb.numel():
         return srgb
-    x5, out = linear.detach().contiguous().numpy(), srgb.numpy()
+    batch, _, height, width = shape
+    pixels, out = source.numpy(), srgb.numpy()
     # Absent parts are None, so that no code is compiled for them.
     settings = tuple(value.detach().contiguous().numpy() if value.numel() else None for value in display)
-    over_rows(batch * height, 3 * width, lambda start, stop: _srgb_rows(x5, *settings, out, start, stop))
+    over_rows(
+        batch * height, 3 * width, lambda start, stop: _srgb_rows(pixels, weights, methods, *settings, out, start, stop)
+    )
     return srgb
 
 
-def demosaic(raw: Tensor, cfa: CFA | str, method: str) -> Tensor:
-    """:func:`rawaug.bayer.demosaic` of a mosaic ``(B, 1, H, W)``, float32 on the CPU."""
-    batch, _, height, width = raw.shape
-    rgb = torch.empty(batch, 3, height, width, dtype=torch.float32)
+@lru_cache
+def _site_weights(cfa: CFA, method: str) -> np.ndarray:
+    """``(2, 3, 6, _TILE)``: by row and colour, the weights of the six sums of :func:`_demosaic` at each site."""
     stencils, kinds = demosaicing(cfa, method)
-    edge = stencils.shape[-1] // 2
-    source = F.pad(raw.detach(), (edge, edge, edge, edge), mode="reflect")[:, 0].numpy()
-    settings = (source, stencils.numpy(), np.array(kinds), rgb.numpy())
-    over_rows(batch * height, 3 * width, lambda start, stop: _demosaiced_rows(*settings, start, stop))
-    return rgb
+    edge = 2 - stencils.shape[-1] // 2
+    around = F.pad(stencils, (edge, edge, edge, edge))
+    own = torch.eye(6)[:1]
+    sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
+    chosen = torch.cat([own, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
+    return chosen.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
 
 
 def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
@@ -294,35 +313,38 @@ def _raw_rows(  # type: ignore[no-untyped-def]
                     _develop(x2[column], colour[b], channel, knee, mask, white, out)
 
 
-@compiled
-def _demosaiced_rows(source, stencils, kinds, rgb, start, stop):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
-    height, width = rgb.shape[2], rgb.shape[3]
-    size = stencils.shape[1]
-    found = np.empty((5, _TILE), np.float32)
-    for row in range(start, stop):
-        b, i = divmod(row, height)
-        for first in range(0, width, _TILE):
-            count = min(_TILE, width - first)
-            found[0, :count] = source[b, i + size // 2, first + size // 2 : first + size // 2 + count]
-            for k in range(4):
-                made = found[k + 1, :count]
-                made[:] = _ZERO
-                for y in range(size):
-                    for x in range(size):
-                        weight = stencils[k, y, x]
-                        if weight != _ZERO:
-                            line = source[b, i + y, first + x : first + x + count]
-                            for j in range(count):
-                                made[j] += weight * line[j]
-            for c in range(3):
-                even, odd, out = (
-                    found[kinds[c, i % 2, 0]],
-                    found[kinds[c, i % 2, 1]],
-                    rgb[b, c, i, first : first + count],
-                )
-                for j in range(count // 2):
-                    out[2 * j], out[2 * j + 1] = even[2 * j], odd[2 * j + 1]
+@part
+def _pairs(one, other, out):  # type: ignore[no-untyped-def]
+    for j in range(len(out)):
+        out[j] = one[j] + other[j]
+
+
+@part
+def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untyped-def]
+    """Colours ``(3, n)`` of a row from ``first`` on, of a mosaic with margins of 2.
+
+    Stencils are symmetric: a colour is a sum, by the weights of its site, of the site's own value and those of its
+    neighbours along the row, the column and the diagonals, and of those two sites away along row and column.
+    """
+    n = out.shape[1]
+    above, own, below = mosaic[row + 1, first:], mosaic[row + 2, first:], mosaic[row + 3, first:]
+    _pairs(own[1:], own[3:], sums[1, :n])
+    _pairs(above[2:], below[2:], sums[2, :n])
+    _pairs(above[1:], above[3:], sums[6, :n])
+    _pairs(below[1:], below[3:], sums[7, :n])
+    _pairs(sums[6], sums[7], sums[3, :n])
+    _pairs(own, own[4:], sums[4, :n])
+    _pairs(mosaic[row, first + 2 :], mosaic[row + 4, first + 2 :], sums[5, :n])
+    for c in range(3):
+        _weighted(weights[c, 0], own[2:], weights[c, 1], sums[1], False, out[c])
+        for k in (2, 4):
+            _weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c])
+
+
+@part
+def _weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
+    for j in range(len(out)):
+        out[j] = (out[j] if more else _ZERO) + (a[j] * x[j] + b[j] * y[j])
 
 
 @part
@@ -349,12 +371,13 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _srgb_rows(  # type: ignore[no-untyped-def]
-    linear, table, curves, attention, matrix, gains, frame, shading, srgb, start, stop,
+    source, weights, methods, table, curves, attention, matrix, gains, frame, shading, srgb, start, stop,
 ):  # fmt: skip
-    """Rows ``start`` to ``stop`` of the batch's rows of pixels, one picture's after the other's."""
-    height, width = linear.shape[2], linear.shape[3]
+    """Rows ``start`` to ``stop`` of the batch's rows of pixels, of camera colour or, with weights, of mosaics."""
+    height, width = srgb.shape[2], srgb.shape[3]
     nodes, shares = np.empty(_TILE, np.int32), np.empty((3, _TILE), np.float32)
     x, root, mask = np.empty((3, _TILE), np.float32), np.empty((3, _TILE), np.float32), np.ones(_TILE, np.float32)
+    sums = np.empty((8, _TILE), np.float32)
     found, half = np.empty((2, 3, _TILE), np.float32), np.ones(6, np.float32)
     half[4:] = np.float32(0.5)  # the mask is made for every second pixel
     for row in range(start, stop):
@@ -362,8 +385,12 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
         for first in range(0, width, _TILE):
             last = min(first + _TILE, width)
             n = last - first
-            for c in range(3):
-                x[c, :n] = linear[b, c, i, first:last]
+            if weights is None:
+                for c in range(3):
+                    for j in range(n):  # faster than slices
+                        x[c, j] = source[b, c, i, first + j]
+            else:
+                _demosaic(source[b, 0], i, first, weights[methods[b], i % 2], sums, x[:, :n])
             if shading is not None:
                 _fall_off(frame[b] * half, i, 2 * first, shading, mask[:n])
                 for c in range(3):

@@ -146,7 +146,7 @@ class Display(NamedTuple):
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Camera colour x5 ``(B, 3, H, W)``, float32, to sRGB in [0, 1]; differentiable."""
-    mask = _fall_off(display, 0, *linear.shape[-2:])
+    mask = fall_off(display, 0, *linear.shape[-2:])
     x = linear if mask is None else linear / mask
     if display.attention.numel():
         x = x * look_up(display.attention, x)[:, :1]
@@ -164,7 +164,7 @@ def render(linear: Tensor, display: Display) -> Tensor:
 def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
     """Rows of pictures from ``top`` on, to ``raw``."""
     x2 = through_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
-    mask = _fall_off(camera, top, *srgb.shape[-2:])
+    mask = fall_off(camera, top, *srgb.shape[-2:])
     for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
         here = x2[..., i::2, j::2]
         shade = mask if mask is None else mask[..., i::2, j::2]
@@ -184,7 +184,7 @@ def _channels(x2: Tensor, camera: Camera, channels: slice, mask: Tensor | None) 
     return x4 if mask is None else x4.mul_(mask)
 
 
-def _fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
+def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Tensor | None:
     """The mask ``(B, 1, H, W)`` of the rows from ``top`` on."""
     if not camera.shading.numel():
         return None

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.targets import reaching_white
 
 
 class ISPModel:
@@ -19,7 +20,10 @@ class ISPModel:
         height, width = img.shape[:2]
         even = np.pad(img, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         srgb = torch.from_numpy(np.ascontiguousarray(even, np.float32)).permute(2, 0, 1).clamp(0.0, 1.0)
-        noisy = self.augment(srgb.to(self.augment.device)).noisy
+        srgb = srgb.to(self.augment.device)
+        params = self.augment.sample(srgb)
+        params = params._replace(isp=reaching_white(params.isp))  # or an overexposed picture would be brighter than hq
+        noisy: torch.Tensor = self.augment.apply(srgb, params).noisy
         return noisy[:, :height, :width].permute(1, 2, 0).cpu().numpy(), hq
 
     __call__ = forward

@@ -281,27 +281,30 @@ class RawAugment(nn.Module):
 
     def _noisy(self, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
         """Noisy, clean and variance of clean planes, as RAW or developed."""
+        if self.forward_pass is not None:
+            return self._developed(self.forward_pass, planes, params)
         noisy, variance = self.noise.apply_with_variance(planes, params.noise)
         _require_finite(noisy)
-        if self.forward_pass is not None:
-            developed = [
-                self.targets.develop(self.forward_pass, bayer.unpack(raw, self.isp.cfa), self.isp.cfa, params)
-                for raw in (noisy, planes)
-            ]
-            if "quality" in params.extras:
-                developed[0] = through_jpeg(developed[0], params.extras["quality"])
-            return developed[0], developed[1], variance.new_empty(len(noisy), 0)
         if self.pattern is None:
             return noisy, planes, variance
         noisy, planes, variance = (bayer.unpack(x, CFA.RGGB) for x in (noisy, planes, variance))
         return noisy, planes, variance
 
+    def _developed(self, forward: FastForward, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
+        raw = self.noise.apply(planes, params.noise)
+        _require_finite(raw)
+        noisy, clean = (self.targets.develop(forward, bayer.unpack(x, self.isp.cfa), params) for x in (raw, planes))
+        if "quality" in params.extras:
+            noisy = through_jpeg(noisy, params.extras["quality"])
+        return noisy, clean, noisy.new_empty(len(noisy), 0)
+
     def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:
-        scene = self.baked.colours(srgb, params.isp, params.place)
-        frames = burst.frames_of(scene, params.extras["motion"])
+        scene = self.baked.colours(srgb, params.isp, params.place, shaded=False)
         repeated = params.map(lambda t: t.repeat_interleave(burst.frames, 0))
         if "seed" in repeated.noise:
             repeated.noise["seed"] = params.extras["frame_seed"].flatten()
+        moved = burst.frames_of(scene, params.extras["motion"])
+        frames = burst.exposed(self.baked.shade(moved, repeated.isp, repeated.place))
         noisy, clean, variance = (
             x.unflatten(0, (len(srgb), burst.frames)) for x in self._noisy(self._planes(frames), repeated)
         )

@@ -2,7 +2,8 @@
 
 Frame k shows the scene of the first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor
 pixels: light is interpolated (bicubic) before the mosaic, so that each frame samples the scene at other places, and has
-noise of its own. What comes into view at the edges is reflected.
+noise of its own. The lens moves with the sensor: its shading stays where it is. What comes into view at the edges is
+reflected.
 """
 
 from __future__ import annotations
@@ -39,12 +40,16 @@ class Burst:
         return {"motion": motion, "frame_seed": new_seeds(batch * self.frames, generator).reshape(batch, self.frames)}
 
     def frames_of(self, scene: Tensor, motion: Tensor) -> Tensor:
-        """Linear light ``(B, 3, H, W)`` as the frames see it, ``(B * N, 3, H, W)``, at most 1."""
+        """Linear light ``(B, 3, H, W)`` as the frames see it, ``(B * N, 3, H, W)``."""
         moving = moved(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
         first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
         moving[first] = scene[first // self.frames]  # which nothing interpolates
-        stops = torch.tensor(self.stops, device=scene.device).repeat(len(scene))
-        return (moving * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
+        return moving
+
+    def exposed(self, frames: Tensor) -> Tensor:
+        """Frames ``(B * N, 3, H, W)`` at their exposures, at most 1."""
+        stops = torch.tensor(self.stops, device=frames.device).repeat(len(frames) // self.frames)
+        return (frames * torch.exp2(stops)[:, None, None, None]).clamp_max(1.0)
 
 
 def moved(image: Tensor, motion: Tensor) -> Tensor:

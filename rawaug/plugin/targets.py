@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.isp.fast import FastForward, demosaic
+from rawaug.isp.config import ISPParams
+from rawaug.isp.fast import FastForward
 from rawaug.plugin.params import AugmentParams
 
 Target = Literal["raw", "rgb", "srgb"]
@@ -61,15 +62,20 @@ class Targets:
             drawn["quality"] = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
         return drawn
 
-    def develop(self, forward: FastForward, mosaic: Tensor, cfa: bayer.CFA, params: AugmentParams) -> Tensor:
-        """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
-        linear = mosaic.new_empty(len(mosaic), 3, *mosaic.shape[-2:])
-        for number, name in enumerate(self.names):
-            own = (params.extras["demosaicing"] == number).nonzero()[:, 0].to(mosaic.device)
-            if len(own):
-                linear[own] = demosaic(mosaic[own], cfa, name)
-        developed: Tensor = forward(linear, params.isp, params.place)
-        return developed
+    def develop(self, forward: FastForward, raw: Tensor, params: AugmentParams) -> Tensor:
+        """Mosaics ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; a saturated sensor is white."""
+        if min(raw.shape[-2:]) < 4:
+            raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(raw.shape[-2:])}")
+        methods = [self.names[number] for number in params.extras["demosaicing"].tolist()]
+        return forward.develop(raw, methods, reaching_white(params.isp), params.place)
+
+
+def reaching_white(setting: ISPParams) -> ISPParams:
+    """The setting with gains of at least 1: RAW exposed above its picture is left as bright as it is.
+
+    Darkened to the picture's brightness, the sensor's white would be grey.
+    """
+    return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
 
 
 def through_jpeg(srgb: Tensor, quality: Tensor) -> Tensor:

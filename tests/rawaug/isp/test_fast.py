@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.isp.config import POINTWISE_STAGES, ISPConfig, ISPParams
-from rawaug.isp.fast import BakedISP, FastForward, demosaic
+from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
@@ -213,10 +213,12 @@ def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
         torch.testing.assert_close(ours, exact, rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("method", bayer.STENCILS)
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("cfa", list(bayer.CFA))
-def test_compiled_demosaicing_is_the_same(cfa: bayer.CFA, method: str) -> None:
-    raw = torch.rand(2, 1, 6, 530, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(demosaic(raw, cfa, method), bayer.demosaic(raw, cfa, method), atol=1e-6, rtol=0)
-    learned = raw.requires_grad_()
-    assert demosaic(learned, cfa, method).requires_grad
+def test_mosaics_are_demosaiced_by_their_own_method_and_developed(cfa: bayer.CFA) -> None:
+    isp, methods = DictionaryISP.from_pretrained("universal"), ["malvar", "bilinear", "malvar"]
+    isp.configure(cfa=cfa)
+    params, forward = isp.draw_setting(3, torch.Generator().manual_seed(1)), FastForward(isp.requires_grad_(False))
+    raw = 0.3 * torch.rand(3, 1, 6, 530, generator=torch.Generator().manual_seed(0))
+    linear = torch.cat([bayer.demosaic(one, cfa, method) for one, method in zip(raw.split(1), methods, strict=True)])
+    torch.testing.assert_close(forward.develop(raw, methods, params), forward(linear, params), atol=1e-4, rtol=0)

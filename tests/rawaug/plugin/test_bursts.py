@@ -13,6 +13,8 @@ from torch.utils.data import DataLoader
 
 from rawaug import DictionaryISP, RawAugment, RawPairs
 from rawaug.bayer import pack_rgb
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.stages import LensShading
 from rawaug.metrics import psnr
 from rawaug.plugin.bursts import moved
 
@@ -45,6 +47,21 @@ def test_the_first_frame_is_the_single_one(universal: DictionaryISP, srgb: Tenso
     single, pair = RawAugment(universal)(srgb, seeded()), RawAugment(universal, burst=3)(srgb, seeded())
     assert torch.equal(pair.clean, single.clean)
     assert not torch.equal(pair.noisy[:, 0] - pair.clean, pair.noisy[:, 1] - pair.clean)
+
+
+@pytest.mark.parametrize("attention", [False, True])
+def test_the_shading_of_the_lens_does_not_move_with_the_scene(attention: bool) -> None:
+    isp = DictionaryISP(ISPConfig(attention=attention))
+    lens = isp.find(LensShading)
+    assert lens is not None
+    lens.mask.set(torch.tensor([0.1, 0.0]), torch.tensor([[9.0, 2.0], [2.0, 5.0]]))
+    if lens.reverse_attention is not None:
+        list(lens.reverse_attention.parameters())[-2].data.normal_(std=0.1, generator=seeded())
+    wall = torch.full((1, 3, 64, 96), 0.5)
+    pair = RawAugment(isp, noise=(0.0, 0.0), burst=3, motion=(8.0, 4.0))(wall, seeded())
+    still = RawAugment(isp, noise=(0.0, 0.0))(wall, seeded())
+    assert still.clean.std() > 0.05 * still.clean.mean()
+    torch.testing.assert_close(pair.noisy, still.clean[:, None].expand_as(pair.noisy), atol=1e-4, rtol=0)
 
 
 def undone(frames: Tensor, motion: Tensor) -> Tensor:

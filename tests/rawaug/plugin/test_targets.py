@@ -86,6 +86,13 @@ def test_noise_of_a_plain_camera_is_the_raw_law() -> None:
     assert neighbours > 0.2  # demosaicing correlates what was white in RAW
 
 
+@pytest.mark.parametrize("stops", [-0.5, 0.0, 1.0])
+def test_saturated_highlights_are_white_at_any_exposure(universal: DictionaryISP, stops: float) -> None:
+    white = torch.ones(4, 3, 16, 16)
+    pair = RawAugment(universal, noise=(1e-6, 1e-8), target="srgb", exposure=(stops, stops))(white, seeded())
+    assert pair.clean.min() > 0.98
+
+
 def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp_path: Path) -> None:
     augment = RawAugment(universal, target="srgb", jpeg=(40, 95))
     srgb = (smooth() * 255).to(torch.uint8)
