@@ -21,12 +21,11 @@ from torch import Tensor
 
 from rawaug.io.pictures import decode_srgb, read_picture
 from rawaug.isp.cameras import colour_matrix, published_cameras
-from rawaug.isp.dictionary import CameraDictionary, colour_coordinates, nearest_in_hull, psnr, second_moment
+from rawaug.isp.dictionary import DECIBEL, CameraDictionary, colour_coordinates, nearest_in_hull, psnr
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import tone_names, tone_tables
+from rawaug.isp.tone import tone_tables
 from rawaug.isp.universal import (
     COLOURS,
-    DECIBEL,
     camera_points,
     chosen_atoms,
     chosen_gains,
@@ -59,7 +58,7 @@ def lights_of_halves(cameras: Tensor, atoms: int, count: int) -> list[float]:
 
 def left_out_tones() -> dict[str, float]:
     """PSNR of each published curve under the nearest mixture of all others."""
-    names, points = tone_names(), tone_points(tone_tables())
+    names, points = list(tone_tables()), tone_points(torch.stack(list(tone_tables().values())))
     errors = {}
     for k, name in enumerate(names):
         others = torch.cat([points[:k], points[k + 1 :]])
@@ -143,7 +142,8 @@ def _moment(folder: Path) -> Tensor:
     if not files:
         raise SystemExit(f"{folder}: no *.jpg in it")
     pictures = (read_picture(file)[:, ::4, ::4].double() / 255.0 for file in files)
-    return torch.stack([second_moment(decode_srgb(picture).flatten(1)) for picture in pictures]).mean(dim=0)
+    colours = [decode_srgb(picture).flatten(1).double() for picture in pictures]
+    return torch.stack([linear @ linear.T / linear.shape[1] for linear in colours]).mean(dim=0)
 
 
 if __name__ == "__main__":

@@ -142,26 +142,38 @@ DUV_SPREAD = 0.003
 
 
 class LightRange(NamedTuple):
-    """What lights are drawn from, as the arguments of :func:`sample_lights`."""
+    """What lights are drawn from: any locus alike within limits of the temperature in kelvin, lamps, and daylight.
+
+    Args:
+        kelvin: within 1,000 to 15,000.
+        lamps: share of the draws that are one of ``among``, whatever its colour temperature.
+        among: chromaticities of lamps, ``(L, 2)``.
+        by_day: share of the draws that are daylight as in most photographs.
+    """
 
     kelvin: tuple[float, float] = (WARMEST, COLDEST)
     lamps: float = LAMP_SHARE
     among: Array = _LAMPS
-    by_day: float = DAYLIGHT_SHARE
+    by_day: float = 0.0
+
+
+ALL_LIGHTS = LightRange()
+PHOTOGRAPHS = LightRange(by_day=DAYLIGHT_SHARE)
+"""The lights of photographs, most of them taken by day."""
 
 
 def light_range(light: float | str | None) -> LightRange:
-    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; all lights by default."""
+    """Lights of one colour temperature in kelvin, or one of :data:`LAMPS` by name; by default :data:`PHOTOGRAPHS`."""
     if light is None:
-        return LightRange()
+        return PHOTOGRAPHS
     if isinstance(light, str):
         if light not in LAMPS:
             listed, near = ", ".join(LAMPS), nearest(light, LAMPS)
             raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
-        return LightRange(lamps=1.0, among=np.array([LAMPS[light]]))
+        return PHOTOGRAPHS._replace(lamps=1.0, among=np.array([LAMPS[light]]))
     if not WARMEST <= light <= COLDEST:
         raise ValueError(f"light must be {WARMEST:g} to {COLDEST:g} kelvin, got {light:g}")
-    return LightRange((float(light), float(light)), lamps=0.0, by_day=0.0)
+    return LightRange((float(light), float(light)), lamps=0.0)
 
 
 def planckian(kelvin: Array) -> Array:
@@ -190,22 +202,12 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
     return torch.from_numpy(_white_point(np.asarray(xy, dtype=np.float64)))
 
 
-def sample_lights(
-    batch: int,
-    generator: torch.Generator,
-    kelvin: tuple[float, float] = (WARMEST, COLDEST),
-    lamps: float = LAMP_SHARE,
-    among: Array = _LAMPS,
-    by_day: float = 0.0,
-) -> Array:
+def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = ALL_LIGHTS) -> Array:
     """White points ``(batch, 3)``, XYZ with Y = 1.
 
-    Where both loci are defined one of them is taken, each as often as the other; ``lamps`` of the draws are one of
-    ``among`` instead, whatever its colour temperature. All are moved by a Duv of N(0, 0.003).
+    Where both loci are defined one of them is taken, each as often as the other. All are moved by a Duv of N(0, 0.003).
     """
-    if not (1000 <= kelvin[0] <= kelvin[1] <= 15000 and 0 <= lamps <= 1 and 0 <= by_day <= 1):
-        wrong = f"{kelvin}, {lamps} and {by_day}"
-        raise ValueError(f"kelvin must be 1000 to 15000, lamps and by_day in [0, 1], got {wrong}")
+    kelvin, lamps, among, by_day = lights
     drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()
     temperature = 1.0 / (1 / kelvin[1] + (1 / kelvin[0] - 1 / kelvin[1]) * drawn[:, 0])

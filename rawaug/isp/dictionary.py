@@ -39,6 +39,7 @@ from torch import Tensor, nn
 
 from rawaug.isp.cameras import (
     D65,
+    PHOTOGRAPHS,
     XYZ_TO_SRGB,
     Array,
     LightRange,
@@ -55,10 +56,10 @@ EXPOSURE = (-0.5, 1.0)
 """Stops, drawn uniformly: what cameras leave between the white of RAW and that of their pictures is not published. With
 these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped have red to spare, as in real
 files; with a ceiling of 1.5 stops 45 %."""
-CAMERAS_MIXED = 2
-TONES_MIXED = 3
+CAMERAS_MIXED, TONES_MIXED = 2, 3
+DECIBEL = 45.0
+"""A point this near to a hull is held by it."""
 _ROUNDS = 100
-_ALL_LIGHTS = LightRange()
 _STEPS = 400
 _CANDIDATES = 24
 
@@ -205,23 +206,12 @@ def convex_weights(batch: int, atoms: int, generator: torch.Generator) -> Tensor
     return exponential / exponential.sum(dim=1, keepdim=True)
 
 
-def sparse_weights(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> Tensor:
-    """Weights ``(batch, atoms)`` on the simplex, float64, of which at most ``mixed`` are not zero: Dirichlet(1/2)."""
-    chosen, shares = sparse_shares(batch, atoms, mixed, generator)
-    return shares.new_zeros(batch, atoms).scatter_add_(1, chosen, shares)
-
-
 def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Indices of atoms ``(batch, mixed)``, drawn with replacement, and their shares, float64: Dirichlet(1/2)."""
     # Squares of normals, divided by their sum, crowd the corners and edges of a hull.
     chosen = torch.randint(atoms, (batch, mixed), generator=generator)
     squares = torch.randn(batch, mixed, generator=generator, dtype=torch.float64) ** 2
     return chosen, squares / squares.sum(dim=1, keepdim=True)
-
-
-def second_moment(linear: Tensor) -> Tensor:
-    """``E[x x^T]`` ``(3, 3)`` float64 of colours ``(3, P)``."""
-    return linear.double() @ linear.double().T / linear.shape[1]
 
 
 def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
@@ -253,16 +243,16 @@ def psnr(squared_error: Tensor) -> Tensor:
     return -10.0 * squared_error.clamp_min(1e-20).log10()
 
 
-def greedy_atoms(points: Tensor, count: int, decibel: float = 45.0) -> list[int]:
+def greedy_atoms(points: Tensor, count: int) -> list[int]:
     """Indices of ``count`` points ``(P, D)`` whose hull reaches as many of all of them as possible."""
     # The first is the point farthest from the mean. Each next one is, among the 24 farthest from the hull so far, the
-    # one that leaves the least total squared error over the points not within ``decibel``.
+    # one that leaves the least total squared error over the points that the hull does not hold.
     chosen = [int((points - points.mean(dim=0)).square().sum(dim=1).argmax())]
     while len(chosen) < min(count, len(points)):
         errors = nearest_in_hull(points, points[chosen])[1]
         farthest = errors.topk(min(_CANDIDATES, len(points))).indices.tolist()
         candidates = [index for index in farthest if index not in chosen]
-        open_ = psnr(errors) < decibel
+        open_ = psnr(errors) < DECIBEL
         if not open_.any():
             open_ = torch.ones_like(open_)
         hulls = points[torch.tensor([[*chosen, new] for new in candidates])]
@@ -284,19 +274,14 @@ class CameraSampler:
         self,
         cameras: CameraDictionary,
         tone_atoms: int,
-        cameras_mixed: int = CAMERAS_MIXED,
-        tones_mixed: int = TONES_MIXED,
-        lights: LightRange = _ALL_LIGHTS,
+        lights: LightRange = PHOTOGRAPHS,
         consistent: bool = True,
     ) -> None:
-        if min(cameras_mixed, tones_mixed) < 1:
-            raise ValueError(f"a draw needs at least one camera and one tone, got {cameras_mixed} and {tones_mixed}")
         self.known, self.atoms, self.responses = (
             tensor.detach().to("cpu", torch.float64).numpy()
             for tensor in (cameras.known, cameras.atoms().flatten(1), cameras.responses())
         )
-        self.tone_atoms, self.cameras_mixed, self.tones_mixed = tone_atoms, cameras_mixed, tones_mixed
-        self.lights, self.consistent = lights, consistent
+        self.tone_atoms, self.lights, self.consistent = tone_atoms, lights, consistent
 
     def sample(self, batch: int, generator: torch.Generator, device: torch.device | str = "cpu") -> ISPParams:
         """Settings of ``batch`` pictures, from a generator on the CPU; gains have no weights, they follow the light."""
@@ -310,7 +295,8 @@ class CameraSampler:
         )
         tones = none = channel_gains[:, :0]
         if self.tone_atoms:
-            tones = sparse_weights(batch, self.tone_atoms, self.tones_mixed, generator).to(channel_gains)
+            atoms, shares = sparse_shares(batch, self.tone_atoms, TONES_MIXED, generator)
+            tones = shares.new_zeros(batch, self.tone_atoms).scatter_add_(1, atoms, shares).to(channel_gains)
         return ISPParams(colour_weights, none, matrices, channel_gains, tones)
 
     def _cameras_in_light(self, batch: int, generator: torch.Generator) -> tuple[Array, Array]:
@@ -318,9 +304,9 @@ class CameraSampler:
         weights, balance = np.empty((batch, self.known.shape[1])), np.empty((batch, 3))
         open_ = np.arange(batch)
         for _ in range(_ROUNDS):
-            chosen, shares = sparse_shares(len(open_), len(self.known), self.cameras_mixed, generator)
+            chosen, shares = sparse_shares(len(open_), len(self.known), CAMERAS_MIXED, generator)
             drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
-            light = sample_lights(len(open_), generator, *self.lights)
+            light = sample_lights(len(open_), generator, self.lights)
             weights[open_], balance[open_] = drawn, self.balance(drawn, light)
             open_ = open_[~plausible(balance[open_])]
             if not len(open_):

@@ -57,15 +57,14 @@ class DictionaryISP(StagedISP):
             tone_weights = self.typical_tones().expand(len(matrix), -1)
         return ISPParams(colour_weights, gain_weights, matrix, gains, tone_weights)
 
-    def draw_setting(self, batch: int, generator: torch.Generator, consistent: bool = True) -> ISPParams:
+    def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
         """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
 
         A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
-        atoms with uniform weights. Not ``consistent``, the gains are those of another camera in another light; of
-        a fitted camera they always have weights of their own.
+        atoms with uniform weights.
         """
         config, device = self.config, self.colour.matrices.device
-        if (cameras := self.camera_sampler(consistent)) is not None:
+        if (cameras := self.camera_sampler()) is not None:
             return cameras.sample(batch, generator, device)
         atoms = [n for n in (config.colour_atoms, config.gain_atoms, config.tone_atoms) if n]
         return self.params_from_weights(*(convex_weights(batch, n, generator).to(device) for n in atoms))
@@ -74,11 +73,11 @@ class DictionaryISP(StagedISP):
         """What draws settings where the atoms are published cameras, as these are now; else None.
 
         ``light`` is a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
+        Not ``consistent``, gains are those of another camera in another light.
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
-        lights = light_range(light)
-        return CameraSampler(self.colour, self.config.tone_atoms, lights=lights, consistent=consistent)
+        return CameraSampler(self.colour, self.config.tone_atoms, light_range(light), consistent)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The parameters that the reverse encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``."""
@@ -136,28 +135,15 @@ class DictionaryISP(StagedISP):
         if srgb.ndim != 4 or srgb.shape[1] != 3 or min(srgb.shape[2:]) < 2:
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
         with self._float32(srgb):
-            return self._reverse(
-                stages.display_referred(srgb), params, white_balance, digital_gain, raw_samples, place, intermediates
-            )
-
-    def _reverse(
-        self,
-        x: Tensor,
-        params: ISPParams | None,
-        white_balance: Tensor | tuple[float, ...] | None,
-        digital_gain: Tensor | float | None,
-        raw_samples: Tensor | None,
-        place: Tensor | None,
-        intermediates: bool,
-    ) -> ISPResult:
-        params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
-        if len(params.gains) != len(x):
-            raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
-        if raw_samples is not None:
-            params = conditioning.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
-        seen: dict[str, Tensor] = {}
-        x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
-        return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
+            x = stages.display_referred(srgb)
+            params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
+            if len(params.gains) != len(x):
+                raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
+            if raw_samples is not None:
+                params = conditioning.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
+            seen: dict[str, Tensor] = {}
+            x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
+            return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
 
     def _float32(self, like: Tensor) -> torch.autocast:
         """RAW is float32, in mixed precision too."""
@@ -268,11 +254,7 @@ class DictionaryISP(StagedISP):
     # -- files ------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write weights, configuration and ``info`` to one safetensors file, atomically; disabled parts are not stored.
-
-        Args:
-            path: of the file.
-        """
+        """Write weights, configuration and ``info`` to one safetensors file, atomically; no disabled part is stored."""
         header = {"format": "rawaug", "kind": "isp", "config": to_json(asdict(self.config)), "info": to_json(self.info)}
         write_tensors(self.state_dict(), header, path)
 

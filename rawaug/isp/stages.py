@@ -41,6 +41,8 @@ from rawaug.registry import STAGES
 EPS = 1e-6
 """Floor under a power: keeps the gradient of x ** (1 / gamma) finite at black."""
 
+WIDTH = 32
+"""Features of the networks."""
 _HALF_LEVEL = 0.5 / 255
 
 
@@ -75,21 +77,25 @@ def require_display_range(image: Tensor) -> None:
         )
 
 
+def _colourwise(hidden: int, outputs: int) -> nn.Sequential:
+    """``hidden`` 1 x 1 convolutions to 32 features with ReLU, then one that is zero until it is trained."""
+    last = nn.Conv2d(WIDTH, outputs, 1)
+    nn.init.zeros_(last.weight)
+    last.bias = nn.Parameter(torch.zeros(outputs))
+    inputs = [3, *[WIDTH] * (hidden - 1)]
+    layers = [layer for channels in inputs for layer in (nn.Conv2d(channels, WIDTH, 1), nn.ReLU())]
+    return nn.Sequential(*layers, last)
+
+
 class ToneNetwork(nn.Module):
     """f1: a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU, piecewise linear in colour.
 
     It starts as the identity (last layer zero), so that an untrained ISP is a plain gamma camera.
     """
 
-    def __init__(self, width: int = 32) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        last = nn.Conv2d(width, 3, 1)
-        nn.init.zeros_(last.weight)
-        last.bias = nn.Parameter(torch.zeros(3))
-        self.layers = nn.Sequential(
-            nn.Conv2d(3, width, 1), nn.ReLU(), nn.Conv2d(width, width, 1), nn.ReLU(),
-            nn.Conv2d(width, width, 1), nn.ReLU(), last,
-        )  # fmt: skip
+        self.layers = _colourwise(hidden=3, outputs=3)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
@@ -204,14 +210,9 @@ class AttentionMask(nn.Module):
     The factor 2, which the paper does not have, lets the untrained mask be the identity.
     """
 
-    def __init__(self, width: int = 32) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        last = nn.Conv2d(width, 1, 1)
-        nn.init.zeros_(last.weight)
-        last.bias = nn.Parameter(torch.zeros(1))
-        self.layers = nn.Sequential(
-            nn.Conv2d(3, width, 1), nn.ReLU(), nn.Conv2d(width, width, 1), nn.ReLU(), last
-        )  # fmt: skip
+        self.layers = _colourwise(hidden=2, outputs=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Mask ``(B, 1, H, W)`` of an image ``(B, 3, H, W)``."""
@@ -259,9 +260,9 @@ class Stage(nn.Module, ABC):
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
         """``x_k`` to ``x_(k-1)``, arguments as in :meth:`reverse`."""
 
-    @abstractmethod
     def bake(self, tables: Tables) -> Tables:
         """The tables of the reverse pass with what this stage does to every picture alike."""
+        return tables._replace(x2=self.reverse(tables.x2, None)) if self.makes <= 2 else tables
 
     def bake_forward(self, tables: Tables) -> Tables:
         """The tables of the forward pass, whose ``x2`` becomes sRGB, likewise."""
@@ -323,15 +324,10 @@ class ToneMap(Stage):
         self.register_buffer("toe", torch.zeros(()), persistent=False)
 
     def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        y: Tensor = self.reverse_network(x)
-        return y
+        return self.reverse_network(x)
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        y: Tensor = self.forward_network(x)
-        return y
-
-    def bake(self, tables: Tables) -> Tables:
-        return tables._replace(x2=self.reverse(tables.x2, None))
+        return self.forward_network(x)
 
     def coarse_parameters(self) -> dict[str, Tensor]:
         return {"toe": self.toe}
@@ -363,9 +359,6 @@ class Gamma(Stage):
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
         return gamma_compress(x, self.forward_gamma)
 
-    def bake(self, tables: Tables) -> Tables:
-        return tables._replace(x2=self.reverse(tables.x2, None))
-
     def describe(self) -> str:
         return f"gamma: {self.reverse_gamma.item():.3f} reverse, {self.forward_gamma.item():.3f} forward"
 
@@ -396,9 +389,6 @@ class ColorCorrection(Stage):
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
         return correct_colour(x, torch.linalg.pinv(chosen(params).matrix))
 
-    def bake(self, tables: Tables) -> Tables:
-        return tables
-
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         return batch._replace(matrix=params.matrix.to(batch.matrix))
 
@@ -414,9 +404,6 @@ class WhiteBalance(Stage):
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
         return apply_gains(x, chosen(params).gains)
-
-    def bake(self, tables: Tables) -> Tables:
-        return tables
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         return batch._replace(floor=1.0 / params.gains.to(batch.floor)[:, None])
@@ -443,10 +430,10 @@ class LensShading(Stage):
         return x if self.forward_attention is None else x * self.forward_attention(x)
 
     def bake(self, tables: Tables) -> Tables:
-        return tables if self.reverse_attention is None else _attended(tables, self.reverse_attention)
+        return _attended(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
-        return tables if self.forward_attention is None else _attended(tables, self.forward_attention)
+        return _attended(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
@@ -467,8 +454,8 @@ class LensShading(Stage):
         return x * self.mask(placed(x, place))
 
 
-def _attended(tables: Tables, mask: AttentionMask) -> Tables:
-    return tables._replace(attention=mask(tables.cube))
+def _attended(tables: Tables, mask: AttentionMask | None) -> Tables:
+    return tables if mask is None else tables._replace(attention=mask(tables.cube))
 
 
 def chosen(params: ISPParams | None) -> ISPParams:

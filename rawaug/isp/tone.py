@@ -20,7 +20,7 @@ bends a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
 
@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from rawaug.isp.config import ISPConfig, ISPParams
-from rawaug.isp.stages import BatchParams, Stage, Tables
+from rawaug.isp.stages import BatchParams, Stage
 from rawaug.kernels.reference import through_curves
 from rawaug.registry import STAGES
 
@@ -44,20 +44,6 @@ _FINE = 2**16
 def srgb_to_linear(code: Tensor) -> Tensor:
     """The sRGB transfer function: codes in [0, 1] to linear display light in [0, 1]."""
     return torch.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055).clamp_min(0.0) ** 2.4)
-
-
-def tone_names() -> list[str]:
-    """The curves that :func:`tone_tables` knows."""
-    return list(_tables())
-
-
-def tone_tables(names: Sequence[str] | None = None) -> Tensor:
-    """Tables ``(K, 1021)`` float32 from 0 to 1, not decreasing; all curves by default."""
-    tables = _tables()
-    unknown = [name for name in names or () if name not in tables]
-    if unknown:
-        raise ValueError(f"tone curve {unknown[0]!r} is unknown; use one of {', '.join(tables)}")
-    return torch.stack([tables[name] for name in (tables if names is None else names)])
 
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
@@ -75,13 +61,14 @@ def to_code(linear: Tensor, tables: Tensor) -> Tensor:
 
 
 @cache
-def _tables() -> dict[str, Tensor]:
+def tone_tables() -> dict[str, Tensor]:
+    """The published curves by name: tables ``(1021,)`` float32 from 0 to 1, not decreasing."""
     code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
     display = srgb_to_linear(code)
     tables = {"linear": display.float(), "upi": _inverse_smoothstep(code).float()}
     text = resources.files("rawaug.isp").joinpath("facts/tone_curves.json").read_text("utf-8")
     for name, points in json.loads(text)["curves"].items():
-        tables[name] = _inverse(_through(points), display).float()
+        tables[name] = _inverse(points, display).float()
     return tables
 
 
@@ -89,20 +76,14 @@ def _inverse_smoothstep(code: Tensor) -> Tensor:
     return (0.5 - torch.sin(torch.asin(1.0 - 2.0 * code) / 3.0)).clamp_min(0.0) ** 2.2
 
 
-def _through(points: Sequence[Sequence[float]]) -> Callable[[np.ndarray], np.ndarray]:
-    """The monotone cubic through ``points`` (camera, display)."""
+def _inverse(points: Sequence[Sequence[float]], display: Tensor) -> Tensor:
+    """Camera light ``(N,)`` at which the monotone cubic through ``points`` (camera, display) reaches ``display``."""
     from scipy.interpolate import PchipInterpolator  # slow to import, and needed by nothing else
 
-    light, display = np.array(points).T
-    display[0] = 0.0  # a measured curve may start at an offset
-    curve: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(light, display)
-    return curve
-
-
-def _inverse(curve: Callable[[np.ndarray], np.ndarray], display: Tensor) -> Tensor:
-    """Camera light ``(N,)`` at which the curve reaches ``display`` ``(N,)``; quadratic nodes, dense near black."""
-    light = np.linspace(0.0, 1.0, _FINE) ** 2
-    reached = np.maximum.accumulate(curve(light))
+    camera, shown = np.array(points).T
+    shown[0] = 0.0  # a measured curve may start at an offset
+    light = np.linspace(0.0, 1.0, _FINE) ** 2  # dense near black
+    reached = np.maximum.accumulate(PchipInterpolator(camera, shown)(light))
     reached = reached / reached[-1]
     rising = np.concatenate([[True], np.diff(reached) > 0])
     return torch.from_numpy(np.interp(display.numpy(), reached[rising], light[rising]))
@@ -165,9 +146,6 @@ class ToneCurve(Stage):
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
         return to_code(x, self._curves(len(x), params))
-
-    def bake(self, tables: Tables) -> Tables:
-        return tables._replace(x2=self.reverse(tables.x2, None))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         return batch._replace(curves=self.dictionary.combine(params.tone_weights.to(batch.matrix)))

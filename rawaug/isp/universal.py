@@ -20,6 +20,7 @@ from torch import Tensor
 from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import (
+    DECIBEL,
     CameraDictionary,
     colour_coordinates,
     extreme_points,
@@ -29,7 +30,7 @@ from rawaug.isp.dictionary import (
     psnr,
 )
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import STEPS, tone_names, tone_tables
+from rawaug.isp.tone import STEPS, tone_tables
 from rawaug.registry import spelled
 from rawaug.seeding import keyed_generator
 
@@ -37,8 +38,6 @@ COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 
 """Second moment of linear sRGB: mean of the six photographs of :mod:`rawaug.data.demo`, every fourth row and column."""
 LIGHTS = 4000
 """Draws of camera and light that the gain atoms are chosen for: of 400, the corners of the hull are too few."""
-DECIBEL = 45.0
-"""A point this near to a hull is held by it."""
 TONE_AND_CAMERAS = ("curve", "colour", "gains")
 
 
@@ -51,7 +50,7 @@ class Choice(NamedTuple):
 
 def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_atoms: int = 16) -> DictionaryISP:
     """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB."""
-    cameras, names, tables = published_cameras(), tone_names(), tone_tables()
+    cameras, names, tables = published_cameras(), list(tone_tables()), torch.stack(list(tone_tables().values()))
     distinct = cameras.distinct()
     points = camera_points(distinct)
     colour = chosen_atoms(points, colour_atoms)
@@ -140,9 +139,9 @@ def chosen_gains(inverse: Tensor, count: int) -> Choice:
     return Choice(chosen.tolist(), nearest_in_hull(points.mean(dim=0, keepdim=True), points[chosen])[0][0].float())
 
 
-def held(points: Tensor, atoms: Tensor, decibel: float = DECIBEL) -> float:
-    """Share of ``points`` within ``decibel`` of the hull of ``atoms``, to four digits."""
-    return round((psnr(nearest_in_hull(points, atoms)[1]) >= decibel).double().mean().item(), 4)
+def held(points: Tensor, atoms: Tensor) -> float:
+    """Share of ``points`` within 45 dB of the hull of ``atoms``, to four digits."""
+    return round((psnr(nearest_in_hull(points, atoms)[1]) >= DECIBEL).double().mean().item(), 4)
 
 
 def _of_colour(key: str) -> bool:

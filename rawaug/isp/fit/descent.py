@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from rawaug.files import read_tensors, write_tensors
 from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.samples import FrameSummary, PixelSamples
+from rawaug.isp.fit.samples import FitFrames, PixelSamples
 from rawaug.isp.model import DictionaryISP
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -67,19 +67,13 @@ def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
 
 
 @torch.no_grad()
-def decibels(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    frames: Sequence[int],
-    as_shot: bool = False,
-) -> float:
-    """Mean PSNR of ``frames``, each in the setting that the ISP chooses for its thumbnail, or with as-shot gains."""
-    every, values = torch.arange(samples.srgb.shape[-1]), []
-    for k in frames:
-        given = shots[k].white_balance if as_shot else None
-        params = with_white_balance(isp, isp.choose(shots[k].srgb), given, None)
-        values.append(mean_square(isp, samples.pick(every, torch.tensor([k])), params))
+def decibels(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> float:
+    """Mean PSNR of the frames, each in the setting that the ISP chooses for its thumbnail, or with as-shot gains."""
+    values = []
+    for k, shot in enumerate(frames.shots):
+        given = shot.white_balance if as_shot else None
+        params = with_white_balance(isp, isp.choose(shot.srgb), given, None)
+        values.append(mean_square(isp, frames.some([k]).pixels, params))
     return float(-10.0 * torch.cat(values).log10().mean())
 
 
@@ -113,10 +107,6 @@ def adam(
         yield optimiser, value.detach()
 
 
-SAVE_SECONDS = 10.0
-REPORT_STEPS = 50
-
-
 class BestScore(NamedTuple):
     """Score of a watched stage at its start, and the best one with its step."""
 
@@ -126,19 +116,13 @@ class BestScore(NamedTuple):
 
 
 class Descent:
-    """Runs the stages of a fit."""
+    """Runs the stages of a fit; reports every so many steps, and writes its state every so many seconds."""
 
-    def __init__(
-        self,
-        path: Path | None,
-        key: str,
-        seed: int,
-        progress: bool,
-        report_steps: int = REPORT_STEPS,
-        save_seconds: float = SAVE_SECONDS,
-    ) -> None:
+    report_steps: ClassVar[int] = 50
+    save_seconds: ClassVar[float] = 10.0
+
+    def __init__(self, path: Path | None, key: str, seed: int, progress: bool) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
-        self.report_steps, self.save_seconds = report_steps, save_seconds
         self.watched: dict[str, BestScore] = {}
         self._steps: dict[str, int] = {}
         self._tensors: dict[str, Tensor] = {}

@@ -15,74 +15,59 @@ parameters come back that served these best, which may be those of the start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, cycle_error, decibels, mean_square, weight_distance
-from rawaug.isp.fit.samples import FrameSummary, PixelSamples
+from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 
-Refit = Callable[[Sequence[int], str], DictionaryISP]
+Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
 
 
-def folds_of(frames: int, folds: int) -> Iterator[tuple[list[int], list[int], str]]:
+def folds_of(frames: FitFrames, folds: int) -> Iterator[tuple[FitFrames, FitFrames, str]]:
     """The frames that each fold leaves out, those that it keeps, and its name."""
+    every = range(len(frames.shots))
     for fold in range(folds):
-        out = list(range(fold, frames, folds))
-        kept = [k for k in range(frames) if k not in out]
-        yield out, kept, f" without part {fold + 1} of {folds}"
+        out = every[fold::folds]
+        yield frames.some(out), frames.some([k for k in every if k not in out]), f" without part {fold + 1} of {folds}"
 
 
-def train_encoders(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    config: FitConfig,
-    descent: Descent,
-    refit: Refit,
-) -> None:
+def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> None:
     """Train and keep the encoders, or leave the constants, as ``config.encoders`` says."""
     wanted = config.encoders
     isp.use_encoders(False)
-    if wanted == "auto" and len(shots) >= config.encoder_training.fewest_frames:
-        gain = _gain_on_frames_left_out(samples, shots, config, descent, refit)
+    if wanted == "auto" and len(frames.shots) >= config.encoder_training.fewest_frames:
+        gain = _gain_on_frames_left_out(frames, config, descent, refit)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
-        _train(isp, samples, shots, list(range(len(shots))), config, descent, "encoders")
+        _train(isp, frames, config, descent, "encoders")
 
 
-def _train(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    frames: Sequence[int],
-    config: FitConfig,
-    descent: Descent,
-    stage: str,
-) -> None:
+def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, stage: str) -> None:
     isp.use_encoders(True, descent.seed)
     how = config.encoder_training
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _some_frames(samples, frames, how.frames, how.pixels, generator)
-        return torch.stack([_frame_loss(isp, part, shots[k], config, generator) for k, part in drawn]).mean()
+        drawn = _drawn(frames, how.frames, how.pixels, generator)
+        return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in drawn]).mean()
 
     descent.run(stage, loss, tensors, how.steps, how.learning_rate)
 
 
-def _some_frames(
-    samples: PixelSamples, frames: Sequence[int], count: int, pixels: int, generator: torch.Generator
-) -> list[tuple[int, PixelSamples]]:
+def _drawn(
+    frames: FitFrames, count: int, pixels: int, generator: torch.Generator
+) -> list[tuple[PixelSamples, FrameSummary]]:
     """``count`` of the frames, with replacement, each with the same random pixels."""
-    chosen = torch.randint(len(frames), (count,), generator=generator).tolist()
-    index = torch.randint(samples.srgb.shape[-1], (pixels,), generator=generator)
-    return [(frames[k], samples.pick(index, torch.tensor([frames[k]]))) for k in chosen]
+    chosen = torch.randint(len(frames.shots), (count,), generator=generator).tolist()
+    index = torch.randint(frames.pixels.srgb.shape[-1], (pixels,), generator=generator)
+    return [(frames.pixels.pick(index, torch.tensor([k])), frames.shots[k]) for k in chosen]
 
 
 def _frame_loss(
@@ -109,18 +94,16 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
     return pieces[0], pieces[1]
 
 
-def _gain_on_frames_left_out(
-    samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, refit: Refit
-) -> float:
+def _gain_on_frames_left_out(frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> float:
     """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
     gain = 0.0
-    for out, kept, part in folds_of(len(shots), config.encoder_training.folds):
-        isp = refit(kept, part)
+    for out, kept, part in folds_of(frames, config.encoder_training.folds):
+        isp = refit(kept, part, config)
         isp.use_encoders(False)
-        gain -= len(out) * decibels(isp, samples, shots, out)
-        _train(isp, samples, shots, kept, config, descent, f"encoders{part}")
-        gain += len(out) * decibels(isp, samples, shots, out)
-    return gain / len(shots)
+        constants = decibels(isp, out)
+        _train(isp, kept, config, descent, f"encoders{part}")
+        gain += len(out.shots) * (decibels(isp, out) - constants)
+    return gain / len(frames.shots)
 
 
 MANY_FRAMES = 50
@@ -137,31 +120,23 @@ def joint_steps(config: FitConfig, frames: int) -> int:
     return STEPS if frames >= MANY_FRAMES else 0
 
 
-def train_jointly(
-    isp: DictionaryISP,
-    samples: PixelSamples,
-    shots: Sequence[FrameSummary],
-    config: FitConfig,
-    descent: Descent,
-    learning_rate: float = LEARNING_RATE,
-) -> None:
+def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent) -> None:
     """Refine everything at once, if ``config.joint_steps`` says so; the gain goes to ``isp.info``."""
-    steps = joint_steps(config, len(shots))
+    count = len(frames.shots)
+    steps = joint_steps(config, count)
     if steps == 0:
         return
-    if len(shots) < 2:
+    if count < 2:
         raise ValueError("joint_steps: end-to-end training holds frames out for validation; give two frames or more")
-    watched = list(range(0, len(shots), 10))[: max(1, len(shots) // 2)]
-    trained = [k for k in range(len(shots)) if k not in watched]
+    held_out = range(0, count, 10)[: max(1, count // 2)]
+    watched, trained = frames.some(held_out), frames.some([k for k in range(count) if k not in held_out])
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _some_frames(samples, trained, FRAMES_A_STEP, config.batch, generator)
-        return torch.stack([_joint_frame_loss(isp, part, shots[k], config) for k, part in drawn]).mean()
+        drawn = _drawn(trained, FRAMES_A_STEP, config.batch, generator)
+        return torch.stack([_joint_frame_loss(isp, part, shot, config) for part, shot in drawn]).mean()
 
-    def watch() -> float:
-        return decibels(isp, samples, shots, watched)
-
-    descent.run("end to end", loss, dict(isp.named_parameters()), steps, learning_rate, watch=watch)
+    tensors = dict(isp.named_parameters())
+    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=lambda: decibels(isp, watched))
     seen = descent.watched["end to end"]
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +30,9 @@ from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import REPORT_STEPS, SAVE_SECONDS, Descent, cycle_error, decibels, reading_error
-from rawaug.isp.fit.encoders import folds_of, train_encoders, train_jointly
-from rawaug.isp.fit.samples import FramePair, FrameSummary, PixelSamples, sample_pixels
+from rawaug.isp.fit.descent import Descent, cycle_error, decibels, reading_error
+from rawaug.isp.fit.encoders import Refit, folds_of, train_encoders, train_jointly
+from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, Stage
@@ -43,24 +42,18 @@ from rawaug.seeding import derived_seed
 
 FOLDS = 4
 
-Refit = Callable[[Sequence[int], str, FitConfig], DictionaryISP]
-"""Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
 
-
-def with_better_tone(
-    samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, refit: Refit
-) -> tuple[FitConfig, float | None]:
+def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
     """The settings with ``tone`` decided, and the curve's gain in dB if it was compared."""
     if config.tone != "auto":
         return config, None
-    if len(shots) < 2:
+    count, gain = len(frames.shots), 0.0
+    if count < 2:
         return replace(config, tone="learned"), None
-    gain = 0.0
-    for out, kept, part in folds_of(len(shots), min(FOLDS, len(shots))):
+    for out, kept, part in folds_of(frames, min(FOLDS, count)):
         learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
         curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
-        better = decibels(curve, samples, shots, out, True) - decibels(learned, samples, shots, out, True)
-        gain += len(out) * better / len(shots)
+        gain += len(out.shots) * (decibels(curve, out, True) - decibels(learned, out, True)) / count
     return replace(config, tone="curve" if gain > 0 else "learned"), gain
 
 
@@ -80,8 +73,6 @@ def fit_isp(
     progress: bool = True,
     state: str | Path | None = None,
     report: Callable[[DictionaryISP], str] | None = None,
-    report_steps: int = REPORT_STEPS,
-    save_seconds: float = SAVE_SECONDS,
 ) -> DictionaryISP:
     """Fit a dictionary ISP to pairs of RAW and sRGB.
 
@@ -90,48 +81,39 @@ def fit_isp(
         config: settings; see :class:`FitConfig`.
         progress: show progress bars.
         state: file with the state of the fit, to resume it; removed at the end.
-        report: called with the ISP as it would be now, every ``report_steps`` steps of stage 2; its text goes to the
-            progress bar.
-        report_steps: of every stage.
-        save_seconds: between two writes of ``state``.
+        report: called with the ISP as it would be now, every 50 steps of stage 2; its text goes to the progress bar.
 
     Raises:
         ValueError: if there is no pair, a frame has too few unclipped pixels, or ``state`` cannot be read.
     """
     config = config or FitConfig()
     reading = progress_of(pairs, label="read", unit="frame", shown=progress)
-    samples, shots = sample_pixels(reading, config.pixels, config.seed, config.noisy)
-    key = _key(config, samples, shots)
-    descent = Descent(_path(state), key, config.seed, progress, report_steps, save_seconds)
+    frames = sample_pixels(reading, config.pixels, config.seed, config.noisy)
+    path = None if state is None else Path(state)
+    descent = Descent(path, _key(config, frames), config.seed, progress)
 
-    def refit(frames: Sequence[int], part: str, config: FitConfig) -> DictionaryISP:
-        index = torch.tensor(frames)
-        some = PixelSamples(*(value[index] for value in samples))
-        return _Fit(some, [shots[k] for k in frames], config, descent, part).reversed_only()
+    def refit(some: FitFrames, part: str, config: FitConfig) -> DictionaryISP:
+        return _Fit(some, config, descent, part).reversed_only()
 
     with one_thread():
-        config, gain = with_better_tone(samples, shots, config, refit)
-        fit = _Fit(samples, shots, config, descent)
+        config, gain = with_better_tone(frames, config, refit)
+        fit = _Fit(frames, config, descent)
         fit.reversed_only(report)
-        train_encoders(fit.isp, samples, shots, config, descent, partial(refit, config=config))
+        train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
-        train_jointly(fit.isp, samples, shots, config, descent)
+        train_jointly(fit.isp, frames, config, descent)
     descent.finish()
     fit.isp.info |= {} if gain is None else {"curve_gain_db": round(gain, 2)}
-    fit.isp.info["registered"] = sum(shot.registered for shot in shots)
-    fit.isp.info |= {"frames": [shot.name for shot in shots], "steps": config.steps, "seed": config.seed}
+    fit.isp.info["registered"] = sum(shot.registered for shot in frames.shots)
+    fit.isp.info |= {"frames": [shot.name for shot in frames.shots], "steps": config.steps, "seed": config.seed}
     return fit.isp.eval()
 
 
-def _path(state: str | Path | None) -> Path | None:
-    return None if state is None else Path(state)
-
-
-def _key(config: FitConfig, samples: PixelSamples, shots: Sequence[FrameSummary]) -> str:
+def _key(config: FitConfig, frames: FitFrames) -> str:
     """What a kept state belongs to: the version, the settings, the very pixels and what the files say of them."""
-    known = [(shot.name, shot.camera, shot.white_balance) for shot in shots]
+    known = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
     settings = repr((__version__, config, known)).encode()
-    return digest(settings, samples.srgb.numpy().tobytes(), samples.target.numpy().tobytes())
+    return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
 
 
 def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
@@ -158,12 +140,11 @@ def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
 class _Fit:
     """The ISP being fitted, with every frame's own colour; ``part`` ends the names of its stages."""
 
-    def __init__(
-        self, samples: PixelSamples, shots: Sequence[FrameSummary], config: FitConfig, descent: Descent, part: str = ""
-    ) -> None:
-        self.samples, self.shots, self.config, self.descent, self.part = samples, shots, config, descent, part
-        self.isp = new_isp(shots, config)
-        self.tie = Tie(shots)
+    def __init__(self, frames: FitFrames, config: FitConfig, descent: Descent, part: str = "") -> None:
+        self.samples, self.shots = frames
+        self.config, self.descent, self.part = config, descent, part
+        self.isp = new_isp(self.shots, config)
+        self.tie = Tie(self.shots)
         self.colour = self._start()
 
     @torch.no_grad()

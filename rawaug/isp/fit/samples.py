@@ -8,7 +8,7 @@ are compared as averages over blocks instead, where every channel is known.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -82,15 +82,25 @@ class PixelSamples(NamedTuple):
         return PixelSamples(*(value[frames].index_select(-1, index) for value in self))
 
 
-def sample_pixels(
-    pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False
-) -> tuple[PixelSamples, list[FrameSummary]]:
+class FitFrames(NamedTuple):
+    """The frames of a fit: their drawn pixels, and a summary of each."""
+
+    pixels: PixelSamples
+    shots: list[FrameSummary]
+
+    def some(self, frames: Sequence[int]) -> FitFrames:
+        """Some of the frames."""
+        index = torch.tensor(frames)
+        return FitFrames(PixelSamples(*(value[index] for value in self.pixels)), [self.shots[k] for k in frames])
+
+
+def sample_pixels(pairs: Iterable[FramePair], pixels: int, seed: int, noisy: bool = False) -> FitFrames:
     """Draw ``pixels`` from each frame with replacement, keyed by ``seed`` and its name; the frames are read once."""
     drawn = [_sample_frame(pair, pixels, seed, noisy) for pair in pairs]
     if not drawn:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
     frames, shots = zip(*drawn, strict=True)
-    return PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True))), list(shots)
+    return FitFrames(PixelSamples(*(torch.stack(values) for values in zip(*frames, strict=True))), list(shots))
 
 
 def _sample_frame(pair: FramePair, pixels: int, seed: int, noisy: bool) -> tuple[PixelSamples, FrameSummary]:
@@ -168,19 +178,19 @@ class Blocks(NamedTuple):
     place: Tensor
 
 
-def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA, block: int = BLOCK) -> Blocks:
-    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks of even side, their shift removed."""
+def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
+    """Average sRGB ``(3, H, W)`` and RAW ``(1, H, W)`` over corresponding blocks, their shift removed."""
     height, width = raw.shape[-2:]
     dy, dx = find_shift(srgb, raw, cfa)
     top, left = -(min(dy, 0) // 2) * 2, -(min(dx, 0) // 2) * 2
-    rows, columns = (height - top - max(dy, 0)) // block * block, (width - left - max(dx, 0)) // block * block
+    rows, columns = (height - top - max(dy, 0)) // BLOCK * BLOCK, (width - left - max(dx, 0)) // BLOCK * BLOCK
     window = raw[:, top : top + rows, left : left + columns]
     x = as_float(srgb[:, top + dy : top + dy + rows, left + dx : left + dx + columns])
-    low_srgb = F.avg_pool2d(x[None] ** 2.2, block)[0] ** (1 / 2.2)
-    low_raw = F.avg_pool2d(_colours(window, cfa)[None], block // 2)[0]
-    clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], block)[0, 0] > 0
+    low_srgb = F.avg_pool2d(x[None] ** 2.2, BLOCK)[0] ** (1 / 2.2)
+    low_raw = F.avg_pool2d(_colours(window, cfa)[None], BLOCK // 2)[0]
+    clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], BLOCK)[0, 0] > 0
     place = place_in_frame(rows, columns, (top, left), (height, width))
-    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(place, block))
+    return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(place, BLOCK))
 
 
 def find_shift(srgb: Tensor, raw: Tensor, cfa: CFA) -> tuple[int, int]:

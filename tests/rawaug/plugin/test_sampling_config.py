@@ -29,7 +29,7 @@ def test_a_lamp_and_a_temperature_give_their_gains() -> None:
     warm, cold = (lamp.redrawn("upi", light=kelvin, exposure=(0, 0)) for kelvin in (2500, 9000))
     red, blue = zip(*(a.sample(PICTURE, seeded()).isp.gains[[0, 2]].tolist() for a in (warm, cold)), strict=True)
     assert red[0] < red[1] and blue[0] > blue[1], "incandescent light needs less red gain and more blue"
-    assert sample_lights(5, seeded(), *light_range("FL11")).std(axis=0).max() < 0.05
+    assert sample_lights(5, seeded(), light_range("FL11")).std(axis=0).max() < 0.05
 
 
 def test_one_tone_curve_is_drawn_and_the_camera_stays() -> None:

@@ -15,11 +15,17 @@ from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, descent, encoders, fit_isp
 from rawaug.isp.fit.descent import Descent, cycle_error, mean_square, reading_error, weight_distance
-from rawaug.isp.fit.samples import FrameSummary, PixelSamples, sample_pixels
+from rawaug.isp.fit.samples import FitFrames, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 TINY = FitConfig(steps=12, curve_steps=12, pixels=512, batch=128, prior_steps=20)
-OFTEN: dict[str, Any] = {"report_steps": 5, "save_seconds": -1.0}
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every 5 steps a report, and after each the state is written."""
+    monkeypatch.setattr(Descent, "report_steps", 5)
+    monkeypatch.setattr(Descent, "save_seconds", -1.0)
 
 
 def stopped_at(step: int) -> Callable[[torch.Tensor], Callable[[torch.Generator], torch.Tensor]]:
@@ -44,7 +50,7 @@ def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False,
     x = torch.zeros(3)
     loss = stopped_at(stop)(x)
     score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None
-    Descent(path, key, 0, False, **OFTEN).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
+    Descent(path, key, 0, False).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
     return x
 
 
@@ -78,7 +84,7 @@ def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
 
 def test_watched_tensors_come_back_from_their_best_step() -> None:
     x = torch.zeros(3)
-    worker = Descent(None, "key", 0, False, report_steps=5)
+    worker = Descent(None, "key", 0, False)
     worker.run("down", lambda g: x.sum(), {"x": x}, 20, 0.1, watch=lambda: -abs(float(x.detach().sum()) + 1.5))
     start, step, best = worker.watched["down"]
     assert (start, step) == (-1.5, 5) and best > -0.2  # 5 steps of 0.1 by Adam, three times
@@ -96,12 +102,12 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
         return ""
 
     with pytest.raises(KeyboardInterrupt):
-        fit_isp(exact_pairs, TINY, progress=False, state=state, report=report, **OFTEN)
+        fit_isp(exact_pairs, TINY, progress=False, state=state, report=report)
     stopped = state.read_bytes()
-    resumed = fit_isp(exact_pairs, TINY, progress=False, state=state, report=report, **OFTEN).state_dict()
+    resumed = fit_isp(exact_pairs, TINY, progress=False, state=state, report=report).state_dict()
     assert calls == 4  # after 5 and 10 steps, then after 10 and 12
     assert list(tmp_path.iterdir()) == []
-    whole = fit_isp(exact_pairs, TINY, progress=False, **OFTEN).state_dict()
+    whole = fit_isp(exact_pairs, TINY, progress=False).state_dict()
     assert all(torch.equal(resumed[key], whole[key]) for key in whole)
 
     # of other settings, or of frames about which the files say something else, it is not used
@@ -110,7 +116,7 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
         state.write_bytes(stopped)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Descent, "_restored", _refusing(Descent._restored))
-            fit_isp(pairs, config, progress=False, state=state, **OFTEN)
+            fit_isp(pairs, config, progress=False, state=state)
 
 
 def _refusing(restored: Callable[..., tuple[int, Any]]) -> Callable[..., tuple[int, Any]]:
@@ -131,16 +137,15 @@ def test_what_it_shows_is_the_mean_loss_since_the_report_before(monkeypatch: pyt
 
     monkeypatch.setattr(descent, "progress", lambda steps, **_: Bar(steps))
     x, values = torch.zeros(1), iter([1.0, 2.0, 3.0, 4.0, 5.0, 60.0, 10.0])
-    Descent(None, "key", 0, False, report_steps=5).run("line", lambda _: next(values) + 0 * x.sum(), {"x": x}, 7, 0.1)
+    Descent(None, "key", 0, False).run("line", lambda _: next(values) + 0 * x.sum(), {"x": x}, 7, 0.1)
     assert shown == [3.0, 35.0]
 
 
-PIXELS = torch.arange(64)
 CLEAN, NOISY = FitConfig(), FitConfig(noisy=True)
 
 
 @pytest.fixture(scope="module")
-def frame(exact_pair: Callable[..., Pair]) -> tuple[PixelSamples, list[FrameSummary]]:
+def frame(exact_pair: Callable[..., Pair]) -> FitFrames:
     return sample_pixels([exact_pair("shot", (1.6, 1.0, 1.7), 0, size=(32, 40))], 64, 0)
 
 
@@ -171,9 +176,7 @@ def both_passes(isp: DictionaryISP, part: PixelSamples) -> tuple[dict[str, Tenso
     return back, ahead, srgb
 
 
-def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
-) -> None:
+def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(isp: DictionaryISP, frame: FitFrames) -> None:
     part, _ = frame
     back, ahead, srgb = both_passes(isp, part)
     assert set(ahead) == {"x1", "x2", "x3", "x4"} <= set(back)
@@ -193,7 +196,7 @@ def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(
 
 
 def test_from_noisy_readings_the_way_back_starts_where_the_reverse_pass_ended(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
+    isp: DictionaryISP, frame: FitFrames
 ) -> None:
     part, _ = frame
     back, _, _ = both_passes(isp, part)
@@ -213,18 +216,18 @@ def test_weights_apart_add_up_over_both_dictionaries(isp: DictionaryISP) -> None
 
 
 def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
+    isp: DictionaryISP, frame: FitFrames
 ) -> None:
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
     first, second = ((mean_square(isp, part, params) + 1e-5).log().sum().item() for params in (ours, theirs))
-    loss = encoders._frame_loss(isp, part, shots, 0, PIXELS, FitConfig(), torch.Generator().manual_seed(0))
+    loss = encoders._frame_loss(isp, part, shots[0], FitConfig(), torch.Generator().manual_seed(0))
     assert abs(first - second) > 1e-3
     assert loss.item() == pytest.approx(first + second + 1.0 * APART, rel=1e-5)
 
 
 def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consistency(
-    isp: DictionaryISP, frame: tuple[PixelSamples, list[FrameSummary]]
+    isp: DictionaryISP, frame: FitFrames
 ) -> None:
     part, shots = frame
     ours, theirs = isp.choose(shots[0].srgb), isp.choose_forward(shots[0].raw)
@@ -232,7 +235,7 @@ def test_the_joint_loss_has_raw_the_cycle_by_the_forward_weights_and_their_consi
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, CLEAN).item()
     assert abs(cycle - cycle_error(isp, part, ours, back, CLEAN).item()) > 1e-6
-    loss = encoders._joint_frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
+    loss = encoders._joint_frame_loss(isp, part, shots[0], CLEAN)
     expected = mean_square(isp, part, ours)[0].item() + cycle + 0.01 * APART
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     loss.backward()
@@ -254,15 +257,15 @@ def test_a_fit_shows_the_forward_encoders_what_the_forward_pass_does(
     seen: list[Tensor] = []
     isp.forward_encoders.colour.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
     if stage == "encoders":
-        encoders._frame_loss(isp, part, shots, 0, PIXELS, CLEAN, torch.Generator().manual_seed(0))
+        encoders._frame_loss(isp, part, shots[0], CLEAN, torch.Generator().manual_seed(0))
     else:
-        encoders._joint_frame_loss(isp, part, shots, 0, PIXELS, CLEAN)
+        encoders._joint_frame_loss(isp, part, shots[0], CLEAN)
     shaded = shots[0].raw.std((2, 3)) / shots[0].raw.mean((2, 3))
     corrected = seen[0].std((3, 4)) / seen[0].mean((3, 4)).abs()
     assert corrected.max() < 0.2 * shaded.max()  # borders of the demosaicing remain
 
 
-def test_readings_weigh_as_shot_noise_has_it(frame: tuple[PixelSamples, list[FrameSummary]]) -> None:
+def test_readings_weigh_as_shot_noise_has_it(frame: FitFrames) -> None:
     part, _ = frame
     known = part.known.bool()
     predicted = torch.where(known, part.target + 0.01, part.target)

@@ -14,7 +14,7 @@ from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
 from rawaug.isp.fit.config import EncoderTraining
 from rawaug.isp.fit.descent import Descent, decibels
 from rawaug.isp.fit.encoders import joint_steps, train_jointly
-from rawaug.isp.fit.samples import sample_pixels
+from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
 LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
@@ -92,8 +92,8 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
             fitted.append({shot.name for shot in self.shots})
             return isp
 
-    def decibels(isp: DictionaryISP, samples: Any, shots: Any, frames: list[int]) -> float:
-        judged.append((fitted[-1], {shots[k].name for k in frames}))
+    def decibels(isp: DictionaryISP, frames: FitFrames) -> float:
+        judged.append((fitted[-1], {shot.name for shot in frames.shots}))
         return 0.0
 
     monkeypatch.setattr(pipeline, "_Fit", Noted)
@@ -118,28 +118,35 @@ def isp(frames: list[Pair]) -> DictionaryISP:
     return fit_isp(frames, CONFIG, progress=False)
 
 
-def trained(isp: DictionaryISP, frames: list[Pair], steps: int, learning_rate: float) -> None:
-    """Looked at every 5 steps."""
-    samples, shots = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
-    config, descent = replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False, report_steps=5)
-    train_jointly(isp, samples, shots, config, descent, learning_rate)
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """End-to-end training of an ISP on frames, looked at every 5 steps."""
+    monkeypatch.setattr(Descent, "report_steps", 5)
+
+    def train(isp: DictionaryISP, frames: FitFrames, steps: int, learning_rate: float) -> None:
+        monkeypatch.setattr(encoders, "LEARNING_RATE", learning_rate)
+        train_jointly(isp, frames, replace(CONFIG, joint_steps=steps), Descent(None, "", 0, False))
+
+    return train
 
 
-def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair]) -> None:
+def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair], trained: Callable[..., None]) -> None:
     assert "joint" not in isp.info
     with torch.no_grad():
         isp.gain.log_gains.add_(0.1)
-    samples, shots = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
-    before = decibels(isp, samples, shots, [0])
-    trained(isp, frames, steps=20, learning_rate=1e-2)
-    gain, info = decibels(isp, samples, shots, [0]) - before, isp.info["joint"]
+    drawn = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
+    before = decibels(isp, drawn.some([0]))
+    trained(isp, drawn, steps=20, learning_rate=1e-2)
+    gain, info = decibels(isp, drawn.some([0])) - before, isp.info["joint"]
     assert gain > 3.0 and info["gain_db"] == pytest.approx(gain, abs=0.006)
     assert info["steps"] == 20 and info["kept_step"] in (5, 10, 15, 20)
 
 
-def test_where_every_step_is_worse_the_start_remains(isp: DictionaryISP, frames: list[Pair]) -> None:
+def test_where_every_step_is_worse_the_start_remains(
+    isp: DictionaryISP, frames: list[Pair], trained: Callable[..., None]
+) -> None:
     before = {key: value.clone() for key, value in isp.state_dict().items()}
-    trained(isp, frames, steps=10, learning_rate=1.0)
+    trained(isp, sample_pixels(frames, CONFIG.pixels, CONFIG.seed), steps=10, learning_rate=1.0)
     assert isp.info["joint"] == {"steps": 10, "kept_step": 0, "gain_db": 0.0}
     assert all(torch.equal(value, before[key]) for key, value in isp.state_dict().items())
 

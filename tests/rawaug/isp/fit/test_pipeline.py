@@ -12,9 +12,9 @@ import torch
 from rawaug.data.pairs import Pair
 from rawaug.isp.fast import BakedISP
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.descent import decibels
+from rawaug.isp.fit.descent import Descent, decibels
 from rawaug.isp.fit.pipeline import with_better_tone
-from rawaug.isp.fit.samples import FrameSummary, PixelSamples, sample_pixels
+from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import psnr
 
@@ -92,14 +92,17 @@ def test_a_seed_gives_one_isp_and_another_seed_another(exact_pairs: list[Pair]) 
     assert not torch.equal(first["colour.matrices"], other["colour.matrices"])
 
 
-def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(exact_pairs: list[Pair]) -> None:
+def test_a_report_sees_the_isp_as_it_would_be_and_changes_nothing(
+    exact_pairs: list[Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Descent, "report_steps", 2)
     scores = []
 
     def report(isp: DictionaryISP) -> str:
         scores.append(error_db(isp, exact_pairs[0], exact_pairs[0].white_balance))
         return f"{scores[-1]:.1f} dB"
 
-    last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report, report_steps=2)
+    last = fit_isp(exact_pairs[:1], TINY, progress=False, report=report)
     assert scores[-1] == pytest.approx(error_db(last, exact_pairs[0], exact_pairs[0].white_balance), abs=1e-3)
     seen = last.state_dict()
     unseen = fit_isp(exact_pairs[:1], TINY, progress=False).state_dict()
@@ -165,8 +168,8 @@ def test_a_curve_that_no_standard_has_is_found_and_serves_every_pass(exact_pair:
 def refitted(gains: dict[str, float]) -> Callable[..., DictionaryISP]:
     """ISPs whose gains are off by a factor that depends on the tone alone."""
 
-    def refit(frames: list[int], part: str, config: FitConfig) -> DictionaryISP:
-        assert len(frames) == 1 and config.tone in part
+    def refit(frames: FitFrames, part: str, config: FitConfig) -> DictionaryISP:
+        assert len(frames.shots) == 1 and config.tone in part
         isp = DictionaryISP()
         with torch.no_grad():
             isp.gain.log_gains.fill_(gains[config.tone])
@@ -177,30 +180,25 @@ def refitted(gains: dict[str, float]) -> Callable[..., DictionaryISP]:
 
 
 @pytest.fixture(scope="module")
-def two_frames(exact_pairs: list[Pair]) -> tuple[PixelSamples, list[FrameSummary]]:
+def two_frames(exact_pairs: list[Pair]) -> FitFrames:
     return sample_pixels(exact_pairs[:2], 256, 0)
 
 
 @pytest.mark.parametrize("better", ["learned", "curve"])
-def test_auto_takes_what_is_better_on_frames_left_out(
-    two_frames: tuple[PixelSamples, list[FrameSummary]], better: str
-) -> None:
+def test_auto_takes_what_is_better_on_frames_left_out(two_frames: FitFrames, better: str) -> None:
     off = {"learned": 1.0, "curve": 1.0} | {better: 0.0}
-    decided, gain = with_better_tone(*two_frames, replace(CURVE, tone="auto"), refitted(off))
+    decided, gain = with_better_tone(two_frames, replace(CURVE, tone="auto"), refitted(off))
     assert decided.tone == better and gain is not None and (gain > 0) == (better == "curve")
 
 
-def test_what_is_asked_for_is_not_tried_and_one_frame_cannot_decide(
-    two_frames: tuple[PixelSamples, list[FrameSummary]],
-) -> None:
-    samples, shots = two_frames
-    assert with_better_tone(samples, shots, CURVE, refitted({})) == (CURVE, None)
+def test_what_is_asked_for_is_not_tried_and_one_frame_cannot_decide(two_frames: FitFrames) -> None:
+    assert with_better_tone(two_frames, CURVE, refitted({})) == (CURVE, None)
     alone = replace(CURVE, tone="auto")
-    assert with_better_tone(samples, shots[:1], alone, refitted({})) == (replace(alone, tone="learned"), None)
+    assert with_better_tone(two_frames.some([0]), alone, refitted({})) == (replace(alone, tone="learned"), None)
 
 
-def test_frames_are_judged_under_their_own_gains(two_frames: tuple[PixelSamples, list[FrameSummary]]) -> None:
+def test_frames_are_judged_under_their_own_gains(two_frames: FitFrames) -> None:
     isp = DictionaryISP()
     with torch.no_grad():
         isp.gain.log_gains.fill_(1.0)
-    assert decibels(isp, *two_frames, [0, 1], as_shot=True) > decibels(isp, *two_frames, [0, 1]) + 3.0
+    assert decibels(isp, two_frames, as_shot=True) > decibels(isp, two_frames) + 3.0
