@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 from denoisers.files import shipped
+from rawaug.commands import YAML
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import TOLD, benchmark, crops, tables
+from rawaug.evaluation.benchmark import TOLD, benchmark, crops, shown_of, strengths_of, tables
 from rawaug.evaluation.contestants import Contestant, contestant
 from rawaug.evaluation.own_noise import own_noise_note
 from rawaug.evaluation.page import Page, Part
@@ -25,6 +27,8 @@ def run(
     bin: int = 1,
     count: int = 6,
     crop: int = 384,
+    noise: Annotated[str | list[str] | tuple[float, float] | None, YAML] = None,
+    iso: list[float] | None = None,
     seed: int = 0,
     device: str = "cpu",
     json: str | None = None,
@@ -41,6 +45,8 @@ def run(
         bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
+        noise: noise in place of the four strengths: a preset, a measured camera, or [shot_var, read_var].
+        iso: ISO values of that camera, a column each.
         seed: seed of the noise.
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
@@ -51,7 +57,7 @@ def run(
     """
     for path in filter(None, (json, report)):
         require_writable(path)
-    where = find_device(device)
+    where, strengths = find_device(device), strengths_of(noise, iso)
     contestants: dict[str, Contestant] = {}
     for spec in dict.fromkeys(("NonLocalMeans", *shipped(), *denoisers)):
         one = contestant(spec, where)
@@ -60,7 +66,7 @@ def run(
     pairs = open_pairs(data, split="test", bin=bin)
     frames = [replace(pairs[k], own_noise=own_noise(pairs, k)) for k in range(min(count, len(pairs)))]
     everyone = list(contestants.values())
-    result = {"data": data, "bin": bin, "crop": crop, **benchmark(everyone, frames, crop, seed)}
+    result = {"data": data, "bin": bin, "crop": crop, **benchmark(everyone, frames, crop, seed, strengths)}
     for title, head, cells in tables(result):
         print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
     told = {name: row["scores"][TOLD] for name, row in result["rows"].items()}
@@ -74,8 +80,9 @@ def run(
     if report:
         page = Page(f"Denoisers on {data}", [Part(texts=notes)])
         page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
-        page.parts.append(Part("Pictures", texts=["Strong noise, levels told; PSNR of RAW."]))
-        for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed):
+        page.parts.append(Part("Pictures", texts=[f"Noise: {shown_of(strengths)}, levels told; PSNR of RAW."]))
+        for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed, strengths):
             page.add_frame(row, cfa)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}
+        settings |= {"noise": noise, "iso": iso}
         print(f"page: {page.write(Path(report), settings)}")

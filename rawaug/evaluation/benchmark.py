@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from statistics import fmean
@@ -30,7 +30,7 @@ from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import compared
 from rawaug.evaluation.tables import METRICS, Row
 from rawaug.metrics import psnr
-from rawaug.noise import FixedLevels, SensorNoise, ShotReadNoise, estimate_noise
+from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 
@@ -49,9 +49,22 @@ SENSOR: dict[str, Any] = {
     "bits": 12,
     "black_level": 64,
 }
-"""What sensors do besides, at the strengths of :data:`OF_SENSORS`."""
+"""What sensors do besides, at the strengths of :data:`OF_SENSORS`, or at the caller's."""
 OF_SENSORS = ("phone", "strong")
 TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
+
+
+def strengths_of(
+    noise: str | Sequence[float] | Sequence[str] | None = None, isos: Sequence[float] | None = None
+) -> dict[str, NoiseLevels]:
+    """Noise levels by the name of their column: :data:`STRENGTHS`, or those of ``noise``, at each ISO if it has any."""
+    if noise is None:
+        if isos:
+            raise ValueError("iso: needs the name of a camera as noise")
+        return {name: FixedLevels(*levels) for name, levels in STRENGTHS.items()}
+    if not isos:
+        return {str(noise): noise_levels(noise)}
+    return {f"ISO {iso:g}": noise_levels(noise, iso=iso) for iso in isos}
 
 
 @dataclass
@@ -63,31 +76,33 @@ class Column:
     samples: list[Sample | None] = field(default_factory=list)
 
 
-def columns_of(frames: Sequence[Pair], crop: int, seed: int = 0) -> list[Column]:
+def columns_of(
+    frames: Sequence[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
+) -> list[Column]:
     """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
 
     Noise is put on whole frames, from which the levels are estimated.
     """
-    wanted = [*product((TOLD, ESTIMATED), STRENGTHS), *product((REAL,), OF_SENSORS)]
-    columns = {pair: Column(*pair) for pair in wanted}
+    strengths = strengths or strengths_of()
+    of_sensors = [name for name in strengths if name in OF_SENSORS] or strengths
+    columns = {pair: Column(*pair) for pair in [*product((TOLD, ESTIMATED), strengths), *product((REAL,), of_sensors)]}
     for frame in progress(frames, label="noise", unit="frame"):
-        for name in STRENGTHS:
-            told, real = (noisy_sample(frame, name, seed, real) for real in (False, True))
+        for name, levels in strengths.items():
+            told, real = (noisy_sample(frame, name, levels, seed, real) for real in (False, True))
             for condition, sample in ((TOLD, told), (ESTIMATED, _estimated(told, frame.cfa)), (REAL, real)):
                 if (condition, name) in columns:
                     columns[condition, name].samples.append(sample and middle_of(sample, crop))
     return list(columns.values())
 
 
-def noisy_sample(frame: Pair, strength: str, seed: int, real: bool = False) -> Sample:
-    """A whole frame with noise of a strength, ``(1, 4, h, w)``."""
-    shot_var, read_var = STRENGTHS[strength]
-    levels = FixedLevels(shot_var, read_var)
+def noisy_sample(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Sample:
+    """A whole frame with noise of a strength, ``(1, 4, h, w)``; that of the caller's levels is that of ``evaluate``."""
     noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
     clean = bayer.pack(frame.raw[None], frame.cfa)
-    params = noise.sample(1, keyed_generator(seed, "benchmark", strength, frame.name))
+    key = ("benchmark", strength) if strength in STRENGTHS else ("test noise",)
+    params = noise.sample(1, keyed_generator(seed, *key, frame.name))
     noisy = noise.apply(clean, params)
-    return Sample(noisy, clean, noise_variance(noisy, shot_var, read_var))
+    return Sample(noisy, clean, noise_variance(noisy, params["shot_var"].item(), params["read_var"].item()))
 
 
 def _estimated(sample: Sample, cfa: CFA) -> Sample | None:
@@ -115,7 +130,13 @@ def hash_of(columns: Sequence[Column]) -> str:
     return digest.hexdigest()[:8]
 
 
-def benchmark(contestants: Sequence[Contestant], frames: Sequence[Pair], crop: int, seed: int = 0) -> dict[str, Any]:
+def benchmark(
+    contestants: Sequence[Contestant],
+    frames: Sequence[Pair],
+    crop: int,
+    seed: int = 0,
+    strengths: Mapping[str, NoiseLevels] | None = None,
+) -> dict[str, Any]:
     """Scores of every denoiser, beside those of the noisy input.
 
     Args:
@@ -123,6 +144,7 @@ def benchmark(contestants: Sequence[Contestant], frames: Sequence[Pair], crop: i
         frames: the references; with ``own_noise``, its share of each squared error is in the scores.
         crop: side of the middle that is scored, in pixels of the mosaic.
         seed: of the noise.
+        strengths: noise levels by name; see :func:`strengths_of`.
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
@@ -131,7 +153,7 @@ def benchmark(contestants: Sequence[Contestant], frames: Sequence[Pair], crop: i
     Raises:
         ValueError: if a denoiser fails, or its result is not finite or of another shape.
     """
-    columns = columns_of(frames, crop, seed)
+    columns = columns_of(frames, crop, seed, strengths)
     frames = [frame.middle(crop) for frame in frames]
     inputs = Contestant("noisy input", lambda noisy, variance, cfa: noisy)
     rows = {one.name: _row(one, frames, columns) for one in (inputs, *contestants)}
@@ -185,14 +207,15 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
         scored = {name: at["frames"] for name, at in result["rows"]["noisy input"]["scores"][condition].items()}
         count = len(result["frames"])
         head = [name if n == count else f"{name} ({n} of {count} frames)" for name, n in scored.items()]
-        head += ["SSIM, strong", "GMAC", "s"] if condition == TOLD else []
+        shown = shown_of(scored)
+        head += [f"SSIM, {shown}", "GMAC", "s"] if condition == TOLD else []
         cells = {}
         for name, row in result["rows"].items():
             scores = row["scores"][condition]
             cells[name] = [_both(scores[strength]) for strength in scored]
             if condition == TOLD:
                 costs = ["" if row[key] is None else f"{row[key]:.2f}" for key in ("gmac", "seconds")]
-                cells[name] += [f"{scores['strong']['ssim']:.4f} / {scores['strong']['ssim_srgb']:.4f}", *costs]
+                cells[name] += [f"{scores[shown]['ssim']:.4f} / {scores[shown]['ssim_srgb']:.4f}", *costs]
         yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frame{'s' * (count != 1)}", head, cells
 
 
@@ -200,12 +223,23 @@ def _both(scores: Mapping[str, float]) -> str:
     return f"{scores['psnr']:.2f} / {scores['psnr_srgb']:.2f}" if scores["frames"] else "-"
 
 
+def shown_of(strengths: Collection[str]) -> str:
+    """The strength whose pictures and SSIM are shown."""
+    *_, last = strengths
+    return "strong" if "strong" in strengths else last
+
+
 def crops(
-    contestants: Sequence[Contestant], frames: Sequence[Pair], crop: int, seed: int = 0
+    contestants: Sequence[Contestant],
+    frames: Sequence[Pair],
+    crop: int,
+    seed: int,
+    strengths: Mapping[str, NoiseLevels],
 ) -> Iterator[tuple[Row, CFA]]:
-    """Pictures for the page: each frame with strong noise, by every denoiser, and clean."""
+    """Pictures for the page: each frame with noise of :func:`shown_of`, by every denoiser, and clean."""
+    shown = shown_of(strengths)
     for frame in frames:
-        sample = middle_of(noisy_sample(frame, "strong", seed), crop)
+        sample = middle_of(noisy_sample(frame, shown, strengths[shown], seed), crop)
         row = Row(frame.middle(crop), {"noisy": sample.noisy}, {})
         for one in contestants:
             row.panels[one.name] = denoised_by(one, sample, frame.cfa)

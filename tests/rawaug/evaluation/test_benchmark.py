@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,10 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import open_pairs
 from rawaug.evaluation import benchmark as ruler
-from rawaug.evaluation.benchmark import STRENGTHS, benchmark, columns_of, hash_of
+from rawaug.evaluation.benchmark import STRENGTHS, benchmark, columns_of, hash_of, strengths_of
 from rawaug.evaluation.contestants import Contestant, bf_dncnn, contestant
+from rawaug.evaluation.scores import frozen_sample
+from rawaug.noise import noise_model
 
 DOCS = Path(__file__).parents[3] / "docs" / "benchmark.md"
 LEVELS = STRENGTHS["phone"]
@@ -63,6 +66,20 @@ def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
             assert measured.item() == pytest.approx(
                 (shot_var * sample.clean[unclipped] + read_var).mean().item(), rel=0.05
             )
+
+
+def test_noise_of_the_callers_is_that_of_evaluate() -> None:
+    frame = replace(open_pairs("demo:test")[0], noisy=None, shot_var=None, read_var=None)
+    samples = {}
+    for column in columns_of([frame], crop=10_000, strengths=strengths_of("SonyA7S2", [1600, 6400])):
+        samples[column.condition, column.strength] = column.samples[0]
+    assert {strength for _, strength in samples} == {"ISO 1600", "ISO 6400"}
+    told = samples["levels told", "ISO 6400"]
+    evaluated = frozen_sample(frame, noise_model("SonyA7S2", iso=6400), frame.cfa, seed=0)
+    assert told is not None and torch.equal(told.noisy, evaluated.noisy)
+    assert torch.allclose(told.variance, evaluated.variance)
+    with pytest.raises(ValueError, match="iso: needs the name of a camera as noise"):
+        strengths_of(isos=[100])
 
 
 @pytest.mark.parametrize(
