@@ -67,7 +67,8 @@ def run(
     Args:
         source: a RAW file, or a folder of them.
         out: output DNG, or output folder.
-        denoiser: .safetensors file written by rawaug run, or the name of a shipped denoiser; by default rawaug-small.
+        denoiser: .safetensors file written by rawaug run, .onnx file written by rawaug export (faster on a CPU), or
+            the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
             law), profile, estimate, camera (the law that the denoiser was trained for), an ISP file (uses its stored

@@ -17,7 +17,7 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,6 +32,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
+from rawaug.evaluation.contestants import feeds, session_of
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import find_weights, read_header, replacing
 from rawaug.io import read_raw
@@ -56,8 +57,13 @@ def require_onnx(way_out: str = "") -> None:
         raise ValueError(f"export to ONNX needs {', '.join(missing)}: pip install 'rawaug[export]'{way_out}")
 
 
-def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path) -> None:
-    """One ONNX file of float32 of ``model(*inputs)``; height and width of four-dimensional inputs are free."""
+def to_onnx(
+    model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path, stated: Mapping[str, str] | None = None
+) -> None:
+    """One ONNX file of float32 of ``model(*inputs)``; height and width of four-dimensional inputs are free.
+
+    ``stated`` are its metadata.
+    """
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
     with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
         warnings.simplefilter("ignore")
@@ -65,6 +71,7 @@ def to_onnx(model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path
         program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
         onnx = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
         assert onnx is not None
+        onnx.model.metadata_props.update(stated or {})
         onnx.save(str(path), external_data=False)
 
 
@@ -78,20 +85,6 @@ def errors_only(name: str) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
-
-
-def session_of(path: Path) -> Any:
-    """ONNX Runtime on the CPU, on as many threads as PyTorch has."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-
-
-def feeds(names: Sequence[str], values: Sequence[Tensor]) -> dict[str, Any]:
-    """What a session is run with."""
-    return {name: value.numpy() for name, value in zip(names, values, strict=True)}
 
 
 def require_equal(result: Any, expected: Tensor, path: Path) -> float:
@@ -230,13 +223,13 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
     require_onnx()
-    model, _ = denoisers.load(find(denoiser))
+    model, info = denoisers.load(find(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
     images = comparison_frame(frame)[: len(names)]
     example = torch.rand(1, model.channels, 70, 90)
     examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
     with replacing(out) as partial:
-        to_onnx(model, examples, "denoised", partial)
+        to_onnx(model, examples, "denoised", partial, {"stride": str(model.stride), "info": json.dumps(info)})
         session, values = session_of(partial), feeds(names, images)
         with torch.inference_mode():
             expected = model(*images)

@@ -23,6 +23,7 @@ from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Sample
+from rawaug.evaluation.contestants import load_network
 from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
 from rawaug.io import RawFrame
@@ -152,7 +153,7 @@ def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
     """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is."""
     if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
         return noise
-    stored = denoisers.load(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
+    stored = load_network(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
     law = stored.get("noise")
     if not isinstance(law, Mapping):
         file = denoiser if noise == "camera" else noise
@@ -201,8 +202,8 @@ class NetworkDenoiser:
 
     def __init__(self, weights: str | Path, self_ensemble: bool = False, device: str = "auto") -> None:
         where, path = find_device(device), find(weights)
-        model, info = denoisers.load(path)
-        self.model = model.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        model, info = load_network(path)
+        self.model = model.to(where, memory_format=torch.channels_last)
         self.cfa, self.self_ensemble = CFA(info.get("cfa", "RGGB")), self_ensemble
         self.settings: dict[str, Any] = {"denoiser_sha256": sha256(path), "self_ensemble": self_ensemble}
 

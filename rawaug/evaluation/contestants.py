@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 import denoisers
@@ -26,11 +26,13 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Sample
 from rawaug.errors import extra
 from rawaug.evaluation.scores import denoise
-from rawaug.files import read_tensors
+from rawaug.files import parse_object, read_tensors
 from rawaug.noise import anscombe
 from rawaug.registry import FILTERS, nearest
 
 _AGAIN = "download or convert it again"
+_STRIDE = 32
+"""Of a network in an ONNX file that states none."""
 
 
 class Contestant(NamedTuple):
@@ -44,7 +46,8 @@ def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
     """The denoiser that a string names; see the module."""
     path = Path(spec)
     if path.suffix == ".onnx":
-        return Contestant(path.stem, _of_onnx(path))
+        network = OnnxNetwork(path)
+        return Contestant(path.stem, lambda noisy, variance, _: network(noisy, variance))
     if path.suffix == ".safetensors" and path.is_file():
         return _of_weights(path, torch.device(device))
     if ":" in spec:
@@ -134,7 +137,39 @@ def _of_filter(name: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
     return run
 
 
-def _of_onnx(path: Path) -> Callable[[Tensor, Tensor, CFA], Tensor]:
+class OnnxNetwork(nn.Module):
+    """A network in an ONNX file, run by ONNX Runtime on the CPU, one picture after the other.
+
+    Args:
+        path: as ``rawaug export`` writes it, which states the CFA and the stride; or any that takes noisy packed RAW
+            ``(1, 4, h, w)``, and its variance or not.
+
+    Raises:
+        FileNotFoundError, MissingExtra: if there is no such file, or no ONNX Runtime.
+        ValueError: if the file cannot be used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.session = session_of(path)
+        self.names = [value.name for value in self.session.get_inputs()]
+        if not 1 <= len(self.names) <= 2:
+            names = ", ".join(self.names)
+            raise ValueError(f"{path}: takes {names}; a denoiser takes noisy RAW, or noisy RAW and its variance")
+        self.reads_variance = len(self.names) == 2
+        self.stated = dict(self.session.get_modelmeta().custom_metadata_map)
+        stride = self.stated.get("stride", "")
+        self.stride = (int(stride) if stride.isdecimal() else 0) or _STRIDE
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        """``(B, 4, h, w)`` denoised, on the CPU."""
+        images = (noisy,) if variance is None else (noisy, variance)
+        ones = zip(*(image.split(1) for image in images), strict=True)
+        return torch.cat([torch.from_numpy(self.session.run(None, feeds(self.names, one))[0]) for one in ones])
+
+
+def session_of(path: Path) -> Any:
+    """ONNX Runtime on the CPU, on as many threads as PyTorch has."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with extra("export"):
@@ -142,18 +177,22 @@ def _of_onnx(path: Path) -> Callable[[Tensor, Tensor, CFA], Tensor]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has a class of its own for each reason
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
-    names = [value.name for value in session.get_inputs()]
-    if not 1 <= len(names) <= 2:
-        raise ValueError(f"{path}: takes {', '.join(names)}; a denoiser takes noisy RAW, or noisy RAW and its variance")
 
-    def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
-        images = zip(names, (noisy.numpy(), variance.numpy()), strict=False)
-        return torch.from_numpy(session.run(None, dict(images))[0])
 
-    return run
+def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
+    """What a session is run with; of the images those that it takes."""
+    return {name: image.numpy() for name, image in zip(names, images, strict=False)}
+
+
+def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
+    """A network and what its file says of it: a ``.safetensors`` of rawaug, or an ``.onnx``."""
+    if path.suffix != ".onnx":
+        return denoisers.load(path)
+    network = OnnxNetwork(path)
+    return network, parse_object(network.stated.get("info", "{}"))
 
 
 def _of_function(spec: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:

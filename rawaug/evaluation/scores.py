@@ -104,7 +104,7 @@ def denoise(
         run = at_test(run)
     if views > 1:
         run = denoisers.SelfEnsemble(run, cfa, views=views, each=counted("view group"))
-    device = next(model.parameters()).device
+    device = next(model.parameters(), sample.noisy).device
     denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
     return denoised.cpu()
 

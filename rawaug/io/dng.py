@@ -8,8 +8,8 @@ A rewritten DNG keeps camera, colour, lens corrections, EXIF, GPS and XMP of its
 old pixels (their layout, levels, digests, previews, noise profile) and what points into the old file (maker notes). The
 EXIF and GPS directories are copied value by value in their binary form.
 
-Pixels are compressed as lossless JPEG, the difference to the left neighbour of the same colour in Huffman's code; RAW
-without noise needs a quarter to half of its size. (Deflate is for floating point in DNG, and LibRaw refuses it here.)
+Pixels are compressed as lossless JPEG, the difference to the left neighbour of the same colour in Huffman's code, to
+about half (14 bits) or a third (10 bits) of their size. (LibRaw reads no integers compressed by deflate.)
 Source: DNG specification 1.4, chapters 3 to 6; TIFF 6.0, section 2; ITU-T T.81, annex H.
 """
 

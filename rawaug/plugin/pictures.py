@@ -8,6 +8,7 @@ these, or a tuple or mapping with one among its fields.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,11 @@ _CHANNELS = (1, 3, 4)
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
+
+_PAIR = (
+    "samples begin with two pictures of one shape, as noisy and clean ones do, and the first is made RAW; give key=1 if "
+    "the second is the clean one, or key=0"
+)
 
 Where = str | int | None
 """Where the picture is in a sample: a key, an index, or None if the sample is the picture."""
@@ -84,8 +90,8 @@ def is_picture(value: Any) -> bool:
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
     """Where the picture (``batched``: the pictures) of a sample is.
 
-    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first. A batch that is a list of
-    pictures is not taken apart.
+    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first; then two pictures of one shape
+    are warned of. A batch that is a list of pictures is not taken apart.
     """
     if isinstance(sample, Mapping):
         if key not in sample:
@@ -95,6 +101,8 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
     if isinstance(sample, (tuple, list)) and sample:
         if batched and key is None and is_picture(sample[0]):
             return None
+        if key is None and len(sample) > 1 and _likely_pair(*sample[:2]):
+            warnings.warn(_PAIR, stacklevel=2)
         where = key or 0
         if not isinstance(where, int) or not -len(sample) <= where < len(sample):
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
@@ -102,6 +110,15 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
     if key is not None:
         raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; omit key")
     return None
+
+
+def _likely_pair(first: Any, second: Any) -> bool:
+    """Whether both are pictures in colour, or batches of them, of one shape."""
+    if isinstance(first, (Tensor, np.ndarray)) and isinstance(second, (Tensor, np.ndarray)):
+        coloured = first.ndim in (3, 4) and 3 in (first.shape[-3], first.shape[-1])
+        return coloured and tuple(first.shape) == tuple(second.shape)
+    images = hasattr(first, "getbands") and hasattr(second, "getbands")
+    return images and first.mode == second.mode == "RGB" and first.size == second.size
 
 
 def picked(sample: Any, where: Where) -> Any:

@@ -10,8 +10,12 @@ import pytest
 import torch
 
 import denoisers
+from rawaug.bayer import CFA
 from rawaug.cli import main
-from rawaug.commands.export import errors_only, export, session_of
+from rawaug.commands.export import errors_only, export
+from rawaug.commands.frame_denoisers import frame_denoiser
+from rawaug.commands.submit import Block
+from rawaug.evaluation.contestants import session_of
 
 
 @pytest.fixture
@@ -30,6 +34,10 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
     assert main(["export", str(weights), str(out)]) == 0
     assert "largest difference from PyTorch" in capsys.readouterr().out
     session, model = session_of(out), denoisers.from_pretrained(weights)
+    frame = Block(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
+    both = [frame_denoiser(file, self_ensemble=True)(frame, (1e-3, 1e-5)) for file in (weights, out)]
+    assert (both[0] - frame.mosaic).abs().max() > 1e-3
+    assert (both[0] - both[1]).abs().max() < 1e-4
     for height, width in ((64, 32), (31, 45), (5, 130)):
         noisy = torch.rand(1, 4, height, width, generator=torch.Generator().manual_seed(0)) - 0.05
         variance = 1e-3 * noisy.clamp_min(0.0) + 1e-5

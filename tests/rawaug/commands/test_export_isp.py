@@ -11,8 +11,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from rawaug.bayer import pack_rgb
 from rawaug.cli import main
-from rawaug.commands.export import ReversePass, export_isp, session_of
+from rawaug.commands.export import ReversePass, export_isp
 from rawaug.commands.info import as_json
+from rawaug.evaluation.contestants import session_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 

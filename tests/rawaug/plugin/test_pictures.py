@@ -170,3 +170,13 @@ def test_a_batch_that_is_a_list_of_pictures_is_not_taken_apart() -> None:
 def test_a_key_that_fits_nothing_says_what_would(sample: Any, key: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         find_picture(sample, key)
+
+
+def test_noisy_and_clean_of_one_shape_are_warned_of() -> None:
+    noisy, clean = torch.rand(2, 3, 20, 24)
+    arrays, images = [x.numpy().transpose(1, 2, 0) for x in (noisy, clean)], [Image.new("RGB", (24, 20))] * 2
+    for pair in ((noisy, clean), arrays, images, (noisy[None], clean[None])):
+        with pytest.warns(UserWarning, match="give key=1"):
+            assert find_picture(pair, None) == 0
+    for sample in ((noisy, clean), (noisy, clean[:, 2:]), (noisy, noisy[0]), (noisy, torch.tensor(1)), (noisy,)):
+        assert find_picture(sample, 0 if sample[-1] is clean else None) == 0  # warnings are errors here
