@@ -24,8 +24,8 @@ _PIL_AS_RGB = ("1", "L", "LA", "La", "P", "PA", "RGBA", "RGBa", "RGBX", "YCbCr")
 _PIL_AS_IS = ("RGB", "F", "I;16", "I;16L", "I;16B", "I;16N")
 
 _PAIR = (
-    "samples begin with two pictures of one shape, as noisy and clean ones do, and the first is made RAW; give key=1 if "
-    "the second is the clean one, or key=0"
+    "samples begin with two pictures of one shape, as noisy and clean ones do, and the first is made RAW; "
+    "give key=1 if the second is the clean one, or key=0"
 )
 
 Where = str | int | None
@@ -90,8 +90,8 @@ def is_picture(value: Any) -> bool:
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
     """Where the picture (``batched``: the pictures) of a sample is.
 
-    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first; then two pictures of one shape
-    are warned of. A batch that is a list of pictures is not taken apart.
+    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first; two pictures of one shape are then
+    warned of. A batch that is a list of pictures is not taken apart.
     """
     if isinstance(sample, Mapping):
         if key not in sample:
