@@ -90,8 +90,8 @@ def is_picture(value: Any) -> bool:
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
     """Where the picture (``batched``: the pictures) of a sample is.
 
-    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first; two pictures of one shape are then
-    warned of. A batch that is a list of pictures is not taken apart.
+    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first, with a warning where the second
+    is a picture of the same shape. A batch that is a list of pictures is not taken apart.
     """
     if isinstance(sample, Mapping):
         if key not in sample:
