@@ -1,7 +1,8 @@
-r"""A RAW pair on disk, ``NAME_clean.dng NAME_noisy.dng``, ``NAME.npz`` or ``NAME_clean.tif NAME_noisy.tif``.
+r"""A pair on disk: ``NAME.npz``, or ``NAME_clean`` and ``NAME_noisy`` as ``.dng``, ``.tif`` or ``.png``.
 
-:mod:`rawaug.data.formats` says what these hold. ``NAME.safetensors``, the parameters that replay the pair, is written
-last: a pair is there when its parameters are. A DNG's black level is as high as the darkest noisy value needs, so that
+:mod:`rawaug.data.formats` says what these hold; the frames of a burst are ``NAME_noisy_0`` and so on, in NPZ one array.
+``NAME.safetensors``, the parameters that replay the pair, is written last: a pair is there when its parameters are. A
+DNG's black level is as high as the darkest noisy value needs, so that
 nothing is clipped at black; the clean file has the same levels.
 """
 
@@ -11,7 +12,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, Task, noise_levels, replayed
-from rawaug.data.formats import write_npz, write_tiff
+from rawaug.data.formats import write_npz, write_png, write_tiff
 from rawaug.files import digest, read_header, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
@@ -82,18 +83,46 @@ def _numbered(stem: Path, number: int) -> Path:
 
 
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
-    """Write a pair ``(4, h, w)`` and its parameters to files whose names begin with ``stem``."""
-    if format == "dng":
-        clean, noisy, stops = camera_frames(pair, augment)
-        write_dng(_beside(stem, "_clean.dng"), clean, baseline_exposure=stops)
-        write_dng(_beside(stem, "_noisy.dng"), noisy, baseline_exposure=stops)
-    elif format == "npz":
-        write_npz(_beside(stem, ".npz"), pair.clean, pair.noisy, _stated(pair, augment))
-    else:
-        for name, raw in (("clean", pair.clean), ("noisy", pair.noisy)):
-            write_tiff(_beside(stem, f"_{name}.tif"), augment.mosaic(raw), _stated(pair, augment))
-    header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(vars(origin))}
+    """Write a pair and its parameters to files whose names begin with ``stem``."""
+    _WRITERS[format](stem, pair, augment)
+    header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(origin.stored())}
     write_tensors(pair.params.tensors(), header, params_file(stem))
+
+
+def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
+    """What a pair holds, ``(C, H, W)`` each, by the end of its file's name."""
+    noisy = {"_noisy": pair.noisy} if augment.burst is None else {f"_noisy_{k}": x for k, x in enumerate(pair.noisy)}
+    return {end: x if len(x) == 3 else augment.mosaic(x) for end, x in {"_clean": pair.clean, **noisy}.items()}
+
+
+def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    frames, stops = camera_frames(pair, augment)
+    for end, frame in frames.items():
+        write_dng(_beside(stem, f"{end}.dng"), frame, baseline_exposure=stops)
+
+
+def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    write_npz(_beside(stem, ".npz"), pair.clean, pair.noisy, _stated(pair, augment))
+
+
+def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    for end, image in _images(pair, augment).items():
+        if augment.targets.target == "srgb":  # which viewers take integers for
+            image = (image * 65535.0).round().to(torch.uint16)
+        write_tiff(_beside(stem, f"{end}.tif"), image, _stated(pair, augment))
+
+
+def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
+    for end, image in _images(pair, augment).items():
+        write_png(_beside(stem, f"{end}.png"), image)
+
+
+_WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {
+    "dng": _write_dngs,
+    "npz": _write_npz,
+    "tiff": _write_tiffs,
+    "png": _write_pngs,
+}
 
 
 def params_file(stem: Path) -> Path:
@@ -102,7 +131,7 @@ def params_file(stem: Path) -> Path:
 
 
 def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
-    """The pair ``(4, h, w)`` described by a parameter file, bit for bit as written.
+    """The pair described by a parameter file, bit for bit as written.
 
     Args:
         params: ``NAME.safetensors`` of a pair.
@@ -130,6 +159,8 @@ def _beside(stem: Path, ending: str) -> Path:
 
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     """Metadata of the mosaics; colour that cannot be inverted is not stored."""
+    if augment.targets.target == "srgb":
+        return noise_levels(pair)
     stated: dict[str, Any] = {"cfa": augment.cfa, **noise_levels(pair)}
     try:
         white_balance, matrix, _ = _color(pair, augment)
@@ -138,8 +169,8 @@ def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:
     return stated | {"white_balance": list(white_balance), "color_matrix": matrix.tolist()}
 
 
-def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFrame, float]:
-    """A pair ``(4, h, w)`` as camera frames: clean, noisy, and the stops of underexposure."""
+def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFrame], float]:
+    """A RAW pair as camera frames by the ends of their files' names, and the stops of underexposure."""
     white_balance, color_matrix, stops = _color(pair, augment)
     metadata: dict[str, Any] = {
         "cfa": augment.isp.cfa,
@@ -156,12 +187,11 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[RawFrame, RawFram
     }
     levels = noise_levels(pair)
     profile = (levels["shot_var"], levels["read_var"]) if len(levels) == 2 else None
-    clean, noisy = (augment.mosaic(raw) for raw in (pair.clean, pair.noisy))
-    return (
-        RawFrame(mosaic=clean, noise_profile=None, **metadata),
-        RawFrame(mosaic=noisy, noise_profile=profile, **metadata),
-        stops,
-    )
+    frames = {
+        end: RawFrame(mosaic=mosaic, noise_profile=None if end == "_clean" else profile, **metadata)
+        for end, mosaic in _images(pair, augment).items()
+    }
+    return frames, stops
 
 
 def _color(pair: RawPair, augment: RawAugment) -> tuple[tuple[float, float, float], Tensor, float]:

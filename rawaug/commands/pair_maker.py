@@ -21,6 +21,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided
 from rawaug.plugin.sampling_config import SamplingConfig, draw_key
+from rawaug.plugin.targets import Target
 from rawaug.registry import Spec
 
 
@@ -39,7 +40,9 @@ def require_same_settings(path: Path, settings: dict[str, object], overwrite: bo
     write_json(settings, path)
 
 
-Format = Literal["dng", "npz", "tiff", "webdataset"]
+Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
+TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}
+"""What a format can hold; the others hold any target."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,11 @@ class Origin:
     noise: Spec | Sequence[float]
     version: str = __version__
     cfa: str | None = None
+    form: Mapping[str, Any] | None = None
+
+    def stored(self) -> dict[str, Any]:
+        """As JSON."""
+        return {key: value for key, value in vars(self).items() if value is not None}
 
 
 class Outcome(NamedTuple):
@@ -100,10 +108,12 @@ class PairMaker:
         """The origin of the pairs of a picture with this hash."""
         drawing = self.settings.drawing
         noise, cfa = drawing.noise_spec, self.augment.cfa
-        return Origin(str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa)
+        return Origin(
+            str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa, form=drawing.form() or None
+        )
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
-        """The origin of a picture's pairs, and an iterator over (number, pair ``(4, h, w)``)."""
+        """The origin of a picture's pairs, and an iterator over (number, pair)."""
         before, content = picture.stat(), sha256(picture)
         srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
         after = picture.stat()
@@ -127,8 +137,10 @@ def noise_levels(pair: RawPair) -> dict[str, float]:
 def replayed(
     drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
 ) -> RawPair:
-    """The pair ``(4, h, w)`` of these parameters, bit for bit."""
-    augment = RawAugment.from_pretrained(str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa)
+    """The pair of these parameters, bit for bit."""
+    augment = RawAugment.from_pretrained(
+        str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa, **origin.form or {}
+    )
     found = Path(picture or origin.picture)
     if sha256(find_weights(str(isp or origin.isp))) != origin.isp_sha256:
         raise ValueError(f"{label}: the ISP {isp or origin.isp} is not the one this pair was made with")

@@ -4,7 +4,7 @@
 key, ``PICTURE_NUMBER``:
 
 ==================  ==============================================================================================
-``KEY.clean.npy``   packed float32 ``(4, h, w)``, R, Gr, Gb, B
+``KEY.clean.npy``   float32, as :class:`rawaug.RawPair` has it: packed ``(4, h, w)``, R, Gr, Gb, B, unless told else
 ``KEY.noisy.npy``   the same with noise
 ``KEY.json``        picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters
 ==================  ==============================================================================================
@@ -33,6 +33,7 @@ from rawaug.bayer import CFA
 from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, noise_levels, replayed
 from rawaug.files import parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
+from rawaug.plugin.sampling_config import SamplingConfig
 
 PER_SHARD = 500
 """Pictures in a shard: of half a megapixel each, two gigabytes."""
@@ -112,8 +113,8 @@ def _names(pictures: Sequence[Path], source: Path) -> tuple[str, ...]:
 
 def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, number: int) -> dict[str, Any]:
     """The JSON of a sample; paths are relative, so that machines with other folders write the same bytes."""
-    own = {**vars(origin), "picture": name, "isp": Path(origin.isp).name, "number": number}
-    height, width = maker.augment.mosaic(pair.clean).shape[-2:]
+    own = {**origin.stored(), "picture": name, "isp": Path(origin.isp).name, "number": number}
+    height, width = (pair.clean if len(pair.clean) == 3 else maker.augment.mosaic(pair.clean)).shape[-2:]
     params = {key: value.tolist() for key, value in pair.params.tensors().items()}
     return own | noise_levels(pair) | {"height": height, "width": width, "params": params}
 
@@ -149,7 +150,7 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
         >>> pair = replay_sample(sample["json"], "photographs")  # doctest: +SKIP
     """
     tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
-    origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__})
+    origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__ if key in described})
     picture = Path(pictures) / described["picture"]
     return replayed(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
 
@@ -167,15 +168,25 @@ def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
     return True
 
 
+def _form(drawing: SamplingConfig) -> str:
+    raw = "packed float32 RAW `(4, h, w)` in the order R, Gr, Gb, B"
+    if drawing.cfa is not None and drawing.cfa not in CFA.__members__:
+        raw = f"float32 RAW mosaics `(1, H, W)` of the pattern {drawing.cfa}"
+    raw += ", black 0, white 1, not clipped at black"
+    forms = {
+        "rgb": f"clean linear camera RGB, float32 `(3, H, W)`, and noisy {raw}",
+        "srgb": "developed sRGB, float32 `(3, H, W)` in [0, 1]",
+    }
+    form = forms.get(drawing.target or "raw", raw)
+    return form if drawing.burst is None else f"{form}; noisy has an axis of {drawing.burst} frames before these"
+
+
 def card(shards: Sequence[Mapping[str, Any]], settings: Settings) -> str:
     """The dataset card, with the header that Hugging Face reads."""
     pairs, size = (sum(shard[key] for shard in shards) for key in ("nsamples", "filesize"))
     drawing = settings.drawing
-    others = {key: drawing.stored().get(key) for key in ("camera", "light", "tone", "exposure", "iso", "cfa")}
-    rows = "".join(f"\n| {key} | {value} |" for key, value in others.items() if value is not None)
-    form = "packed float32 `(4, h, w)` in the order R, Gr, Gb, B"
-    if drawing.cfa is not None and drawing.cfa not in CFA.__members__:
-        form = f"float32 mosaics `(1, H, W)` of the pattern {drawing.cfa}"
+    own = ("isp", "noise", "sampling")
+    rows = "".join(f"\n| {key} | {value} |" for key, value in drawing.stored().items() if key not in own)
     category = next((name for limit, name in _SIZES if pairs < limit), "n>10M")
     return f"""---
 configs:
@@ -202,7 +213,7 @@ tags:
 | sampling of cameras | {drawing.sampling} |
 | seed | {settings.seed} |{rows}
 
-Each sample has `clean.npy` and `noisy.npy`, {form}, black 0, white 1, not
-clipped at black; and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels
+Each sample has `clean.npy` and `noisy.npy`, {_form(drawing)};
+and `json`: the picture and its SHA-256, `cfa`, `height` and `width` of the mosaic, the noise levels
 and the parameters that replay the pair. The pictures' licences apply to the pairs: name them here.
 """

@@ -18,14 +18,14 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import torch
 
 from rawaug.bayer import CFA
 from rawaug.commands import OPTIONS, pair_shards, value_of
 from rawaug.commands.pair_files import picture_tasks, replay
-from rawaug.commands.pair_maker import Format, Outcome, PairMaker, Settings, Task, require_same_settings
+from rawaug.commands.pair_maker import TARGETS, Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
 from rawaug.errors import escape
@@ -58,7 +58,8 @@ def run(
     Args:
         pictures: folder of sRGB pictures, or one picture.
         out: output folder.
-        format: 16-bit DNG, packed float32 NPZ, float32 TIFF, or tar shards for WebDataset and Hugging Face.
+        format: 16-bit DNG of RAW, float32 NPZ, TIFF (float32, sRGB 16 bits), 8-bit PNG of sRGB, or tar shards for
+            WebDataset and Hugging Face.
         per_image: pairs per picture.
         drawing: what is drawn.
         seed: random seed.
@@ -105,7 +106,7 @@ def synth(
     Args:
         source: the folder of sRGB pictures, or one picture.
         out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
-        format: dng, npz, tiff or webdataset.
+        format: dng, npz, tiff, png or webdataset; dng for target raw, png for srgb only.
         per_image: pairs per picture; may grow from run to run, but not in shards.
         isp: name of a shipped ISP, or an ISP's file.
         noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
@@ -116,8 +117,8 @@ def synth(
         max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
-        drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso`` and ``cfa``, as in
-            :class:`rawaug.plugin.sampling_config.SamplingConfig`.
+        drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso``, ``cfa``, ``target``, ``jpeg``, ``burst``,
+            ``motion`` and ``stops``, as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
 
     Raises:
         FileNotFoundError: if there is no such folder, picture or ISP.
@@ -164,9 +165,13 @@ def part_of(shard: str) -> tuple[int, int]:
 
 
 def _settings(format: Format, per_image: int, seed: int, **drawn: Any) -> Settings:
-    if format not in ("dng", "npz", "tiff", "webdataset") or per_image < 1:
-        wanted = "format must be dng, npz, tiff or webdataset and per_image at least 1"
+    if format not in get_args(Format) or per_image < 1:
+        wanted = f"format must be one of {', '.join(get_args(Format))} and per_image at least 1"
         raise ValueError(f"{wanted}, got {format} and {per_image}")
+    target = drawn.get("target") or "raw"
+    if target not in TARGETS.get(format, (target,)):
+        able = [name for name in get_args(Format) if target in TARGETS.get(name, (target,))]
+        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(able)}")
     isp = drawn["isp"]
     drawing = SamplingConfig(**drawn | {"isp": str(isp) if not Path(isp).suffix else str(Path(isp).resolve())})
     return Settings(format, drawing, sha256(find_weights(drawing.isp)), seed)

@@ -192,14 +192,17 @@ def _read_tiff(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
     return numbers, stated
 
 
-def write_tiff(file: Path, mosaic: Tensor, stated: Mapping[str, Any]) -> None:
-    """A mosaic ``(1, H, W)`` as float32, black 0, white 1."""
+def write_tiff(file: Path, image: Tensor, stated: Mapping[str, Any]) -> None:
+    """A mosaic ``(1, H, W)`` or colour ``(3, H, W)`` in its own type; float32 has black 0 and white 1."""
     with extra("raw"):
         import tifffile
 
     with replacing(file) as partial:
-        description = json.dumps(stated, sort_keys=True)
-        tifffile.imwrite(partial, mosaic[0].numpy(), photometric="minisblack", metadata=None, description=description)
+        kind: dict[str, Any] = {"description": json.dumps(stated, sort_keys=True), "metadata": None}
+        if len(image) == 3:
+            tifffile.imwrite(partial, image.permute(1, 2, 0).numpy(), photometric="rgb", **kind)
+        else:
+            tifffile.imwrite(partial, image[0].numpy(), photometric="minisblack", **kind)
 
 
 def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
@@ -207,6 +210,16 @@ def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
     if numbers.dtype != np.uint16:
         raise ValueError(f"{file}: has 8 bits; a mosaic needs a PNG of 16 bits")
     return numbers, {}
+
+
+def write_png(file: Path, srgb: Tensor) -> None:
+    """sRGB ``(3, H, W)`` in [0, 1], 8 bits."""
+    with extra("raw"):
+        from PIL import Image
+
+    pixels = (srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous()
+    with replacing(file) as partial:
+        Image.fromarray(pixels.numpy()).save(partial, "PNG")
 
 
 READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from rawaug.plugin.augment import RawAugment, Sampling
+from rawaug.plugin.targets import Target
 from rawaug.registry import Spec
 from rawaug.seeding import keyed_generator
 
@@ -20,7 +21,7 @@ def draw_key(seed: int, name: str, number: int) -> torch.Generator:
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Which cameras, lights, curves, exposures and noise are drawn; None draws from all of them.
+    """Which cameras, lights, curves, exposures and noise are drawn, and for which target; None draws from all of them.
 
     Args:
         isp: ISP file, or the name of a shipped ISP.
@@ -32,6 +33,11 @@ class SamplingConfig:
         iso: ISO of a measured camera's noise, instead of a draw from its measured range.
         sampling: how camera settings are drawn.
         cfa: pattern of the RAW: RGGB, BGGR, GRBG, GBRG, XTRANS, or QUAD-RGGB and the like; the ISP's by default.
+        target: raw (the default), rgb for clean linear camera RGB, or srgb for noisy and clean developed pictures.
+        jpeg: of srgb, lowest and highest JPEG quality of the noisy pictures; not compressed by default.
+        burst: number of noisy frames of each scene; a single one by default.
+        motion: of bursts, largest shift in pixels and rotation in degrees; 2 and 0.5 by default.
+        stops: of bursts, exposure of each frame in stops; all alike by default.
     """
 
     isp: str = "universal"
@@ -43,6 +49,11 @@ class SamplingConfig:
     iso: float | None = None
     sampling: Sampling = "convex"
     cfa: str | None = None
+    target: Target | None = None
+    jpeg: tuple[int, int] | None = None
+    burst: int | None = None
+    motion: tuple[float, float] | None = None
+    stops: tuple[float, ...] | None = None
 
     @property
     def noise_spec(self) -> Spec | Sequence[float]:
@@ -61,10 +72,13 @@ class SamplingConfig:
         given = {"light": self.light, "tone": self.tone, "exposure": exposure, "sampling": sampling}
         return {"noise": self.noise_spec, **{key: value for key, value in given.items() if value is not None}}
 
+    def form(self) -> dict[str, Any]:
+        """Target and burst, as :class:`rawaug.RawAugment` takes them."""
+        return self._given("target", "jpeg", "burst", "motion", "stops")
+
     def arguments(self) -> dict[str, Any]:
         """The arguments of :meth:`rawaug.RawAugment.from_pretrained` besides the ISP."""
-        made_for = {"camera": self.camera, "cfa": self.cfa}
-        return {**{key: value for key, value in made_for.items() if value is not None}, **self.draws()}
+        return {**self._given("camera", "cfa"), **self.draws(), **self.form()}
 
     def make(self) -> RawAugment:
         """The augmentation."""
@@ -72,5 +86,8 @@ class SamplingConfig:
 
     def stored(self) -> dict[str, Any]:
         """What was given, as JSON."""
-        given = {key: value for key, value in vars(self).items() if value is not None}
-        return given | {"noise": self.noise if isinstance(self.noise, str) else list(self.noise)}
+        given = self._given(*vars(self))
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
+
+    def _given(self, *names: str) -> dict[str, Any]:
+        return {name: value for name in names if (value := getattr(self, name)) is not None}

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import rawpy
 import tifffile
 import torch
 
@@ -16,7 +17,7 @@ from rawaug.cli import main
 from rawaug.commands.pair_files import camera_frames, replay
 from rawaug.commands.synth import synth
 from rawaug.files import replacing
-from rawaug.io import read_raw, write_picture
+from rawaug.io import read_picture, read_raw, write_picture
 from rawaug.noise import estimate_noise
 
 FIXED = (2e-3, 1e-4)
@@ -63,6 +64,49 @@ def test_every_format_replays_bit_for_bit(tmp_path: Path, pictures: Path, format
             assert torch.allclose(pack(frame.mosaic, frame.cfa), packed, atol=0.51 * step, rtol=0)
             levels = (pair.params.noise["shot_var"].item(), pair.params.noise["read_var"].item())
             assert frame.noise_profile == (levels if name == "noisy" else None)
+
+
+@pytest.mark.parametrize(
+    ("target", "format", "ends"),
+    [
+        ("raw", "dng", {"_clean.dng", "_noisy_0.dng", "_noisy_1.dng"}),
+        ("rgb", "tiff", {"_clean.tif", "_noisy_0.tif", "_noisy_1.tif"}),
+        ("srgb", "tiff", {"_clean.tif", "_noisy_0.tif", "_noisy_1.tif"}),
+        ("srgb", "png", {"_clean.png", "_noisy_0.png", "_noisy_1.png"}),
+        ("srgb", "npz", {".npz"}),
+    ],
+)
+def test_bursts_of_every_target_replay(
+    tmp_path: Path, pictures: Path, target: str, format: str, ends: set[str]
+) -> None:
+    picture, out = pictures / "sub" / "b.png", tmp_path / "out"
+    drawn: dict[str, Any] = {"target": target, "burst": 2, "motion": (1.0, 0.1), "workers": 0, "noise": FIXED}
+    if target == "srgb":
+        drawn["jpeg"] = (50, 90)
+    synth(picture, out, format=format, **drawn)  # type: ignore[arg-type]
+    pair = replay(out / "b_0.safetensors")
+    assert {file.name for file in out.iterdir()} == {f"b_0{end}" for end in ends} | {"b_0.safetensors", "synth.json"}
+    noisy = {k: pair.noisy[k] for k in (0, 1)}
+    if format == "npz":
+        with np.load(out / "b_0.npz") as file:
+            assert np.array_equal(file["noisy"], pair.noisy.numpy()) and file["clean"].shape == (3, 96, 64)
+    elif format == "png":
+        for end, expected in (("clean", pair.clean), ("noisy_1", noisy[1])):
+            read = read_picture(out / f"b_0_{end}.png") / 255.0
+            torch.testing.assert_close(read, expected, atol=0.51 / 255, rtol=0)
+    elif format == "dng":
+        frame = read_raw(out / "b_0_noisy_1.dng")
+        step = 1 / (frame.white - frame.black[0])
+        torch.testing.assert_close(pack(frame.mosaic, frame.cfa), noisy[1], atol=0.51 * step, rtol=0)
+        with rawpy.imread(str(out / "b_0_noisy_0.dng")) as raw:
+            assert raw.postprocess(use_camera_wb=True).shape == (96, 64, 3)
+    else:
+        clean = torch.from_numpy(tifffile.imread(out / "b_0_clean.tif").astype(np.float32)).permute(2, 0, 1)
+        scale = 65535 if target == "srgb" else 1
+        torch.testing.assert_close(clean / scale, pair.clean, atol=0.51 / 65535, rtol=0)
+    assert synth(picture, out, format=format, **drawn).made == 0  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"synth\.json: made with motion \[1.0, 0.1\], not None"):
+        synth(picture, out, format=format, **drawn | {"motion": None})  # type: ignore[arg-type]
 
 
 def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -> None:
@@ -141,7 +185,8 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
     augment = RawAugment(isp, noise=(0.0, 0.0))
     srgb = torch.full((3, 64, 96), 0.5)
     pair = augment.apply(srgb, augment.sample(srgb, torch.Generator().manual_seed(0)))
-    clean, _, stops = camera_frames(pair, augment)
+    frames, stops = camera_frames(pair, augment)
+    clean = frames["_clean"]
     flat = pack(clean.mosaic * clean.shading_gains, clean.cfa)
     assert clean.mosaic.std() / clean.mosaic.mean() > 0.05
     assert (flat.std((1, 2)) / flat.mean((1, 2))).max() < 1e-3
@@ -156,6 +201,9 @@ def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
         synth(pictures, pictures / "out", workers=0)
     with pytest.raises(ValueError, match="'bogus' is unknown"):
         synth(pictures, tmp_path / "out", noise="bogus", workers=0)
+    for format, target in (("dng", "srgb"), ("dng", "rgb"), ("png", "raw")):
+        with pytest.raises(ValueError, match=f"format {format} cannot hold target '{target}'; use .*npz, tiff"):
+            synth(pictures, tmp_path / "out", format=format, target=target, workers=0)  # type: ignore[arg-type]
     synth(pictures, tmp_path / "out", workers=0)
     with pytest.raises(ValueError, match=r"synth\.json: made with seed 0, not 1; choose another folder"):
         synth(pictures, tmp_path / "out", seed=1, workers=0)
