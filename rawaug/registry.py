@@ -243,6 +243,8 @@ FILTERS = Registry("classical filter", "rawaug.filters", "denoisers")
 """Subclasses of :class:`denoisers.classical.Classical`."""
 NOISE = Registry("noise", "rawaug.noise", "rawaug.noise")
 """Subclasses of :class:`rawaug.noise.NoiseModel`; presets and cameras have names in :mod:`rawaug.noise.cameras`."""
+SRGB_NOISE = Registry("noise on sRGB", "rawaug.srgb_noise", "rawaug.training")
+"""Models of :class:`rawaug.training.srgb_noise.SrgbNoise`."""
 DATASETS = Registry("kind of data", "rawaug.datasets", "rawaug.data")
 """``reader(path, split) -> Sequence[Pair]``; what ``kind:path`` opens as pairs."""
 PICTURES = Registry("kind of pictures", "rawaug.pictures", "rawaug.data")

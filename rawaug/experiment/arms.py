@@ -17,10 +17,11 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS
+from rawaug.registry import ESTIMATORS, SRGB_NOISE
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
+from rawaug.training.srgb_noise import NoisyPictures
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
 from rawaug.training.validation import Watched, watched
 
@@ -62,12 +63,15 @@ def training_stream(
 ) -> TrainingStream:
     """The training samples of one arm."""
     crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
+    real: Source | None = None
+    made: Source | None = None
+    if arm.srgb_noise is not None:
+        made = NoisyPictures(pictures, SRGB_NOISE.make(arm.srgb_noise), crop, arm.zoom)
+        return TrainingStream(None, made, recipe.train.batch, 1.0, seed)
     augment: RawAugment | None = None
     if arm.augmented:
         draws: dict[str, Any] = {"exposure": arm.exposure, "target": recipe.target, "jpeg": arm.jpeg}
         augment = RawAugment(isp, noise, arm.sampling, arm.strength, **draws)
-    real: Source | None = None
-    made: Source | None = None
     if isinstance(estimator, SelfSupervised):
         if frames and arm.augmented < 1.0:
             real = NoisyCrops(frames, estimator, crop, isp.cfa)

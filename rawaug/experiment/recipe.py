@@ -14,7 +14,7 @@ from rawaug.files import yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.targets import Target, Targets
-from rawaug.registry import ESTIMATORS, EXPERIMENTS, name_and_settings, nearest, require_between
+from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, name_and_settings, nearest, require_between
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
 SHORT_CROP = 256
@@ -106,6 +106,8 @@ class ArmConfig:
         strength: of ``perturb``.
         exposure: lowest and highest exposure of the RAW in stops; null for the ISP's own.
         jpeg: of sRGB targets: lowest and highest quality of the JPEG that noisy pictures go through; null for none.
+        srgb_noise: of sRGB targets: noise drawn on the pictures themselves, in place of the camera's: Gaussian, BSRGAN,
+            or {name, settings}, see :mod:`rawaug.training.srgb_noise`.
         estimator: training target, a name or {name, settings}: supervised uses clean frames; noisier, noise2noise, r2r
             and neighbor2neighbor use noisy frames only, see :mod:`rawaug.training.estimators`.
         search: a setting of the estimator to choose on validation, such as ``{gamma: [2, 8, 16]}``: an arm is trained
@@ -123,6 +125,7 @@ class ArmConfig:
     strength: float = 0.1
     exposure: tuple[float, float] | None = None
     jpeg: tuple[int, int] | None = None
+    srgb_noise: str | dict[str, Any] | None = None
     estimator: str | dict[str, Any] = "supervised"
     search: dict[str, list[float]] | None = None
     candidate_of: str | None = None
@@ -234,6 +237,10 @@ class Recipe:
         for label, arm in self.arms.items():
             try:
                 Targets(self.target, None, arm.jpeg, "RGGB")
+                if arm.srgb_noise is not None:
+                    SRGB_NOISE.make(arm.srgb_noise)
+                    if self.target != "srgb":
+                        raise ValueError(f"srgb_noise is for target 'srgb', not {self.target!r}; omit it")
             except ValueError as error:
                 raise ValueError(f"arms.{label}: {error}") from None
 
