@@ -18,7 +18,7 @@ from rawaug.training.estimators import Supervised
 FOLDER = Path(__file__).parents[1] / "recipes"
 FILES = {file.relative_to(FOLDER).with_suffix("").as_posix(): file for file in sorted(FOLDER.rglob("*.yaml"))}
 ALL = {name: kind_of(read_recipe(file)) for name, file in FILES.items()}
-NAMES = [name for name, kind in ALL.items() if kind == "training"]
+NAMES = [name for name, kind in ALL.items() if kind in ("training", "srgb")]
 """The recipes that train denoisers."""
 
 
@@ -46,6 +46,7 @@ def test_the_recipes_are_all_there() -> None:
         "fivek/reconstruction": "reconstruction",
         "rgb2raw": "reconstruction",
         "sidd/reconstruction": "reconstruction",
+        "srgb": "srgb",
     }
 
 

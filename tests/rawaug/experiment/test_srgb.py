@@ -1,0 +1,120 @@
+"""Denoisers of developed pictures: LibRaw develops what they are tested on, alike for every method."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.cli import main
+from rawaug.data import demo_pairs
+from rawaug.data.pairs import Pair
+from rawaug.experiment.recipe import ArmConfig, DataConfig, DenoiserConfig
+from rawaug.experiment.srgb import Shot, SrgbRecipe, best_filter, developed, filtered, key_of, raw_way, scored, shots_of
+from rawaug.metrics import psnr
+
+LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
+SMALL = [
+    "--data.pictures", "tiny:", "--data.validation", "tiny:validation", "--data.test", "tiny:test", "--device", "cpu",
+    "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--untouched", "[]", "--train.precision", "32-true",
+    "--denoiser.settings", '{"width": 4, "scales": 2, "channels": 3, "variance_map": false}', "--steps", "2",
+    "--train.crop", "32", "--train.batch", "4", "--train.validate-every", "1",
+]  # fmt: skip
+"""The recipe in seconds."""
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    return [pair.middle(96) for pair in demo_pairs("test", count=2)]
+
+
+@pytest.fixture(scope="module")
+def shots(pairs: list[Pair]) -> dict[tuple[float, float], list[Shot]]:
+    return shots_of(pairs, LEVELS, "test")
+
+
+def test_libraw_develops_grey_to_grey_by_its_own_curve(pairs: list[Pair]) -> None:
+    pair, light = pairs[0], 0.2
+    mosaic = torch.empty_like(pair.raw)
+    for (i, j), gain in zip(pair.cfa.sites, [pair.white_balance[c] for c in (0, 1, 1, 2)], strict=True):
+        mosaic[:, i::2, j::2] = light / gain
+    srgb = developed(mosaic, pair)[0, :, 8:-8, 8:-8]
+    expected = 1.099 * light**0.45 - 0.099  # BT.709
+    torch.testing.assert_close(srgb, torch.full_like(srgb, expected), rtol=0.0, atol=2 / 255)
+    assert not developed(mosaic - 0.5, pair).any(), "below black is black"
+
+
+def test_noise_is_that_of_the_level_the_same_for_all(shots: dict[tuple[float, float], list[Shot]]) -> None:
+    weak, strong = (found[0] for found in shots.values())
+    assert psnr(weak.noisy, weak.clean) > 55 and torch.equal(weak.clean, strong.clean)
+    noise = strong.raw.noisy - strong.raw.clean
+    told = strong.raw.variance.mean().item()
+    assert noise[strong.raw.clean < 0.9].var().item() == pytest.approx(told, rel=0.05)
+    again = shots_of([strong.pair], LEVELS[1:], "again")[LEVELS[1]][0]
+    assert torch.equal(again.noisy, strong.noisy)
+
+
+def test_a_raw_denoiser_is_developed_after(shots: dict[tuple[float, float], list[Shot]]) -> None:
+    class Perfect(torch.nn.Module):
+        def __init__(self, shift: float) -> None:
+            super().__init__()
+            self.shift = torch.nn.Parameter(torch.tensor(shift))
+
+        def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+            return noisy + self.shift
+
+    shot = shots[LEVELS[1]][0]
+    same = raw_way(Perfect(0.0), CFA.RGGB)(shot)  # type: ignore[arg-type]
+    assert torch.equal(same, shot.noisy)
+    assert raw_way(Perfect(0.1), CFA.RGGB)(shot).mean() > shot.noisy.mean() + 0.02  # type: ignore[arg-type]
+
+
+def test_the_filter_is_as_strong_as_the_noise_of_its_shots(shots: dict[tuple[float, float], list[Shot]]) -> None:
+    weak, strong = shots.values()
+    spec = "NonLocalMeans"
+    chosen = scored(best_filter(spec, strong), {LEVELS[1]: strong}, "chosen")[key_of(LEVELS[1])]
+    for deviation in (0.01, 0.16):
+        assert scored(filtered(spec, deviation), {LEVELS[1]: strong}, "")[key_of(LEVELS[1])]["psnr"] < chosen["psnr"]
+    gentle = best_filter(spec, weak)
+    assert torch.equal(gentle(weak[0]), filtered(spec, 0.01)(weak[0]))
+
+
+@pytest.mark.usefixtures("tiny")
+def test_the_recipe_scores_every_arm_and_method_at_every_level(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--dry-run"]) == 0
+    assert not list(tmp_path.iterdir())
+    assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
+    results = json.loads((tmp_path / "srgb" / "results.json").read_text())
+    assert set(results["results"]) == {"gaussian", "bsrgan", "camera"}
+    assert set(results["others"]) == {"noisy", "NonLocalMeans"}
+    for runs in (*results["results"].values(), [results["others"]["noisy"]] * 2):
+        assert len(runs) == 2
+        for run in runs:
+            weak, strong = run.values()
+            assert 10 < strong["psnr"] < weak["psnr"] < 50 and 0 < strong["ssim"] < weak["ssim"] <= 1
+    noisy, filtered_too = (results["others"][name]["0.008, 0.0001"]["psnr"] for name in ("noisy", "NonLocalMeans"))
+    assert filtered_too > noisy + 1
+    said = capsys.readouterr().out
+    assert "0.002, 1e-05" in said and (tmp_path / "srgb" / "picture.png").is_file()
+    assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
+    assert capsys.readouterr().out.count("already trained") == 6
+
+
+def test_what_has_no_meaning_is_refused() -> None:
+    data, arms = DataConfig(pairs=None), {"camera": ArmConfig(1.0)}
+    network = DenoiserConfig(settings={"channels": 3, "variance_map": False})
+    for given, said in (
+        ({"levels": []}, "at least one level"),
+        ({"denoiser": DenoiserConfig()}, "channels: 3, variance_map: false"),
+        ({"classical": ["BM3D"]}, "BM3D is for RAW"),
+        ({"data": DataConfig(pairs=None, validation=None)}, r"data\.validation"),
+        ({"arms": {"a": ArmConfig(1.0, srgb_noise="Gausian")}}, "Gaussian"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            SrgbRecipe(**{"data": data, "camera": "universal", "denoiser": network, "arms": arms, **given})  # type: ignore[arg-type]

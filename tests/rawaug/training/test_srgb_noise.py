@@ -1,0 +1,105 @@
+"""Noise drawn on sRGB has the variance, the colours and the compression that its parameters say, and replays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug.registry import SRGB_NOISE
+from rawaug.training import srgb_noise
+from rawaug.training.srgb_noise import BsrganNoise, NoisyPictures, SrgbNoise, WhiteNoise
+
+GREY = torch.full((6, 3, 128, 128), 0.5)
+
+
+def noise_of(model: SrgbNoise, clean: Tensor = GREY, **given: Any) -> Tensor:
+    """What a model adds, with parameters replaced by those given."""
+    params = model.sample(len(clean), torch.Generator().manual_seed(0))
+    return model.apply(clean, params | {k: torch.as_tensor(v) for k, v in given.items()}) - clean
+
+
+def bsrgan(**given: Any) -> Tensor:
+    """Noise of :class:`BsrganNoise` without normals or photons, if none are given."""
+    return noise_of(BsrganNoise(), **{"photons": [0.0] * 6, "mixing": torch.zeros(6, 3, 3)} | given)
+
+
+@pytest.fixture
+def uncompressed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No JPEG, which halves the resolution of colour noise."""
+    monkeypatch.setattr(srgb_noise, "through_jpeg", lambda srgb, quality: srgb)
+
+
+def test_white_noise_has_the_drawn_deviation_between_its_limits() -> None:
+    model = WhiteNoise((10.0, 40.0))
+    sigma = model.sample(2000, torch.Generator().manual_seed(1))["sigma"] * 255
+    assert 10.0 <= sigma.min() < 10.5 and 39.5 < sigma.max() <= 40.0
+    assert sigma.mean().item() == pytest.approx(25.0, abs=0.6)
+    drawn = model.sample(6, torch.Generator().manual_seed(0))["sigma"]
+    noise = noise_of(model)
+    torch.testing.assert_close(noise.std((1, 2, 3)), drawn, rtol=0.02, atol=0.0)
+    neighbours = (noise[..., 1:] * noise[..., :-1]).mean((1, 2, 3)) / drawn.square()
+    assert neighbours.abs().max() < 0.02, "white"
+    assert not noise_of(WhiteNoise((0.0, 0.0))).any()
+
+
+@pytest.mark.usefixtures("uncompressed")
+def test_gaussian_noise_is_mixed_as_its_matrix_says() -> None:
+    mixing = 0.04 * torch.tensor([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
+    grey = bsrgan(mixing=mixing.expand(6, 3, 3))
+    assert grey.std(1).max() < 1e-6 and grey.mean(1).std().item() == pytest.approx(0.04, rel=0.03)
+    drawn = BsrganNoise().sample(3000, torch.Generator().manual_seed(2))["mixing"]
+    covariance = drawn @ drawn.mT
+    same = (drawn[:, 0] == drawn[:, 1]).all(-1)
+    independent = (covariance - torch.diag_embed(covariance.diagonal(dim1=1, dim2=2))).abs().amax((1, 2)) == 0
+    assert same.float().mean().item() == pytest.approx(0.4, abs=0.03)
+    assert independent.float().mean().item() == pytest.approx(0.4, abs=0.03)
+    assert covariance.diagonal(dim1=1, dim2=2).max().sqrt() <= 25 / 255 + 1e-6
+    found = bsrgan(mixing=drawn[~same & ~independent][:6])[0]
+    torch.testing.assert_close(torch.cov(found.flatten(1)), covariance[~same & ~independent][0], rtol=0.1, atol=3e-5)
+
+
+@pytest.mark.usefixtures("uncompressed")
+@pytest.mark.parametrize("grey", [False, True])
+def test_photons_have_the_variance_of_their_light(grey: bool) -> None:
+    noise = bsrgan(photons=[400.0] * 6, grey=[grey] * 6)
+    assert noise.var().item() == pytest.approx(0.5 / 400, rel=0.06)
+    assert abs(noise.mean().item()) < 1e-3
+    assert (noise.std(1).max().item() < 1e-6) == grey
+    photons = BsrganNoise(poisson=0.3).sample(3000, torch.Generator().manual_seed(3))["photons"]
+    assert (photons > 0).float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert 100.0 <= photons[photons > 0].min() < 110.0 and 9000.0 < photons.max() <= 10000.0
+
+
+def test_jpeg_of_lower_quality_is_further_away() -> None:
+    picture = torch.rand(6, 1, 64, 64, generator=torch.Generator().manual_seed(0)).expand(6, 3, 64, 64)
+    still = {"photons": torch.zeros(6), "mixing": torch.zeros(6, 3, 3)}
+    near, far = (noise_of(BsrganNoise(jpeg=(q, q)), picture, **still).square().mean() for q in (95, 30))
+    assert 0 < near < far / 2
+
+
+@pytest.mark.parametrize("name", list(SRGB_NOISE))
+def test_a_sample_replays_and_keeps_the_picture(name: str) -> None:
+    model = SRGB_NOISE.make(name)
+    params = model.sample(6, torch.Generator().manual_seed(4))
+    noisy = model.apply(GREY, params)
+    assert torch.equal(noisy, model.apply(GREY, params)) and 0 <= noisy.min() < noisy.max() <= 1
+    alone = model.apply(GREY[2:3], {key: value[2:3] for key, value in params.items()})
+    torch.testing.assert_close(alone, noisy[2:3], rtol=0, atol=1e-6)
+    pictures = [torch.full((3, 50, 61), 99, dtype=torch.uint8)]
+    first, again = (NoisyPictures(pictures, model, 32).draw(torch.Generator().manual_seed(5)) for _ in range(2))
+    assert torch.equal(first.noisy, again.noisy) and first.noisy.shape == (3, 32, 32)
+    assert (first.clean == 99 / 255).all() and not first.variance.any()
+
+
+def test_limits_that_nobody_means_are_refused() -> None:
+    wrong: list[tuple[type, dict[str, Any], str]] = [
+        (WhiteNoise, {"sigma": (20.0, 10.0)}, r"sigma must be \(lowest, highest\) within 0 to 255"),
+        (BsrganNoise, {"jpeg": (0, 95)}, "jpeg must be"),
+        (BsrganNoise, {"poisson": 1.5}, "poisson must be"),
+    ]
+    for model, settings, said in wrong:
+        with pytest.raises(ValueError, match=said):
+            model(**settings)
