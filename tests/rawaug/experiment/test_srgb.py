@@ -13,9 +13,10 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
-from rawaug.experiment.recipe import ArmConfig, DataConfig, DenoiserConfig
+from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.experiment.srgb import Shot, SrgbRecipe, best_filter, developed, filtered, key_of, raw_way, scored, shots_of
 from rawaug.metrics import psnr
+from rawaug.training.config import DenoiserConfig
 
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [

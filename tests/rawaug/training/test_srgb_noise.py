@@ -23,7 +23,8 @@ def noise_of(model: SrgbNoise, clean: Tensor = GREY, **given: Any) -> Tensor:
 
 def bsrgan(**given: Any) -> Tensor:
     """Noise of :class:`BsrganNoise` without normals or photons, if none are given."""
-    return noise_of(BsrganNoise(), **{"photons": [0.0] * 6, "mixing": torch.zeros(6, 3, 3)} | given)
+    plain: dict[str, Any] = {"photons": [0.0] * 6, "mixing": torch.zeros(6, 3, 3)}
+    return noise_of(BsrganNoise(), **plain | given)
 
 
 @pytest.fixture
