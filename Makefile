@@ -15,8 +15,9 @@ BENCHMARKS := augment denoise explore faults folder fuzz loader networks noise s
 
 .PHONY: demo test lint docs bench dist lock resolve clean
 
-demo: $(VENV)/.demo  ## train a RAW denoiser on built-in data, with and without augmentation
+demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and without augmentation, and test it on real frames
 	$(BIN)/rawaug run recipes/fewshot.yaml
+	$(BIN)/rawaug benchmark runs/fewshot/seed0/*/denoiser.safetensors --noise cycleisp_sidd  # on real frames
 
 test: lint  ## style, types and all tests
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses 2 --dist worksteal  # processes share bytecode

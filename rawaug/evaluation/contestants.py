@@ -111,7 +111,8 @@ def _of_weights(path: Path, device: torch.device) -> Contestant:
     """Of rawaug, PMRID's authors or BF-DnCNN: the tensors say which."""
     metadata, tensors = read_tensors(path, _AGAIN)
     if metadata.get("format") == "rawaug":
-        return _of_network(path.stem, *_loaded(path), device)
+        arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors
+        return _of_network(arm if path.stem == "denoiser" else path.stem, *_loaded(path), device)
     if "conv00" in tensors:
         run = bf_dncnn({name: tensor.to(device) for name, tensor in tensors.items()})
         return Contestant("BF-DnCNN", lambda noisy, variance, _: run(noisy.to(device), variance.to(device)).cpu())
