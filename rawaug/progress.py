@@ -9,15 +9,17 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TextIO
+from functools import wraps
+from typing import Any, TextIO, TypeVar
 from weakref import WeakKeyDictionary
 
 from tqdm.asyncio import tqdm as terminal_tqdm
 from tqdm.auto import tqdm
 
+T = TypeVar("T")
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
 
 
@@ -126,3 +128,20 @@ class _Logged:
         remaining = "?" if left is None else tqdm.format_interval(left)
         interval = tqdm.format_interval(elapsed)
         return f"{self.label}: {count} {self.unit}s, {interval} elapsed, {remaining} left{self.postfix}"
+
+
+def timed(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Adds the seconds of a method to ``self.seconds[stage]``."""
+
+    def decorated(method: Callable[..., T]) -> Callable[..., T]:
+        @wraps(method)
+        def run(self: Any, *arguments: Any) -> T:
+            start = time.perf_counter()
+            try:
+                return method(self, *arguments)
+            finally:
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+        return run
+
+    return decorated

@@ -152,7 +152,9 @@ def evaluate(
             result["classical"] = {name: with_own_noise(scores, own) for name, scores in found.items()}
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
-            page = Page.of_scores(f"{weights.stem} on {data}", {weights.stem: [runs]}, result.get("classical", {}))
+            facts = {"Noise": f"{scoring.named}, seed {seed}"}
+            results = {weights.stem: [runs]}
+            page = Page.of_scores(f"{weights.stem} on {data}", results, result.get("classical", {}), facts)
             scoring.add_frames(page, classical)
             page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
     if pairs.broken:
@@ -169,7 +171,8 @@ class _Scoring:
         model, info = denoisers.load(weights)
         self.name = weights.stem
         self.model, self.pairs, self.seed = model.to(device), pairs, seed
-        self.levels = noise_model(noise or info.get("noise", "cycleisp_sidd"))
+        self.named = noise or info.get("noise", "cycleisp_sidd")
+        self.levels = noise_model(self.named)
         self.cfa = CFA(info.get("cfa", "RGGB"))
         self.at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
 

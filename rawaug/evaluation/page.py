@@ -10,7 +10,9 @@ import base64
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import shlex
+import sys
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -24,7 +26,8 @@ from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
-from rawaug.evaluation.tables import COLUMNS, QUARTERS, Row, Runs, levels_note, table_rows
+from rawaug.evaluation.own_noise import own_noise_note
+from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, figures_of, levels_note, verdict
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -51,32 +54,52 @@ class Figure(NamedTuple):
 
 @dataclass
 class Part:
-    """What stands under a heading: texts, a table, figures; what is empty is left out."""
+    """What stands under a heading: texts, explained terms, a table, figures; what is empty is left out."""
 
     heading: str = ""
     name: str = ""
     texts: Sequence[str] = ()
+    terms: Mapping[str, str] = field(default_factory=dict)
     head: Sequence[str] = ()
     rows: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    best: Collection[tuple[str, int]] = ()
     figures: Sequence[Figure] = ()
 
 
 class Page:
     """Collects the parts of the page; frames are encoded as they come and not kept."""
 
-    def __init__(self, title: str, parts: Sequence[Part] = ()) -> None:
-        self.title, self.parts = title, list(parts)
+    def __init__(self, title: str, parts: Sequence[Part] = (), lead: str = "") -> None:
+        self.title, self.parts, self.lead = title, list(parts), lead
 
     @classmethod
-    def of_scores(cls, title: str, results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> Page:
-        """A page with the scores of ``results``, by arm with one entry a seed, and of classical denoisers, by name."""
-        note = levels_note(next(iter(results.values()))[0]["plain"])
-        page = cls(title, [Part("Scores", texts=[note] if note else [])])
-        for columns in (COLUMNS, QUARTERS):
-            rows = table_rows(results, classical, columns)
-            filled = [k for k in range(len(columns)) if any(cells[k] for cells in rows.values())]
-            kept = {name: [cells[k] for k in filled] for name, cells in rows.items()}
-            page.parts.append(Part(head=["", *(list(columns)[k] for k in filled)], rows=kept))
+    def of_scores(
+        cls,
+        title: str,
+        results: Runs,
+        classical: Mapping[str, Mapping[str, Any]],
+        facts: Mapping[str, str] | None = None,
+        arms: Mapping[str, str] | None = None,
+    ) -> Page:
+        """A page with the scores of ``results``, by arm with one entry a seed, and of classical denoisers, by name.
+
+        It opens with the verdict and the ``facts``; ``arms`` explains the methods.
+        """
+        plain = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+        first = next(iter(results.values()))[0]["plain"]
+        about = {"Command": command_line(), **(facts or {}), "Own noise": own_noise_note(plain)}
+        about["Noise"] = ", ".join(filter(None, [about.get("Noise"), levels_range(first)]))
+        about = {name: text for name, text in about.items() if text}
+        page = cls(title, [Part(terms=about), Part("Methods", terms=arms or {})][: 2 if arms else 1])
+        page.lead = verdict(results, classical)
+        note = levels_note(first)
+        for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
+            table = figures_of(results, classical, columns)
+            texts = [note] if note and columns is PLAIN else []
+            if table.rows:
+                page.parts.append(
+                    Part(heading, texts=texts, head=["", *table.columns], rows=table.rows, best=table.best)
+                )
         page.parts.append(_every_image(results, classical))
         return page
 
@@ -105,15 +128,31 @@ class Page:
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         """The file, with ``settings`` at its end."""
+        import yaml
         from jinja2 import Environment, PackageLoader
 
         templates = Environment(loader=PackageLoader(__package__, ""), autoescape=True, trim_blocks=True)
         templates.filters["b64"] = lambda png: base64.b64encode(png).decode()
         template = templates.get_template("page.html")
-        text = template.render(title=self.title, parts=self.parts, settings=json.dumps(settings, indent=1))
+        shown = yaml.safe_dump(json.loads(json.dumps(settings)), sort_keys=False, allow_unicode=True)
+        text = template.render(title=self.title, lead=self.lead, parts=self.parts, settings=shown)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8", errors="backslashreplace")
         return path
+
+
+def command_line() -> str:
+    """The command that runs, as it was typed; empty in another program."""
+    return shlex.join(["rawaug", *sys.argv[1:]]) if Path(sys.argv[0]).stem in ("rawaug", "__main__") else ""
+
+
+def levels_range(summary: Mapping[str, Any]) -> str:
+    """Lowest and highest noise levels of the frames; empty where they are not known."""
+    said = []
+    for key in ("shot_var", "read_var"):
+        values = [image[key] for image in summary["images"] if key in image]
+        said += [f"{key} {min(values):.2g} to {max(values):.2g}"] if values else []
+    return ", ".join(said)
 
 
 def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:

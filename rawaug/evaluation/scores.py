@@ -43,8 +43,8 @@ Method = Callable[[Pair, Sample], Tensor]
 class Score:
     """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input.
 
-    ``levels_from_clean`` is True where the noise levels that the denoiser was given had been measured against the clean
-    frame, else None.
+    ``shot_var`` and ``read_var`` are the noise levels that the denoiser was given, if it was given any;
+    ``levels_from_clean`` is True where they had been measured against the clean frame, else None.
     """
 
     name: str
@@ -56,6 +56,8 @@ class Score:
     ssim_noisy: float | None = None
     psnr_srgb_noisy: float | None = None
     ssim_srgb_noisy: float | None = None
+    shot_var: float | None = None
+    read_var: float | None = None
     levels_from_clean: bool | None = None
 
 
@@ -118,12 +120,13 @@ def score_method(
     method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
 ) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
     """Scores of every frame, with what was compared; one frame in memory at a time."""
-    for pair in progress(pairs, label=label, unit="image"):
+    for read in progress(pairs, label=label, unit="image"):
+        pair = read.with_levels()
         sample = frozen_sample(pair, noise, cfa, seed)
         denoised = method(pair, sample)
         values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-        flag = pair.with_levels().levels_from_clean or None
-        yield Score(pair.name, *values, levels_from_clean=flag), pair, sample, denoised
+        levels = frozen_levels(pair, noise, seed) or (None, None)
+        yield Score(pair.name, *values, *levels, pair.levels_from_clean or None), pair, sample, denoised
 
 
 def network_method(
@@ -230,7 +233,8 @@ def summary(scores: Sequence[Score]) -> dict[str, Any]:
     images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
     result: dict[str, Any] = {"images": images}
     for image, score in zip(images, scores, strict=True):
-        image |= {"levels_from_clean": True} if score.levels_from_clean else {}
+        stated = {key: getattr(score, key) for key in ("shot_var", "read_var", "levels_from_clean")}
+        image |= {key: value for key, value in stated.items() if value is not None}
     if flagged := sum(bool(score.levels_from_clean) for score in scores):
         result["levels_from_clean"] = flagged
     wrong: list[str] = []

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -79,16 +79,24 @@ def mean_and_spread(values: Sequence[float], digits: int) -> str:
     return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
 
-COLUMNS = {
+PLAIN = {
     "PSNR (dB)": ("plain", "psnr"),
     "SSIM": ("plain", "ssim"),
-    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
-    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
     "PSNR, sRGB": ("plain", "psnr_srgb"),
     "SSIM, sRGB": ("plain", "ssim_srgb"),
     "own noise": ("plain", "own_noise"),
 }
-"""Columns of the table: which summary and which figure; the last one is the references' share of the squared error."""
+"""Columns of a table: which summary and which figure; the last one is the references' share of the squared error."""
+
+ENSEMBLE = {name: ("self_ensemble", key) for name, (_, key) in PLAIN.items()}
+
+COLUMNS = {
+    **dict(list(PLAIN.items())[:2]),
+    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
+    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
+    **dict(list(PLAIN.items())[2:]),
+}
+"""Those of the printed table."""
 
 QUARTERS = {
     f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")
@@ -100,31 +108,80 @@ QUARTERS = {
     )
     for part in ("worst 25%", "best 25%")
 }
-"""Of the second table of the page."""
+"""Of a table of the page."""
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
-def table_rows(
+class Figures(NamedTuple):
+    """A table: its columns, cells by method, empty where a figure does not apply, and the best cells of columns."""
+
+    columns: list[str]
+    rows: dict[str, list[str]]
+    best: set[tuple[str, int]]
+
+
+def figures_of(
     results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Mapping[str, tuple[str, str]]
-) -> dict[str, list[str]]:
-    """Cells by method: the noisy input, classical denoisers, the arms; empty where a figure does not apply."""
+) -> Figures:
+    """The noisy input, classical denoisers and the arms, without columns and methods that have no figure."""
     plain = next(iter(results.values()))[0]["plain"]
     noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
     methods: dict[str, Sequence[Mapping[str, Any]]] = {"noisy input": [{"plain": noisy}]}
     methods |= {name: [{"plain": scores}] for name, scores in (classical or {}).items()}
     methods |= results
-    rows = {}
-    for method, runs in methods.items():
-        cells = []
-        for kind, key in columns.values():
-            values = [run[kind][key] for run in runs if key in run.get(kind, {})]
-            if key == "own_noise":
-                cells.append(f"{statistics.fmean(values):.0%}" if values else "")
-            else:
-                cells.append(mean_and_spread(values, 2 if "psnr" in key else 4) if values else "")
-        rows[method] = cells
-    return rows
+    values = {name: [_values(runs, *column) for column in columns.values()] for name, runs in methods.items()}
+    kept = [k for k in range(len(columns)) if any(row[k] for row in values.values())]
+    values = {name: [row[k] for k in kept] for name, row in values.items() if any(row)}
+    keys = [list(columns.values())[k][1] for k in kept]
+    best: set[tuple[str, int]] = set()
+    for k, key in enumerate(keys):
+        means = {name: statistics.fmean(row[k]) for name, row in values.items() if row[k] and key != "own_noise"}
+        best |= {(name, k) for name, mean in means.items() if len(means) > 1 and mean == max(means.values())}
+    rows = {name: [_cell(key, found) for key, found in zip(keys, row, strict=True)] for name, row in values.items()}
+    return Figures([list(columns)[k] for k in kept], rows, best)
+
+
+def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[float]:
+    return [run[kind][key] for run in runs if key in run.get(kind, {})]
+
+
+def _cell(key: str, values: Sequence[float]) -> str:
+    if not values:
+        return ""
+    return (
+        f"{statistics.fmean(values):.0%}" if key == "own_noise" else mean_and_spread(values, 2 if "psnr" in key else 4)
+    )
+
+
+def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which method to use: the arm of the highest mean PSNR against the best of the others, or of the noisy input.
+
+    Several seeds give the noise of the difference; of one the frames on which it is above 0 are counted.
+    """
+    means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
+    if not means:
+        return ""
+    arm = max(means, key=means.__getitem__)
+    runs = [run["plain"] for run in results[arm]]
+    noisy = {**runs[0], "images": [{**image, "psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]}
+    noisy |= {key: runs[0][f"{key}_noisy"] for key in ("psnr", "psnr_srgb") if f"{key}_noisy" in runs[0]}
+    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {"the noisy input": noisy}
+    other = max(scored, key=lambda name: scored[name]["psnr"])
+    gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
+    gain = statistics.fmean(gains)
+    said = [f"{gain:+.2f} dB over {other}" if gain >= 0 else f"{arm}, the best arm, is {-gain:.2f} dB below it"]
+    if len(gains) > 1:
+        spread = statistics.stdev(gains)
+        said += [f"{'within' if abs(gain) <= spread else 'more than'} the noise of the seeds (± {spread:.2f} dB)"]
+    else:
+        pairs = list(zip(runs[0]["images"], scored[other]["images"], strict=False))
+        better = sum((one.get("psnr") or 0.0) > (two.get("psnr") or 0.0) for one, two in pairs)
+        said += [f"higher on {better} of {len(pairs)} frames, one seed"]
+    if "psnr_srgb" in scored[other] and all("psnr_srgb" in run for run in runs):
+        developed = statistics.fmean(run["psnr_srgb"] for run in runs) - scored[other]["psnr_srgb"]
+        said += [f"{developed:+.2f} dB after development"]
+    return f"Use {arm if gain >= 0 else other}: {', '.join(said)}."
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
@@ -155,11 +212,8 @@ def levels_note(summary: Mapping[str, Any]) -> str:
 
 def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
-    rows = [[method, *cells] for method, cells in table_rows(results, classical, COLUMNS).items()]
-    columns = list(COLUMNS)
-    if not any(row[-1] for row in rows):  # of no reference the noise could be measured
-        columns, rows = columns[:-1], [row[:-1] for row in rows]
-    print_rows(title, ["arm", *columns], rows)
+    table = figures_of(results, classical, COLUMNS)
+    print_rows(title, ["arm", *table.columns], [[method, *cells] for method, cells in table.rows.items()])
     if note := levels_note(next(iter(results.values()))[0]["plain"]):
         print(note)
 
@@ -176,6 +230,7 @@ def print_scores(result: Mapping[str, Any]) -> None:
     others |= result.get("classical", {})
     means += [[name, *_cells(scores, "{}", metrics)] for name, scores in others.items()]
     title = "PSNR_d, RAW denoising" if denoiser else "PSNR_r, RAW reconstruction"
+    title += f", self-ensemble of {result['views']} views" if result.get("self_ensemble") else ""
     print_rows(f"{title}: {result['data']}", ["image", *head[: len(metrics)]], images, means)
     if note := levels_note(result):
         print(note)

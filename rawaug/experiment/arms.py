@@ -11,13 +11,13 @@ from typing import Any
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import frozen_sample
+from rawaug.evaluation.scores import frozen_sample, label_of
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, SRGB_NOISE
+from rawaug.registry import ESTIMATORS, SRGB_NOISE, name_and_settings
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
@@ -33,6 +33,24 @@ def estimator_of(arm: ArmConfig) -> Supervised:
     """The estimator that the arm names."""
     estimator: Supervised = ESTIMATORS.make(arm.estimator)
     return estimator
+
+
+def methods_of(recipe: Recipe) -> dict[str, str]:
+    """What each row of the table is, in a line."""
+    filters = {label_of(spec): "a filter, nothing is trained" for spec in recipe.classical}
+    unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
+    return {**filters, **unchanged, **{label: _explained(recipe, label) for label in recipe.arms}}
+
+
+def _explained(recipe: Recipe, label: str) -> str:
+    arm, network = recipe.arms[label], recipe.network_of(label)
+    begun = f"{network.name} from random weights" if network.start is None else f"{network.start}, trained further"
+    real = "real pairs" if arm.sees_clean else "real noisy frames"
+    made = "RAW made from pictures"
+    mixed = f"{real}, with {made} as {arm.augmented:.0%} of a batch"
+    name, settings = name_and_settings(arm.estimator)
+    how = "" if arm.sees_clean else f", by {' '.join([name, *(f'{key}={value}' for key, value in settings.items())])}"
+    return f"{begun}, on {real if not arm.augmented else made if arm.augmented == 1.0 else mixed}{how}"
 
 
 def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:

@@ -33,8 +33,16 @@ from rawaug.evaluation.scores import (
     score_method,
     summary,
 )
-from rawaug.evaluation.tables import Row, draw, print_table
-from rawaug.experiment.arms import chosen, estimator_of, frames_of, in_pattern, training_stream, validation_samples
+from rawaug.evaluation.tables import Row, draw, print_table, verdict
+from rawaug.experiment.arms import (
+    chosen,
+    estimator_of,
+    frames_of,
+    in_pattern,
+    methods_of,
+    training_stream,
+    validation_samples,
+)
 from rawaug.experiment.plan import planned, require_usable, with_given_pairs
 from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.run_folder import claim, require_free, run_folder
@@ -43,6 +51,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
+from rawaug.progress import timed
 from rawaug.registry import EXPERIMENTS
 from rawaug.training.camera import fit
 from rawaug.training.config import weights_key
@@ -116,6 +125,7 @@ class TrainingRun:
         self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
         self.frames: dict[str, Sequence[Any]] = {}
         self.own: dict[str, OwnNoise] = {}
+        self.seconds: dict[str, float] = {}
         require_usable(recipe, self.pairs, self.validation)
 
     @one_at_a_time(lambda self: self.folder if _leads() else None)
@@ -140,6 +150,8 @@ class TrainingRun:
                     results[arm].append(self.evaluated(arm, models[arm], noise, isp, seed))
         if _leads():
             self.reported(results, models, noise, isp)
+            spent = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
+            print(f"took {sum(self.seconds.values()):.0f} s: {spent}")
         return results
 
     @property
@@ -155,6 +167,7 @@ class TrainingRun:
         start = self.starts[arm]
         return isp.cfa if start is None else start.cfa
 
+    @timed("fit")
     def fitted_isp(self, seed: int) -> DictionaryISP:
         """The ISP of the few pairs, or the recipe's own."""
         if self.recipe.camera is not None:
@@ -176,6 +189,7 @@ class TrainingRun:
         isp.save(path)
         return isp
 
+    @timed("training")
     def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
         """The denoiser of one arm."""
         recipe, place = self.recipe, self.place(arm, seed)
@@ -227,6 +241,7 @@ class TrainingRun:
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 
+    @timed("scores of the arms")
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         path = self.place(arm, seed) / "evaluation.json"
@@ -258,6 +273,7 @@ class TrainingRun:
             methods[name] = network_method(model.to(find_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
         return methods
 
+    @timed("other denoisers, report")
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
         recipe, cfa = self.recipe, isp.cfa
@@ -276,8 +292,11 @@ class TrainingRun:
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
         methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
-        picture = self.pictured(Page.of_scores(title, results, classical), methods, noise, cfa)
+        facts = {"Noise": str(recipe.noise), "To use the best arm": self.usage(results)[-1].partition(": ")[2]}
+        page = Page.of_scores(title, results, classical, facts, methods_of(recipe))
+        picture = self.pictured(page, methods, noise, cfa)
         print_table(results, title, classical)
+        _say(*filter(None, [verdict(results, classical)]))
         methods_scores = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
         _say(*filter(None, [own_noise_note(methods_scores)]))
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")

@@ -90,7 +90,7 @@ def is_picture(value: Any) -> bool:
 def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> Where:
     """Where the picture (``batched``: the pictures) of a sample is.
 
-    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first, with a warning where the second
+    Under ``key`` of a mapping, at index ``key`` of a tuple or list, by default the first, with a warning if the second
     is a picture of the same shape. A batch that is a list of pictures is not taken apart.
     """
     if isinstance(sample, Mapping):

@@ -49,7 +49,8 @@ def scores(psnr: float) -> dict[str, Any]:
     keys = {"psnr": psnr, "ssim": 0.91, "psnr_srgb": 30.0, "ssim_srgb": 0.8}
     quarters = {f"{key}_{part}": value for key, value in keys.items() for part in ("worst25", "best25")}
     noisy = {f"{key}_noisy": 0.5 for key in keys}
-    return {"images": [{"name": "a <frame>", **keys, **noisy}], **keys, **quarters, **noisy}
+    images = [{"name": "a <frame>", "shot_var": 1e-3, **keys, **noisy}]
+    return {"images": images, **keys, **quarters, **noisy}
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def page(tmp_path: Path) -> Elements:
     log = tmp_path / "log.csv"
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
-    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)})
+    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)}, {}, {"real": "a U-Net"})
     made.add_curves(draw_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)
@@ -71,8 +72,17 @@ def page(tmp_path: Path) -> Elements:
 
 def test_it_is_well_formed_and_says_what_was_measured(page: Elements) -> None:
     assert page.open == []
-    for said in ("a & b", "a <frame>", "40.12", "37.50", "41.00", "Wavelet", "worst 25%", '"steps": 4', "noisy input"):
+    for said in ("a & b", "a <frame>", "40.12", "37.50", "41.00", "Wavelet", "worst 25%", "steps: 4", "noisy input"):
         assert said in page.text
+
+
+def test_it_opens_with_the_verdict_and_marks_the_best(page: Elements) -> None:
+    assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frames, one seed" in page.text
+    assert "a U-Net" in page.text and "shot_var 0.001 to 0.001" in page.text
+    cells = re.findall(r'<td class="best">([^<]*)', page.source)
+    assert "40.12" in cells and "37.50" not in cells and "41.00" not in cells  # the only self-ensemble is no best one
+    heads = re.findall(r"<thead>.*?</thead>", page.source, re.DOTALL)
+    assert [head.count("self-ensemble") for head in heads] == [0, 0, 0, 0]  # a heading of its own says so
 
 
 def test_its_pictures_open_and_have_the_promised_sizes(page: Elements) -> None:
@@ -109,7 +119,7 @@ def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
 def test_nothing_is_wider_than_a_phone_but_what_scrolls(page: Elements) -> None:
     classes = [attributes.get("class") for _, attributes in page.found]
     tables = [k for k, (tag, _) in enumerate(page.found) if tag == "table"]
-    assert len(tables) == 3 and all(classes[k - 1] == "table" for k in tables)
+    assert len(tables) == 4 and all(classes[k - 1] == "table" for k in tables)
     (style,) = re.findall(r"<style>(.*?)</style>", page.source, re.DOTALL)
     assert re.search(r"\.table \{ overflow-x: auto", style) and "img { max-width: 100%" in style
     assert all(int(width) < 400 for width in re.findall(r"[^-]width: (\d+)px", style))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.tables import Row, draw, mean_and_spread, print_table
+from rawaug.evaluation.tables import Row, draw, mean_and_spread, print_table, verdict
 
 
 @pytest.fixture
@@ -48,6 +50,25 @@ def test_the_figure_is_written(grey_pair: Pair, tmp_path: Path) -> None:
 def test_one_seed_has_no_spread() -> None:
     assert mean_and_spread([40.123], 2) == "40.12"
     assert mean_and_spread([40.0, 41.0], 2) == "40.50 ± 0.71"
+
+
+@pytest.mark.parametrize(
+    ("seeds", "other", "said"),
+    [
+        ((40.0, 40.2), 39.0, r"Use real: \+1.10 dB over NLM, more than the noise of the seeds \(± 0.14 dB\)"),
+        ((40.0, 40.2), 40.05, r"Use real: \+0.05 dB over NLM, within the noise of the seeds"),
+        ((40.0, 40.2), 41.0, r"Use NLM: real, the best arm, is 0.90 dB below it, more than the noise"),
+        ((40.0,), 39.0, r"Use real: \+1.00 dB over NLM, higher on 1 of 2 frames, one seed"),
+    ],
+)
+def test_the_verdict_says_whether_the_gain_is_more_than_noise(
+    seeds: tuple[float, ...], other: float, said: str
+) -> None:
+    def scores(psnr: float, spread: float = 0.0) -> dict[str, Any]:
+        return {"psnr": psnr, "images": [{"psnr": psnr + spread}, {"psnr": psnr - spread}]}
+
+    arms = {"real": [{"plain": scores(psnr, 2.0)} for psnr in seeds], "weak": [{"plain": scores(30.0)}] * len(seeds)}
+    assert re.match(said, verdict(arms, {"NLM": scores(other), "TV": scores(20.0)}))
 
 
 def test_the_table_names_every_arm(capsys: pytest.CaptureFixture[str]) -> None:
