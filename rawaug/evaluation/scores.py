@@ -125,8 +125,8 @@ def score_method(
         sample = frozen_sample(pair, noise, cfa, seed)
         denoised = method(pair, sample)
         values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-        levels = frozen_levels(pair, noise, seed) or (None, None)
-        yield Score(pair.name, *values, *levels, pair.levels_from_clean or None), pair, sample, denoised
+        shot_var, read_var = frozen_levels(pair, noise, seed) or (None, None)
+        yield Score(pair.name, *values, shot_var, read_var, pair.levels_from_clean or None), pair, sample, denoised
 
 
 def network_method(

@@ -86,7 +86,7 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path, middle
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
     assert result["psnr_worst25"] < result["psnr"] < result["psnr_best25"]
     figures = {"psnr", "ssim", "psnr_srgb", "ssim_srgb"}
-    assert set(result["images"][0]) == {"name", *figures, *(f"{figure}_noisy" for figure in figures)}
+    assert set(result["images"][0]) == {"name", "shot_var", "read_var", *figures, *(f"{f}_noisy" for f in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
     early: list[dict[str, Any]] = []
