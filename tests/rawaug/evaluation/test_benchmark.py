@@ -128,6 +128,9 @@ def test_weights_of_others_are_known_by_their_tensors(tmp_path: Path, noisy: tup
     assert contestant(str(tmp_path / "bf.safetensors")).name == "BF-DnCNN"
     pmrid = contestant(str(tmp_path / "pmrid.safetensors"))
     assert pmrid.name.startswith("PMRID") and pmrid.run(*noisy, CFA.RGGB).shape == noisy[0].shape
+    (tmp_path / "finetuned").mkdir()
+    denoisers.save(denoisers.build("DnCNN", width=4, depth=3), tmp_path / "finetuned" / "denoiser.safetensors", {})
+    assert contestant(str(tmp_path / "finetuned" / "denoiser.safetensors")).name == "finetuned"  # an arm of a run
     with pytest.raises(ValueError, match="weights of no known denoiser"):
         contestant(str(tmp_path / "other.safetensors"))
 
