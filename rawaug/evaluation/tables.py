@@ -113,6 +113,10 @@ QUARTERS = {
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
+MATTERS = 0.05
+"""dB; a smaller gain is no reason to prefer an arm."""
+
+
 class Figures(NamedTuple):
     """A table: its columns, cells by method, empty where a figure does not apply, and the best cells of columns."""
 
@@ -136,7 +140,8 @@ def figures_of(
     keys = [list(columns.values())[k][1] for k in kept]
     best: set[tuple[str, int]] = set()
     for k, key in enumerate(keys):
-        means = {name: statistics.fmean(row[k]) for name, row in values.items() if row[k] and key != "own_noise"}
+        means = {name: round(statistics.fmean(row[k]), _digits(key)) for name, row in values.items() if row[k]}
+        means = {} if key == "own_noise" else means
         best |= {(name, k) for name, mean in means.items() if len(means) > 1 and mean == max(means.values())}
     rows = {name: [_cell(key, found) for key, found in zip(keys, row, strict=True)] for name, row in values.items()}
     return Figures([list(columns)[k] for k in kept], rows, best)
@@ -170,18 +175,19 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
     other = max(scored, key=lambda name: scored[name]["psnr"])
     gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
     gain = statistics.fmean(gains)
-    said = [f"{gain:+.2f} dB over {other}" if gain >= 0 else f"{arm}, the best arm, is {-gain:.2f} dB below it"]
+    better = gain >= MATTERS
+    said = [f"{gain:+.2f} dB over {other}" if better else f"{arm}, the best arm, is at {gain:+.2f} dB from it"]
     if len(gains) > 1:
         spread = statistics.stdev(gains)
         said += [f"{'within' if abs(gain) <= spread else 'more than'} the noise of the seeds (± {spread:.2f} dB)"]
     else:
         pairs = list(zip(runs[0]["images"], scored[other]["images"], strict=False))
-        better = sum((one.get("psnr") or 0.0) > (two.get("psnr") or 0.0) for one, two in pairs)
-        said += [f"higher on {better} of {len(pairs)} frames, one seed"]
+        higher = sum((one.get("psnr") or 0.0) > (two.get("psnr") or 0.0) for one, two in pairs)
+        said += [f"higher on {higher} of {len(pairs)} frames, one seed"]
     if "psnr_srgb" in scored[other] and all("psnr_srgb" in run for run in runs):
         developed = statistics.fmean(run["psnr_srgb"] for run in runs) - scored[other]["psnr_srgb"]
         said += [f"{developed:+.2f} dB after development"]
-    return f"Use {arm if gain >= 0 else other}: {', '.join(said)}."
+    return f"Use {arm if better else other}: {', '.join(said)}."
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:

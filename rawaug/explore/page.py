@@ -154,9 +154,10 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
         with gr.Row(elem_id="layout"):
             with gr.Column(scale=1, min_width=300, elem_id="controls"):
                 controls = _controls(gr, choices)
-            with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs():
+            with gr.Column(scale=3, min_width=300, elem_id="views"), gr.Tabs(overflow_behavior="wrap"):
                 tabs = {name: _tab(gr, name, outputs) for name in (*VIEWS, DENOISE)}
                 with gr.Tab("Code"):
+                    gr.Markdown("Python and the command that make this very pair.")
                     form = {"interactive": False, "wrap_lines": True, "show_line_numbers": False, "buttons": ["copy"]}
                     outputs["python"] = gr.Code(label="Python", language="python", elem_id="python", **form)
                     outputs["command"] = gr.Code(label="Command", language="shell", elem_id="command", **form)

@@ -54,7 +54,7 @@ class Panel(NamedTuple):
 
 
 def pair(look: Look) -> list[Panel]:
-    """Noisy and clean RAW, developed."""
+    """The noisy and the clean RAW made from the picture, developed; PSNR is that of the RAW."""
     made = drawn(look)
     noisy, clean = _developed(made, made.pair.noisy, made.pair.clean)
     factor = 2 if made.augment.pattern is None else 1
@@ -81,7 +81,7 @@ def stages(look: Look) -> list[Panel]:
 
 
 def raw(look: Look) -> list[Panel]:
-    """The mosaic from nearby, its planes, and histograms."""
+    """The mosaic magnified, histograms of clean and noisy RAW, and the packed planes."""
     made = drawn(look)
     mosaic = made.augment.mosaic(made.pair.noisy)
     sensor = pattern(made.augment.cfa)
@@ -103,7 +103,7 @@ def raw(look: Look) -> list[Panel]:
 
 
 def camera(look: Look) -> list[Panel]:
-    """Tone curve and colour matrix of the draw over those of the ISP."""
+    """The drawn tone curve and colours, over the atoms of the ISP that they are mixed from."""
     made = drawn(look)
     return [
         Panel(_setting(made), figures.tone_curve(made)),
@@ -112,7 +112,7 @@ def camera(look: Look) -> list[Panel]:
 
 
 def noise(look: Look) -> list[Panel]:
-    """The noise of the pair against the law that it was drawn from."""
+    """Measured variance of the noise against the law that it was drawn from."""
     made = drawn(look)
     titles = f"noise of the pair and its law: {_levels(made)}", "the same on logarithmic axes"
     return [Panel(title, image) for title, image in zip(titles, figures.noise(made), strict=True)]
@@ -120,7 +120,7 @@ def noise(look: Look) -> list[Panel]:
 
 @torch.no_grad()
 def draws(look: Look) -> list[Panel]:
-    """Eight noisy draws of the picture's central part, at half size."""
+    """Eight draws of camera, light, exposure and noise for the central part, at half size."""
     first = drawn(look)
     develop = Development(first.augment.isp, first.pair.params.isp)
     part = _crop(first.srgb, HEIGHT, WIDTH)
@@ -137,7 +137,7 @@ def draws(look: Look) -> list[Panel]:
 
 
 def denoised(look: Look) -> list[Panel]:
-    """Noisy, and denoised by the shipped network, developed.
+    """Noisy on the left, denoised by the shipped network on the right, both developed.
 
     Raises:
         ValueError: if the pattern is not Bayer's.
