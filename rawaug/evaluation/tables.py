@@ -152,11 +152,13 @@ def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[floa
 
 
 def _cell(key: str, values: Sequence[float]) -> str:
-    if not values:
-        return ""
-    return (
-        f"{statistics.fmean(values):.0%}" if key == "own_noise" else mean_and_spread(values, 2 if "psnr" in key else 4)
-    )
+    if key == "own_noise" and values:
+        return f"{statistics.fmean(values):.0%}"
+    return mean_and_spread(values, _digits(key)) if values else ""
+
+
+def _digits(key: str) -> int:
+    return 2 if "psnr" in key else 4
 
 
 def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
