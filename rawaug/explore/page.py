@@ -21,7 +21,7 @@ from jinja2 import Environment
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
 from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
-from rawaug.explore.views import VIEWS, Panel, denoised
+from rawaug.explore.views import VIEWS, Panel, denoised, seen_in
 from rawaug.files import shipped_isps
 from rawaug.isp.cameras import LAMPS, published_cameras
 from rawaug.plugin.sampling_config import SamplingConfig
@@ -120,7 +120,7 @@ def _given(choice: str) -> str | None:
 def shown(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """What changes on the page: ``message``, ``python``, ``command``, and the content of the open tab by its name."""
     try:
-        look = look_of(values)
+        look = seen_in(tab, look_of(values))
         if tab == DENOISE:
             before, after = denoised(look)
             images = (before.image, after.image)

@@ -7,7 +7,7 @@ import shlex
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -68,12 +68,13 @@ def opened(picture: str, changed: int) -> Tensor:
 
 def augmentation(drawing: SamplingConfig) -> RawAugment:
     """What :meth:`SamplingConfig.make` makes, from an ISP that is baked once."""
-    return _baked(drawing.isp, drawing.camera, drawing.cfa).redrawn(**drawing.draws())
+    form = tuple(drawing.form().items())
+    return _baked(drawing.isp, drawing.camera, drawing.cfa, form).redrawn(**drawing.draws())
 
 
 @lru_cache(maxsize=4)
-def _baked(isp: str, camera: str | None, cfa: str | None) -> RawAugment:
-    return RawAugment.from_pretrained(loaded(isp), camera=camera, cfa=cfa)
+def _baked(isp: str, camera: str | None, cfa: str | None, form: tuple[tuple[str, Any], ...]) -> RawAugment:
+    return RawAugment.from_pretrained(loaded(isp), camera=camera, cfa=cfa, **dict(form))
 
 
 @lru_cache(maxsize=4)

@@ -9,10 +9,12 @@ gains g, colour matrix C, shading mask G and tone curve T. Of a learned tone net
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -154,6 +156,26 @@ def denoised(look: Look) -> list[Panel]:
     return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
 
 
+def developed(look: Look) -> list[Panel]:
+    """Noisy and clean as sRGB: noise in RAW, demosaiced and developed by the camera that made the RAW."""
+    made = drawn(look)
+    noisy, clean = (_crop(image, HEIGHT, WIDTH) for image in (made.pair.noisy, made.pair.clean))
+    quality = psnr(noisy[None], clean[None]).item()
+    method = made.augment.targets.names[int(made.pair.params.extras["demosaicing"])]
+    title = f"noisy: {_levels(made)}, demosaicing {method}; {quality:.1f} dB"
+    return [Panel(title, _to_uint8(noisy)), Panel("clean: developed alike", _to_uint8(clean))]
+
+
+def burst(look: Look) -> list[Panel]:
+    """Noisy frames of the scene from a hand that moves, each with noise of its own."""
+    made = drawn(look)
+    frames, panels = _developed(made, *made.pair.noisy), []
+    for k, (down, right, angle) in enumerate(made.pair.params.extras["motion"].tolist()):
+        moved = f"{down:+.1f} pixels down, {right:+.1f} to the right, turned by {math.degrees(angle):+.2f} degrees"
+        panels.append(Panel(f"frame {k}: {moved}", frames[k]))
+    return panels
+
+
 VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "Pair": pair,
     "Stages": stages,
@@ -161,8 +183,17 @@ VIEWS: dict[str, Callable[[Look], list[Panel]]] = {
     "Camera": camera,
     "Noise": noise,
     "Eight draws": draws,
+    "sRGB": developed,
+    "Burst": burst,
 }
 """The tabs; beside them there is the one that compares the noisy picture with the denoised one."""
+FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst": 4}}
+"""Target and burst of the pairs that a tab shows, if not those of the others."""
+
+
+def seen_in(tab: str, look: Look) -> Look:
+    """The look as a tab shows it."""
+    return replace(look, drawing=replace(look.drawing, **FORMS.get(tab, {})))
 
 
 class Development:

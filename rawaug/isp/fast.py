@@ -36,10 +36,10 @@ from rawaug import bayer
 from rawaug.bayer import CFA, unpack
 from rawaug.isp.config import ISPParams
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
+from rawaug.isp.staged import Encoder, thumbnail
 from rawaug.isp.stages import BatchParams, Stage, Tables, as_float, highlight_rise, node_colours
 from rawaug.isp.tone import STEPS, to_code
-from rawaug.kernels import fastest, runtime
+from rawaug.kernels import fastest
 from rawaug.kernels.reference import Camera, Display, fall_off, look_up, render, unprocess
 from rawaug.kernels.runtime import one_thread
 
@@ -258,15 +258,10 @@ class _Chooser(nn.Module):
         return ISPParams(colour_weights, gain_weights, matrix, self.gain.combine(gain_weights), tone_weights)
 
 
+@one_thread()
 def _small(srgb: Tensor, table: Tensor) -> Tensor:
     """x2 of the thumbnail that the encoders look at, ``(B, 3, h, w)``."""
-    if srgb.dtype != torch.uint8 or srgb.device.type != "cpu" or not runtime.has_numba():
-        return look_up(table, thumbnail(as_float(srgb)))[:, :3]
-    from rawaug.kernels.cpu import thumbnails
-
-    height, width = srgb.shape[-2:]
-    scale = THUMBNAIL / max(height, width, THUMBNAIL)
-    return thumbnails(srgb, table, max(1, round(height * scale)), max(1, round(width * scale)))
+    return look_up(table, thumbnail(as_float(srgb)))[:, :3]
 
 
 def _folded(encoder: Encoder, maps: list[Tensor]) -> Encoder:

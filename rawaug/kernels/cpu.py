@@ -1,4 +1,4 @@
-"""The passes of :mod:`rawaug.kernels.reference` as loops for the CPU, compiled by Numba; and thumbnails.
+"""The passes of :mod:`rawaug.kernels.reference` as loops for the CPU, compiled by Numba.
 
 A row is worked on in pieces that fit the fastest cache, each step a loop of its own, which the compiler turns into
 vector instructions. It does not find those for the table's look-up, so :func:`_interpolate` spells them out: four
@@ -108,25 +108,6 @@ def _site_weights(cfa: CFA, method: str) -> np.ndarray:
     sums = torch.stack([around[:, i, j] for i, j in ((2, 2), (2, 1), (1, 2), (1, 1), (2, 0), (0, 2))], dim=1)
     chosen = torch.cat([own, sums])[torch.tensor(kinds)]  # (colour, row, column, sum)
     return chosen.permute(1, 0, 3, 2).repeat(1, 1, 1, _TILE // 2).contiguous().numpy()
-
-
-def thumbnails(srgb: Tensor, table: Tensor, height: int, width: int) -> Tensor:
-    """uint8 ``(B, 3, H, W)`` on the CPU, averaged to ``(B, 3, height, width)`` and looked up in the table: x2."""
-    x2 = torch.empty(len(srgb), 3, height, width, dtype=torch.float32)
-    picture, nodes, out = srgb.detach().contiguous().numpy(), table.contiguous().numpy(), x2.numpy()
-    rows, columns = _windows(srgb.shape[2], height), _windows(srgb.shape[3], width)
-    over_rows(
-        len(srgb) * height,
-        srgb[0].numel() // height,
-        lambda start, stop: _small_rows(picture, rows, columns, nodes, out, start, stop),
-    )
-    return x2
-
-
-def _windows(size: int, count: int) -> np.ndarray:
-    """``(count, 2)`` start and stop of the pixels of a mean, as adaptive average pooling has them: they may overlap."""
-    k = np.arange(count)
-    return np.stack([k * size // count, -(-(k + 1) * size // count)], axis=1)
 
 
 @intrinsic
@@ -422,40 +403,6 @@ def _srgb_rows(  # type: ignore[no-untyped-def]
                         y = found[0, c, j]
                         y = y if y > _ZERO else _ZERO
                         srgb[b, c, i, first + j] = y if y < _ONE else _ONE
-
-
-@part
-def _average(plane, top, bottom, edges, sums, means):  # type: ignore[no-untyped-def]
-    """Means of the windows of a plane between ``top`` and ``bottom``, and ``edges`` ``(n, 2)`` from left to right."""
-    sums[:] = 0
-    for y in range(top, bottom):
-        line = plane[y]
-        for x in range(len(sums)):
-            sums[x] += np.uint32(line[x])
-    for j in range(len(means)):
-        left, right = edges[j]
-        total = np.uint32(0)
-        for x in range(left, right):
-            total += sums[x]
-        means[j] = np.float32(total / (255.0 * (bottom - top) * (right - left)))
-
-
-@compiled
-def _small_rows(srgb, rows, columns, table, x2, start, stop):  # type: ignore[no-untyped-def]
-    """Rows ``start`` to ``stop`` of the batch's rows of thumbnails, one picture's after the other's."""
-    scale, width = np.float32(len(table) - 1), len(columns)
-    sums, means = np.empty(srgb.shape[3], np.uint32), np.empty((3, width), np.float32)
-    nodes, shares = np.empty(_TILE, np.int32), np.empty((3, _TILE), np.float32)
-    found = np.empty((2, 3, _TILE), np.float32)
-    for row in range(start, stop):
-        b, i = divmod(row, len(rows))
-        for c in range(3):
-            _average(srgb[b, c], rows[i, 0], rows[i, 1], columns, sums, means[c])
-        for first in range(0, width, _TILE):
-            last = min(first + _TILE, width)
-            red, green, blue = means[0, first:last], means[1, first:last], means[2, first:last]
-            _look_up(red, green, blue, scale, table, nodes, shares, 0, found)
-            x2[b, :, i, first:last] = found[0, :, : last - first]
 
 
 def shot_read(

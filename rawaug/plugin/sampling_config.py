@@ -37,7 +37,7 @@ class SamplingConfig:
         jpeg: of srgb, lowest and highest JPEG quality of the noisy pictures; not compressed by default.
         burst: number of noisy frames of each scene; a single one by default.
         motion: of bursts, largest shift in pixels and rotation in degrees; 2 and 0.5 by default.
-        stops: of bursts, exposure of each frame in stops; all alike by default.
+        stops: of bursts, exposure of each frame in stops, as "[0, -2, 2]"; all alike by default.
     """
 
     isp: str = "universal"

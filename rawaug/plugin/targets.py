@@ -4,7 +4,7 @@ r"""What a pair holds besides RAW: linear camera RGB, or sRGB developed by the c
 
 with the gains g, matrix C and tone curve t of the draw (:class:`rawaug.isp.fast.FastForward`). Noisy and clean RAW are
 developed alike, by a demosaicing drawn from those at hand, so that the two differ by the sensor's noise alone: the
-developed clean RAW, not the picture, is the target.
+developed clean RAW is the target, not the picture, which demosaicing alone would leave at 29 to 31 dB.
 """
 
 from __future__ import annotations

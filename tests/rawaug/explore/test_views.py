@@ -38,6 +38,8 @@ def picture(tmp_path_factory: pytest.TempPathFactory) -> str:
         SamplingConfig("universal", "Nikon D750", 4000.0, "Nikon D750", -0.5, "Nikon D750", 1600.0, cfa="GRBG"),
         SamplingConfig(light="LED-B3", noise=LEVELS, cfa="XTRANS"),
         SamplingConfig("canon-powershot", exposure=0.25, noise="any camera"),
+        SamplingConfig(target="srgb"),
+        SamplingConfig(burst=3),
     ],
 )
 def test_command_and_python_make_the_pair_bit_for_bit(picture: str, drawing: SamplingConfig, tmp_path: Path) -> None:
@@ -65,12 +67,14 @@ def test_developed_without_noise_it_is_the_picture_again(picture: str) -> None:
 
 def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> None:
     look = Look(picture, SamplingConfig(noise=LEVELS))
-    panels = {name: view(look) for name, view in views.VIEWS.items()}
+    panels = {name: view(views.seen_in(name, look)) for name, view in views.VIEWS.items()}
     assert {name: len(found) for name, found in panels.items()} == {
-        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8
+        "Pair": 2, "Stages": 5, "RAW": 6, "Camera": 2, "Noise": 2, "Eight draws": 8, "sRGB": 2, "Burst": 4
     }  # fmt: skip
     for panel in (panel for found in panels.values() for panel in found):
         assert panel.title and panel.image.dtype == np.uint8 and panel.image.shape[2] == 3 and panel.image.std() > 3
+    first, second = (panel.image.astype(float) for panel in panels["Burst"][:2])
+    assert panels["Burst"][0].title.startswith("frame 0: +0.0 pixels down") and np.abs(first - second).mean() > 1
     means = {tuple(panel.image.mean(axis=(0, 1)).round(1)) for panel in panels["Eight draws"]}
     assert len(means) == 8, "eight cameras in eight lights"
     fixed = replace(look.drawing, camera="Nikon D750", light=5500.0, tone="linear", exposure=0.0)

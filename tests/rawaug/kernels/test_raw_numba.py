@@ -6,13 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.kernels import cpu
-from rawaug.kernels.reference import Camera, frame_of, look_up, through_curves, unprocess
+from rawaug.kernels.reference import Camera, frame_of, through_curves, unprocess
 
 NODES = 9
 
@@ -112,11 +111,3 @@ def test_bands_in_pytorch_are_the_picture_in_one() -> None:
     srgb, setting = pictures(2, 3, 20, 16), camera(2, True, True)
     whole = unprocess(srgb, setting, 1.0)
     torch.testing.assert_close(unprocess(srgb, setting, 1.0, band=6 * 16), whole, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("size", [(64, 64), (65, 130), (40, 33), (7, 9)])
-def test_thumbnails_are_adaptive_averages_looked_up(size: tuple[int, int]) -> None:
-    srgb, table = pictures(2, 3, *size), camera(1, False, False).table
-    for small in ((7, 9), (5, 8), size):
-        expected = look_up(table, F.adaptive_avg_pool2d(srgb / 255.0, small))[:, :3]
-        torch.testing.assert_close(cpu.thumbnails(srgb, table, *small), expected, atol=1e-5, rtol=0)
