@@ -7,8 +7,8 @@ pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture 
 with its own noise. *cycleisp* is its network from sRGB to RAW alone, and *unbaked* the ISP's own reverse pass, each on
 one small crop whose time is scaled by pixels, in the network's favour. *copy* turns bytes into as many floats as are
 made of them, and does no more; *kornia* flips and rotates float pictures, as users of a GPU do anyway; *drawn before*
-is rawaug without the draw of its parameters; *forward* is the way back from demosaiced RAW to sRGB. All are timed in
-turn, and the fastest run of each counts.
+is rawaug without the draw of its parameters; *rgb* and *srgb* are its other targets; *forward* is the way back from
+demosaiced RAW to sRGB. All are timed in turn, and the fastest run of each counts.
 
 The roofline is the bandwidth of a large copy in the same run, bytes read plus bytes written a second. A pixel counts
 as :data:`COUNTED` bytes, whatever a method moves; rawaug's two passes move :data:`MOVED`.
@@ -107,6 +107,9 @@ def methods(batch: Tensor) -> dict[str, tuple[Callable[[], object], int]]:
         name: (lambda augment=augment: augment(batch), pixels)  # type: ignore[misc]
         for name, augment in ours.items()
     }
+    for target in ("rgb", "srgb"):
+        other = RawAugment.from_pretrained("universal", target=target).to(device)
+        runs[target] = (lambda other=other: other(batch), pixels)  # type: ignore[misc]
     return runs | {
         "rawaug, drawn before": (lambda: augment.apply(batch, drawn), pixels),
         "forward": (lambda: develop(colour, drawn.isp), pixels),
