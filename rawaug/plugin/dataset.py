@@ -140,6 +140,20 @@ class RawPairs(Dataset[Any]):
         """The pair of picture ``index``, drawn from ``generator``; counts no epoch."""
         return self._paired(self.dataset[index], index, generator)
 
+    def draw_batch(self, indices: Sequence[int], generators: Sequence[torch.Generator]) -> RawPair:
+        """The pairs of :meth:`draw`, bit for bit, made at once as a batch: of small crops most of the time is calls.
+
+        The dataset's samples are pictures alone, and ``crop`` is set.
+        """
+        drawn, patches = [], []
+        for index, generator in zip(indices, generators, strict=True):
+            picture = even_sided(to_rgb_tensor(self.dataset[index]))
+            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
+            patches.append(placed(picture, place, self.crop)[None])
+            drawn.append(self.augment.sample(patches[-1], generator, place[None]))
+        pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.joined(drawn))
+        return pair
+
     def replay(self, index: int, params: AugmentParams) -> RawPair:
         """The pair that ``params`` (those of one pair, without B) make of picture ``index``, whatever the seed is."""
         sample = self.dataset[index]

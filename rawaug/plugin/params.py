@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from rawaug.files import read_tensors, write_tensors
@@ -42,6 +43,12 @@ class AugmentParams(NamedTuple):
         groups = {"isp": self.isp._asdict(), "noise": self.noise, "extras": self.extras}
         flat = {f"{group}.{name}": value for group, drawn in groups.items() for name, value in drawn.items()}
         return flat | {"place": self.place}
+
+    @classmethod
+    def joined(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
+        """Those of several batches as one batch."""
+        flat = [params.tensors() for params in parts]
+        return cls.from_tensors({name: torch.cat([tensors[name] for tensors in flat]) for name in flat[0]})
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> AugmentParams:

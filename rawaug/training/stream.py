@@ -68,8 +68,14 @@ class PictureCrops:
 
     def draw(self, generator: torch.Generator) -> Sample:
         """One crop of a random picture."""
-        pair = self.pairs.draw(int(torch.randint(len(self.pairs), (), generator=generator)), generator)
-        return Sample(pair.noisy, pair.clean, pair.variance if pair.variance.numel() else torch.zeros_like(pair.noisy))
+        return self.draw_batch([generator])[0]
+
+    def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
+        """One crop for each generator, all made together."""
+        indices = [int(torch.randint(len(self.pairs), (), generator=generator)) for generator in generators]
+        pair = self.pairs.draw_batch(indices, generators)
+        variance = pair.variance if pair.variance.numel() else torch.zeros_like(pair.noisy)
+        return [Sample(*tensors) for tensors in zip(pair.noisy, pair.clean, variance, strict=True)]
 
 
 def turned_crop(mosaics: Sequence[Tensor], crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:
@@ -104,9 +110,22 @@ class TrainingStream(Dataset[Any]):
             raise ValueError("this arm needs real pairs; set data.pairs")
 
     def __getitem__(self, index: int) -> Any:
-        source = self.real if index % self.batch >= self.from_pictures else self.pictures
+        source = self.pictures if self._pictured(index) else self.real
         assert source is not None
-        return source.draw(keyed_generator(self.seed, "stream", index))
+        return source.draw(self._generator(index))
+
+    def __getitems__(self, indices: Sequence[int]) -> list[Any]:
+        """The samples of a step, as a DataLoader asks for them."""
+        made: dict[int, Any] = {}
+        if isinstance(self.pictures, PictureCrops) and (pictured := [*filter(self._pictured, indices)]):
+            made = dict(zip(pictured, self.pictures.draw_batch([*map(self._generator, pictured)]), strict=True))
+        return [made[index] if index in made else self[index] for index in indices]
+
+    def _pictured(self, index: int) -> bool:
+        return index % self.batch < self.from_pictures
+
+    def _generator(self, index: int) -> torch.Generator:
+        return keyed_generator(self.seed, "stream", index)
 
 
 class StepSampler(Sampler[list[int]]):

@@ -9,12 +9,14 @@ import torch
 
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
-from rawaug.data import demo_pairs, demo_photographs
+from rawaug.data import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
+from rawaug.plugin.targets import Target
+from rawaug.seeding import keyed_generator
 from rawaug.training.stream import RealCrops, StepSampler, TrainingStream
 
 
@@ -68,6 +70,21 @@ def test_samples_depend_on_seed_and_index_alone() -> None:
     assert torch.equal(stream[9].noisy, later)
     assert not torch.equal(stream[8].noisy, later)
     assert stream.from_pictures == 2
+
+
+@pytest.mark.parametrize("target", ["raw", "srgb"])
+def test_a_step_made_at_once_is_that_of_the_plugin_one_by_one(target: Target) -> None:
+    augment = RawAugment(DictionaryISP(), target=target, jpeg=(50, 60) if target == "srgb" else None)
+    pictures = RawPairs(demo_pictures(3), augment, crop=32, zoom=2.0)
+    stream = TrainingStream(None, pictures, batch=4, augmented=1.0, seed=1)
+    for index, sample in zip((7, 4, 6), stream.__getitems__([7, 4, 6]), strict=True):
+        generator = keyed_generator(1, "stream", index)
+        alone = pictures.draw(int(torch.randint(3, (), generator=generator)), generator)
+        assert torch.equal(sample.noisy, alone.noisy) and torch.equal(sample.clean, alone.clean)
+    real = RealCrops([colour_pair(CFA.RGGB)], noise_model("cycleisp_sidd"), 16, CFA.RGGB)
+    mixed = TrainingStream(real, RawPairs(demo_pictures(3), RawAugment(DictionaryISP()), crop=16), 4, 0.5, seed=1)
+    for index, sample in enumerate(mixed.__getitems__(range(4))):
+        assert torch.equal(sample.noisy, mixed[index].noisy)
 
 
 def test_an_arm_needs_its_sources() -> None:
