@@ -12,10 +12,12 @@ mirrored line on the sides where the patterns differ, and cropped after.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated
 
 from torch import Tensor
@@ -27,6 +29,7 @@ from rawaug.commands.frame_denoisers import (
     FrameDenoiser,
     NetworkDenoiser,
     Noise,
+    Shots,
     UnknownNoise,
     as_json,
     frame_denoiser,
@@ -71,8 +74,9 @@ def run(
             the name of a shipped denoiser; by default rawaug-small.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
-            law), profile, estimate, camera (the law that the denoiser was trained for), an ISP file (uses its stored
-            noise law), the name of a camera, or [shot_var, read_var].
+            law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
+            that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or
+            [shot_var, read_var].
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
@@ -110,6 +114,8 @@ class Denoised:
     noise_source: str
     below_zero: float
     seconds: float
+    camera: str
+    iso: float | None
 
 
 @dataclass
@@ -198,7 +204,8 @@ def _denoise_file(
     left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
     out.parent.mkdir(parents=True, exist_ok=True)
     write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
-    return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    return Denoised(source, out, shot_var, read_var, noise_source, below, seconds, frame.camera, frame.iso)
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
@@ -245,20 +252,41 @@ def denoise_folder(
     result = DenoisedFolder(
         unread=[file.name for file in sorted(source.rglob("*")) if file.suffix.lower() in UNREADABLE]
     )
+    read, unknown = partial(isolated, read_raw), []
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists() and not overwrite:
             result.existing += 1
             continue
         try:
-            result.files.append(_denoise_file(file, target, made, noise, strength, partial(isolated, read_raw)))
+            result.files.append(_denoise_file(file, target, made, noise, strength, read))
+        except UnknownNoise as error:
+            unknown.append(file)
+            result.broken[str(file)] = f"noise unknown: {_named(error, file)}"
         except (OSError, ValueError) as error:
             if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
                 raise  # what cannot be written, such as to a full disk, is no fault of the file
-            named = str(error) if file.stem in str(error) else f"{file}: {error}"
-            result.broken[str(file)] = f"{'noise unknown' if isinstance(error, UnknownNoise) else 'broken'}: {named}"
+            result.broken[str(file)] = f"broken: {_named(error, file)}"
+    known = _levels_by_shot(result.files) if noise == "auto" else {}
+    for file in unknown:
+        with suppress(UnknownNoise):
+            result.files.append(_denoise_file(file, targets[file], made, known, strength, read))
+            del result.broken[str(file)]
     if len(result.broken) == len(targets):
         raise ValueError(f"{source}: none of its {len(targets)} files can be denoised; {min(result.broken.values())}")
     return result
+
+
+def _named(error: Exception, file: Path) -> str:
+    return str(error) if file.stem in str(error) else f"{file}: {error}"
+
+
+def _levels_by_shot(files: Sequence[Denoised]) -> Shots:
+    """The mean levels of files, by camera and ISO where it is known."""
+    found: dict[tuple[str, float | None], list[tuple[float, float]]] = {}
+    for done in files:
+        if done.iso is not None:
+            found.setdefault((done.camera, done.iso), []).append((done.shot_var, done.read_var))
+    return {shot: (fmean(s for s, _ in levels), fmean(r for _, r in levels)) for shot, levels in found.items()}
 
 
 def _targets(source: Path, out: Path) -> dict[Path, Path]:

@@ -152,7 +152,7 @@ def evaluate(
             result["classical"] = {name: with_own_noise(scores, own) for name, scores in found.items()}
         if report is not None:
             runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
-            facts = {"Noise": f"{scoring.named}, seed {seed}"}
+            facts = {"Noise": scoring.named, "Seed": str(seed)}
             results = {weights.stem: [runs]}
             page = Page.of_scores(f"{weights.stem} on {data}", results, result.get("classical", {}), facts)
             scoring.add_frames(page, classical)

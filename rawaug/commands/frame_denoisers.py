@@ -43,8 +43,11 @@ from rawaug.noise.cameras import ProfileLevels
 from rawaug.registry import FILTERS, Spec
 from rawaug.seeding import keyed_generator
 
-Noise = str | Sequence[float] | MeasuredLevels
-"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), or two variances."""
+Shots = Mapping[tuple[str, float | None], tuple[float, float]]
+"""Levels by camera and ISO."""
+Noise = str | Sequence[float] | MeasuredLevels | Shots
+"""``"auto"``, ``"profile"``, ``"estimate"``, a measured camera's name or law (at the file's ISO), two variances, or the
+levels of other files."""
 
 LOOSE = 0.9
 """R^2 below which an estimate is called uncertain."""
@@ -65,6 +68,10 @@ def levels_of(frame: RawFrame, noise: Noise = "auto") -> tuple[float, float, str
     """
     if isinstance(noise, MeasuredLevels):
         return *_of_law(noise, frame), "camera"
+    if isinstance(noise, Mapping):
+        if (shot := (frame.camera, frame.iso)) not in noise:
+            raise UnknownNoise(f"{frame.name}: no other file is of {frame.camera} at its ISO")
+        return *noise[shot], f"other files of {frame.camera} at ISO {frame.iso:g}"
     if not isinstance(noise, str):
         fixed = FixedLevels(*noise)
         return fixed.shot_var, fixed.read_var, "given"

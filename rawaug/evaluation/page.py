@@ -78,17 +78,19 @@ class Page:
         title: str,
         results: Runs,
         classical: Mapping[str, Mapping[str, Any]],
-        facts: Mapping[str, str] | None = None,
+        facts: Mapping[str, Any] | None = None,
         arms: Mapping[str, str] | None = None,
     ) -> Page:
         """A page with the scores of ``results``, by arm with one entry a seed, and of classical denoisers, by name.
 
-        It opens with the verdict and the ``facts``; ``arms`` explains the methods.
+        It opens with the verdict and the ``facts``, ``Noise`` as in a recipe; ``arms`` says what the methods are.
         """
         plain = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
         first = next(iter(results.values()))[0]["plain"]
         about = {"Command": command_line(), **(facts or {}), "Own noise": own_noise_note(plain)}
-        about["Noise"] = ", ".join(filter(None, [about.get("Noise"), levels_range(first)]))
+        if noise := about.pop("Noise", None):
+            named = noise if isinstance(noise, str) else json.dumps(noise)
+            about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
         about = {name: text for name, text in about.items() if text}
         page = cls(title, [Part(terms=about), Part("Methods", terms=arms or {})][: 2 if arms else 1])
         page.lead = verdict(results, classical)

@@ -292,7 +292,7 @@ class TrainingRun:
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
         methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
-        facts = {"Noise": str(recipe.noise), "To use the best run": self.usage(results)[-1].partition(": ")[2]}
+        facts = {"Noise": recipe.noise, "To use the best run": self.usage(results)[-1].partition(": ")[2]}
         page = Page.of_scores(title, results, classical, facts, methods_of(recipe))
         picture = self.pictured(page, methods, noise, cfa)
         print_table(results, title, classical)

@@ -292,6 +292,21 @@ def test_a_folder_with_a_broken_file_is_done_and_fails(
     assert main([*command, "--strength", "0.5"]) == 0
 
 
+def test_of_unknown_noise_files_of_the_same_camera_and_iso_tell(tmp_path: Path, identity: Path) -> None:
+    known = dataclasses.replace(gradient(), camera="Maker One", iso=400.0, noise_profile=LEVELS)
+    bare = dataclasses.replace(known, mosaic=known.mosaic[..., :64, :64], noise_profile=None)
+    frames = {"a": bare, "b": known, "c": dataclasses.replace(bare, iso=800.0)}
+    (tmp_path / "in").mkdir()
+    for name, frame in frames.items():
+        write_dng(tmp_path / "in" / f"{name}.dng", frame)
+    result = denoise_folder(tmp_path / "in", tmp_path / "out", identity)
+    assert [done.source.stem for done in result.files] == ["b", "a"]
+    assert (result.files[1].shot_var, result.files[1].read_var) == pytest.approx(LEVELS)
+    assert result.files[1].noise_source == "other files of Maker One at ISO 400"
+    (reason,) = result.broken.values()
+    assert reason.startswith("noise unknown: c: ")
+
+
 @pytest.mark.usefixtures("no_gpu")
 def test_wrong_wishes_are_refused_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -58,7 +58,7 @@ def page(tmp_path: Path) -> Elements:
     log = tmp_path / "log.csv"
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
-    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)}, {}, {"real": "a U-Net"})
+    made = Page.of_scores("a & b", results, {"Wavelet": scores(37.5)}, {"Noise": "upi"}, {"real": "a U-Net"})
     made.add_curves(draw_curves({"real": [log]}))
     generator = torch.Generator().manual_seed(0)
     raw = torch.rand(1, 200, 800, generator=generator)
@@ -78,7 +78,7 @@ def test_it_is_well_formed_and_says_what_was_measured(page: Elements) -> None:
 
 def test_it_opens_with_the_verdict_and_marks_the_best(page: Elements) -> None:
     assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frames, one seed" in page.text
-    assert "a U-Net" in page.text and "shot_var 0.001 to 0.001" in page.text
+    assert "a U-Net" in page.text and "else upi; shot_var 0.001 to 0.001" in page.text
     cells = re.findall(r'<td class="best">([^<]*)', page.source)
     assert "40.12" in cells and "37.50" not in cells and "41.00" not in cells  # the only self-ensemble is no best one
     heads = re.findall(r"<thead>.*?</thead>", page.source, re.DOTALL)
