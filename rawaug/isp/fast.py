@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
+from functools import partial
 from itertools import pairwise
 from typing import cast
 
@@ -45,7 +46,7 @@ from rawaug.kernels.runtime import one_thread
 
 NODES = 65
 """Nodes of the table along each axis of the sRGB cube."""
-CURVE_NODES = 4097
+CURVE_NODES = 1025
 """Nodes of an inverted tone curve, over the root of linear light."""
 
 
@@ -159,15 +160,20 @@ class FastForward(nn.Module):
         return fastest("render", linear, display, otherwise=lambda: render(linear, display))
 
     @torch.no_grad()
-    def develop(self, raw: Tensor, methods: Sequence[str], params: ISPParams, place: Tensor | None = None) -> Tensor:
-        """Mosaics ``(B, 1, H, W)``, float32, sides at least 4, to sRGB, each by one of ``bayer.STENCILS``."""
-        display = self._display(raw, params, place)
+    def develop(
+        self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None = None
+    ) -> list[Tensor]:
+        """Mosaics of the same pictures, each ``(B, 1, H, W)`` with sides of at least 4, to sRGB.
 
-        def in_pytorch() -> Tensor:
+        Every picture is demosaiced by its own of :data:`rawaug.bayer.STENCILS`.
+        """
+        display = self._display(raws[0], params, place)
+
+        def in_pytorch(raw: Tensor) -> Tensor:
             pictures = zip(raw.split(1), methods, strict=True)
             return render(torch.cat([bayer.demosaic(one, self.cfa, method) for one, method in pictures]), display)
 
-        return fastest("develop", raw, display, self.cfa, methods, otherwise=in_pytorch)
+        return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_pytorch, raw)) for raw in raws]
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)

@@ -293,7 +293,8 @@ class RawAugment(nn.Module):
     def _developed(self, forward: FastForward, planes: Tensor, params: AugmentParams) -> tuple[Tensor, Tensor, Tensor]:
         raw = self.noise.apply(planes, params.noise)
         _require_finite(raw)
-        noisy, clean = (self.targets.develop(forward, bayer.unpack(x, self.isp.cfa), params) for x in (raw, planes))
+        mosaics = [bayer.unpack(x, self.isp.cfa) for x in (raw, planes)]
+        noisy, clean = self.targets.develop(forward, mosaics, params)
         if "quality" in params.extras:
             noisy = through_jpeg(noisy, params.extras["quality"])
         return noisy, clean, noisy.new_empty(len(noisy), 0)

@@ -62,12 +62,12 @@ class Targets:
             drawn["quality"] = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
         return drawn
 
-    def develop(self, forward: FastForward, raw: Tensor, params: AugmentParams) -> Tensor:
-        """Mosaics ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1]; a saturated sensor is white."""
-        if min(raw.shape[-2:]) < 4:
-            raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(raw.shape[-2:])}")
+    def develop(self, forward: FastForward, raws: Sequence[Tensor], params: AugmentParams) -> list[Tensor]:
+        """Mosaics of the same pictures, ``(B, 1, H, W)`` each, to sRGB in [0, 1]; a saturated sensor is white."""
+        if min(raws[0].shape[-2:]) < 4:
+            raise ValueError(f"target 'srgb' demosaics pictures of at least 4 x 4, got {tuple(raws[0].shape[-2:])}")
         methods = [self.names[number] for number in params.extras["demosaicing"].tolist()]
-        return forward.develop(raw, methods, reaching_white(params.isp), params.place)
+        return forward.develop(raws, methods, reaching_white(params.isp), params.place)
 
 
 def reaching_white(setting: ISPParams) -> ISPParams:

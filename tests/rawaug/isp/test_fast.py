@@ -221,4 +221,4 @@ def test_mosaics_are_demosaiced_by_their_own_method_and_developed(cfa: bayer.CFA
     params, forward = isp.draw_setting(3, torch.Generator().manual_seed(1)), FastForward(isp.requires_grad_(False))
     raw = 0.3 * torch.rand(3, 1, 6, 530, generator=torch.Generator().manual_seed(0))
     linear = torch.cat([bayer.demosaic(one, cfa, method) for one, method in zip(raw.split(1), methods, strict=True)])
-    torch.testing.assert_close(forward.develop(raw, methods, params), forward(linear, params), atol=1e-4, rtol=0)
+    torch.testing.assert_close(forward.develop([raw], methods, params)[0], forward(linear, params), atol=1e-4, rtol=0)
