@@ -68,7 +68,7 @@ def middle(frame: RawFrame) -> RawFrame:
 
 def by_libraw(frame: RawFrame, noisy: Tensor) -> tuple[Tensor, Tensor]:
     """Noisy and clean mosaics of the frame as LibRaw develops them, ``(3, H, W)`` in [0, 1]."""
-    black = tuple(max(level, 0.1 * frame.white) for level in frame.black)  # so that noise is not clipped at black
+    black = (0.1 * frame.white,) * 4  # so that noise is not clipped at black
     shown = []
     with tempfile.TemporaryDirectory() as folder:
         for mosaic in (noisy, frame.mosaic):
@@ -85,8 +85,9 @@ def curves(path: Path) -> dict[str, list[tuple[Tensor, Tensor]]]:
     noisy, clean = by_libraw(frame, noisy_raw)
     found = {"RAW": [(frame.mosaic[0], (noisy_raw - frame.mosaic)[0])], "LibRaw": [(clean[1], (noisy - clean)[1])]}
     for method in bayer.STENCILS:
-        settings = {"noise": LEVELS, "target": "srgb", "demosaicing": method, "exposure": (0.0, 0.0)}
-        augment = RawAugment.from_pretrained("universal", **settings)
+        augment = RawAugment.from_pretrained(
+            "universal", noise=LEVELS, target="srgb", demosaicing=method, exposure=(0.0, 0.0)
+        )
         pairs = [augment(clean, torch.Generator().manual_seed(k)) for k in range(DRAWS)]
         found[f"rawaug, {method}"] = [(pair.clean[1], (pair.noisy - pair.clean)[1]) for pair in pairs]
     return found
