@@ -42,7 +42,7 @@ PROBE, CACHE = 60, 2048
 
 def middles(args: argparse.Namespace) -> list[Pair]:
     """The middles of the validation frames."""
-    return [pair.middle(MIDDLE) for pair in open_pairs(args.validation, split="validation")]
+    return [pair.middle(MIDDLE) for pair in open_pairs(args.validation, split="validation", bin=args.bin)]
 
 
 def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[str, float]:

@@ -175,6 +175,7 @@ def main() -> None:
     parser.add_argument("--precision", default="32-true", help="of --minutes, such as bf16-mixed")
     parser.add_argument("--pictures", default="demo:", help="sRGB pictures of --minutes")
     parser.add_argument("--validation", default="demo:validation", help="frames of --minutes")
+    parser.add_argument("--bin", type=int, default=1, help="bins these K x K by colour site: clean references")
     parser.add_argument("--pmrid", help="file of PMRID's published weights, to be scored beside --minutes")
     parser.add_argument("--figure", type=Path, help="draw --minutes' PSNR over seconds a megapixel into this PNG")
     parser.add_argument("--batch", type=int, default=16)

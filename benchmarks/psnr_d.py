@@ -96,10 +96,10 @@ def sources(
         yield f"real RAW, {name}", RealCrops(pairs, noise, crop, CFA.RGGB)
 
 
-def filtered(specs: Sequence[str]) -> DownstreamScore:
+def filtered(specs: Sequence[str], factor: int) -> DownstreamScore:
     """The row that needs no training."""
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
-    frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test")]
+    frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test", bin=factor)]
     scores = [s for s, *_ in score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, "")]
     return mean_of(scores)
 
@@ -117,6 +117,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", nargs="+", required=True)
     parser.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
+    parser.add_argument("--bin", type=int, default=1, help="bins the tests K x K by colour site: clean references")
     parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
     parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
     parser.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
@@ -127,6 +128,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     config, noise = settings(options.recipe, options.steps)
+    config = replace(config, bin=options.bin)
     crop = config.train.crop
     folders = [open_pictures(folder, min_side=crop) for folder in options.pictures]
     pictures = [even_sided(folder[k]) for folder in folders for k in range(len(folder))]
@@ -144,7 +146,7 @@ def main() -> None:
                 test: list(score_on(net, replace(config, test=specs), CFA.RGGB)) for test, specs in tests.items()
             }
             write_json(rows, known)
-    rows["NonLocalMeans"] = {"": {test: list(filtered(specs)) for test, specs in tests.items()}}
+    rows["NonLocalMeans"] = {"": {test: list(filtered(specs, options.bin)) for test, specs in tests.items()}}
     heads = [f"{test}, {domain}" for test in tests for domain in ("RAW", "sRGB")]
     cells = [
         [row, *(mean_and_spread([s[test][k] for s in scores.values()], 2) for test in tests for k in (0, 1))]

@@ -89,6 +89,7 @@ def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filte
     args = argparse.Namespace(
         pictures="demo:",
         validation="demo:validation",
+        bin=1,
         batch=2,
         crop=32,
         minutes=0.0,

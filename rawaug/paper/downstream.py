@@ -49,6 +49,7 @@ class DownstreamConfig:
         test: RAW frames of unseen cameras; folders, or ``kind:path``.
         test_crop: side of the central crop scored of each test frame; null for the whole frame.
         test_count: number of frames of each of ``test``; null for all.
+        bin: K bins them K x K by colour site: clean references of real photographs.
         exposure: lowest and highest exposure in stops at which the RAW of a fitted ISP is drawn, for the test cameras'
             headroom is not known; ISPs of published cameras and UPI's published distributions have their own.
         noise: preset, in training and on the test frames.
@@ -60,6 +61,7 @@ class DownstreamConfig:
     test: list[str] = field(default_factory=lambda: ["demo:test"])
     test_crop: int | None = 1024
     test_count: int | None = None
+    bin: int = 1
     exposure: tuple[float, float] | None = (-1.5, 0.0)
     noise: str = "cycleisp_sidd"
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
@@ -105,7 +107,7 @@ def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) 
 
 def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamScore:
     """Mean scores on the test frames; their noise is frozen with seed 0."""
-    opened = ((open_pairs(spec, split="test"), spec) for spec in config.test)
+    opened = ((open_pairs(spec, split="test", bin=config.bin), spec) for spec in config.test)
     chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
     pairs = (pair for frames, spec in chosen for pair in skip_broken(frames, spec))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
