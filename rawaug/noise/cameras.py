@@ -328,7 +328,7 @@ def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
             listed = ", ".join(short)
             raise ValueError(
                 f"noise {spec!r} is unknown: {unknown}; use one of {listed}, {ANY_CAMERA!r}, maker and model of a "
-                f"camera, or (shot_var, read_var){nearest(spec, short)}"
+                f"camera, or (shot_var, read_var){nearest(spec, short)}; one of your own: rawaug --import FILE.py"
             ) from None
     return ProfileLevels(spec, iso)
 
