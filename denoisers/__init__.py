@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from denoisers.cycleisp import CycleISPDenoiser
     from denoisers.files import build, from_pretrained, load, save
     from denoisers.inference import SelfEnsemble, tiled
+    from denoisers.joint import JointDRUNet
     from denoisers.network import Denoiser
     from denoisers.networks import DHDN, DnCNN, DRUNet, NAFNet, UNet
     from denoisers.pmrid import PMRID
@@ -24,6 +25,7 @@ _MODULES = {
     "denoisers.cycleisp": "CycleISPDenoiser",
     "denoisers.files": "build from_pretrained load save",
     "denoisers.inference": "SelfEnsemble tiled",
+    "denoisers.joint": "JointDRUNet",
     "denoisers.network": "Denoiser",
     "denoisers.networks": "DHDN DRUNet DnCNN NAFNet UNet",
     "denoisers.pmrid": "PMRID",
@@ -40,6 +42,7 @@ __all__ = [
     "DRUNet",
     "Denoiser",
     "DnCNN",
+    "JointDRUNet",
     "NAFNet",
     "NonLocalMeans",
     "SelfEnsemble",

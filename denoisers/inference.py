@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.domains import levels_of
+from denoisers.network import PACKED
 from rawaug import bayer
 
 
@@ -44,7 +45,8 @@ def tiled(
     size; at most ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
 
     Args:
-        model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles.
+        model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles, and its
+            ``upscale`` says how much larger the result's sides are.
         noisy: ``(B, 4, h, w)``.
         variance: the noise variance of each value, shape of ``noisy``.
         tile: side of a piece in packed pixels, overlap included.
@@ -60,21 +62,25 @@ def tiled(
         >>> tiled(DnCNN(width=8, depth=4, variance_map=False), torch.rand(1, 4, 300, 90), tile=64, overlap=8).shape
         torch.Size([1, 4, 300, 90])
     """
-    stride: int = getattr(model, "stride", 1)
+    stride, scale = (getattr(model, name, 1) for name in ("stride", "upscale"))
     if not 0 <= 2 * overlap < tile:
         raise ValueError(f"overlap must be at least 0 and less than half the tile {tile}, got {overlap}")
     if tile % stride or overlap % stride:
         raise ValueError(f"tile {tile} and overlap {overlap} must be multiples of the model's stride {stride}")
     if tile < 2 * stride:
         raise ValueError(f"tile must be at least {2 * stride}, twice the model's stride, got {tile}")
-    denoised = torch.empty_like(noisy)
+    denoised: Tensor | None = None
     # In reading order: what a tile has too little context for, at its right and lower end, the next tile overwrites.
     (tops, height), (lefts, width) = (_pieces(side, tile, overlap, stride) for side in noisy.shape[-2:])
     for top, left in each([(top, left) for top in tops for left in lefts]):
         window = (..., slice(top, top + height), slice(left, left + width))
         piece = model(noisy[window], None if variance is None else variance[window])
-        above, before = (overlap if start else 0 for start in (top, left))
-        denoised[..., top + above : top + height, left + before : left + width] = piece[..., above:, before:]
+        if denoised is None:
+            denoised = piece.new_empty(*piece.shape[:2], *(scale * side for side in noisy.shape[-2:]))
+        above, before = (scale * overlap if start else 0 for start in (top, left))
+        core, row, column = piece[..., above:, before:], scale * top + above, scale * left + before
+        denoised[..., row : row + core.shape[-2], column : column + core.shape[-1]] = core
+    assert denoised is not None
     return denoised
 
 
@@ -88,10 +94,12 @@ def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
     return bayer.pack(F.pad(turned, (columns, columns, rows, rows), mode="reflect"), cfa)
 
 
-def from_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
-    """The inverse of :func:`to_view`."""
-    turned = bayer.aligned(bayer.unpack(packed, cfa), cfa, cfa.turned(view))
-    return bayer.pack(bayer.turn_back(turned, view), cfa)
+def from_view(image: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
+    """The inverse of :func:`to_view`, of packed RAW or of full colour ``(B, 3, 2h, 2w)``."""
+    packed = image.shape[1] == PACKED
+    turned = bayer.aligned(bayer.unpack(image, cfa) if packed else image, cfa, cfa.turned(view))
+    upright = bayer.turn_back(turned, view)
+    return bayer.pack(upright, cfa) if packed else upright
 
 
 class SelfEnsemble(nn.Module):
@@ -143,7 +151,7 @@ class SelfEnsemble(nn.Module):
         turned = {view: to_view(noisy, self.cfa, view) for view in range(self.views)}
         for view, picture in turned.items():
             alike[picture.shape].append(view)
-        mean = torch.zeros_like(noisy)
+        mean = noisy.new_zeros(())
         count = 0
         for views in self.each(list(alike.values())):
             batch = torch.cat([turned.pop(view) for view in views])

@@ -128,6 +128,8 @@ class Denoiser(nn.Module, ABC):
 
     tiny: ClassVar[dict[str, Any]] = {}
     """Settings of a network of a few thousand weights, for the smoke form of a recipe."""
+    upscale: ClassVar[int] = 1
+    """Sides of the result over those of packed RAW: 2 where it is demosaiced, ``(B, 3, 2h, 2w)``."""
 
     def __init__(
         self,
@@ -168,10 +170,14 @@ class Denoiser(nn.Module, ABC):
 
     @abstractmethod
     def residual(self, features: Tensor) -> Tensor:
-        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction ``(B, channels, h, w)``."""
+        """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction, of the result's shape."""
+
+    def uncorrected(self, packed: Tensor) -> Tensor:
+        """What the correction is added to: the input itself, or what it is in the result's shape."""
+        return packed
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise ``(B, channels, h, w)``; the result has the same shape and is not clipped.
+        """Denoise ``(B, channels, h, w)``; the result has the same shape, or :attr:`upscale`'s, and is not clipped.
 
         Args:
             noisy: packed RAW.
@@ -187,7 +193,7 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
         self._require_type(noisy, "noisy")
         if not self.reads_variance:
-            return noisy + self._correction(noisy)
+            return self.uncorrected(noisy) + self._correction(noisy)
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
             raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
@@ -195,7 +201,8 @@ class Denoiser(nn.Module, ABC):
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
         self._require_type(variance, "variance")
         if self.domain == "linear":
-            return noisy + self._correction(noisy, variance.sqrt() if self.deviation else variance)
+            correction = self._correction(noisy, variance.sqrt() if self.deviation else variance)
+            return self.uncorrected(noisy) + correction
         domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
         signal = mended(signal) if self.mend else signal
@@ -205,13 +212,15 @@ class Denoiser(nn.Module, ABC):
             maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
         correction = self._correction(signal, *maps)
         correction = maps[0] * correction if self.variance_map else correction
-        denoised = domain.inverse(signal + correction, *levels)
-        return torch.where(variance > 0, denoised, noisy).to(noisy.dtype)
+        denoised = domain.inverse(self.uncorrected(signal) + correction, *levels)
+        denoised = denoised if self.upscale > 1 else torch.where(variance > 0, denoised, noisy)
+        return denoised.to(noisy.dtype)
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
         features = torch.cat([signal, *maps], dim=1) if maps else signal
         correction = self.residual(pad_to_multiple(features.to(self._dtype), self.stride))
-        return correction[..., : signal.shape[-2], : signal.shape[-1]]
+        height, width = (self.upscale * side for side in signal.shape[-2:])
+        return correction[..., :height, :width]
 
     @property
     def _dtype(self) -> torch.dtype:

@@ -396,6 +396,10 @@ class DRUNet(Denoiser):
         self.initialise(seed, self.tail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
+        return self.tail(self.body(features))
+
+    def body(self, features: Tensor) -> Tensor:
+        """All layers but the last: ``(B, width, h, w)``."""
         signal, maps = features[:, : self.channels], features[:, self.channels :]
         mean = F.avg_pool2d(signal, self.cell)
         x, skips = self.head(torch.cat([_without(signal, mean), maps], dim=1)), []
@@ -407,8 +411,7 @@ class DRUNet(Denoiser):
             skips.append(x)
         for up, blocks, skip in zip(self.ups, self.decoder, reversed(skips[:-1]), strict=True):
             x = blocks(F.pixel_shuffle(up(x), 2) + skip)
-        correction: Tensor = self.tail(x)
-        return correction
+        return x
 
 
 def _without(signal: Tensor, mean: Tensor) -> Tensor:

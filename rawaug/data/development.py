@@ -65,7 +65,13 @@ def developed(
         >>> developed(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS
         0.735...
     """
-    rgb = bayer.demosaic(raw[None], cfa, demosaicing)[0]
+    return rendered(bayer.demosaic(raw[None], cfa, demosaicing)[0], gains, matrix, exposure, least)
+
+
+def rendered(
+    rgb: Tensor, gains: Sequence[float], matrix: Tensor, exposure: float = 1.0, least: float | None = 0.0
+) -> Tensor:
+    """Linear camera RGB ``(3, H, W)`` as a picture; arguments as in :func:`developed`."""
     balanced = (rgb * exposure * torch.tensor(gains).reshape(3, 1, 1)).clamp(least, 1)
     return encode_srgb(torch.einsum("ij,jhw->ihw", matrix, balanced).clamp(0, 1))
 

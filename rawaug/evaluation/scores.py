@@ -34,6 +34,8 @@ from rawaug.seeding import keyed_generator
 Run = Callable[..., Tensor]
 """``run(noisy, variance) -> denoised``, packed RAW."""
 SHOWN_FAULTS = 5
+RGB = 3
+"""Channels of full colour."""
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -84,6 +86,8 @@ def denoise(
 ) -> Tensor:
     """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, averaged over ``views`` of it.
 
+    A network that demosaics gives linear RGB ``(1, 3, 2h, 2w)``.
+
     Args:
         cfa: of the sample's mosaic.
         views: 1, or 4 or 8 of a self-ensemble.
@@ -92,23 +96,25 @@ def denoise(
         at_test: what the estimator of the training puts around the network.
 
     Returns:
-        The same shape, on the CPU.
+        The denoised RAW or RGB, on the CPU.
     """
     if own is not None and own != cfa:
         rows, columns = cfa.shift_to(own)
         mosaics = (F.pad(bayer.unpack(x, cfa), (columns, columns, rows, rows), mode="reflect") for x in sample)
         shifted = Sample(*(bayer.pack(mosaic, own) for mosaic in mosaics))
-        mosaic = bayer.unpack(denoise(model, shifted, own, views, at_test=at_test), own)
-        height, width = mosaic.shape[-2:]
-        return bayer.pack(mosaic[..., rows : height - rows, columns : width - columns], cfa)
+        denoised = denoise(model, shifted, own, views, at_test=at_test)
+        full_colour = denoised.shape[1] == RGB
+        image = denoised if full_colour else bayer.unpack(denoised, own)
+        image = image[..., rows : image.shape[-2] - rows, columns : image.shape[-1] - columns]
+        return image if full_colour else bayer.pack(image, cfa)
     run: Run = partial(denoisers.tiled, model, each=counted("tile"))
     if at_test is not None:
         run = at_test(run)
     if views > 1:
         run = denoisers.SelfEnsemble(run, cfa, views=views, each=counted("view group"))
     device = next(model.parameters(), sample.noisy).device
-    denoised: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
-    return denoised.cpu()
+    result: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
+    return result.cpu()
 
 
 def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:

@@ -46,21 +46,21 @@ def start_of(config: DenoiserConfig) -> Start | None:
 
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
-    """The network before its first step, in train mode."""
+    """The network before its first step, in train mode; layers that it has beyond those of its start are drawn."""
+    drawn = {"seed": derived_seed(seed, "network") % 2**31, **config.settings}
     if config.start is None:
-        drawn = {"seed": derived_seed(seed, "network") % 2**31, **config.settings}
         return denoisers.build(config.name, **drawn)
     model, _ = denoisers.load(find(config.start))
-    unnamed = DenoiserConfig(start=config.start)
-    if config != unnamed:
-        with torch.device("meta"):
-            wanted = denoisers.build(config.name, **config.settings)
-        if (type(wanted), wanted.config) != (type(model), model.config):
-            raise ValueError(
-                f"denoiser.start: {config.start} is a {type(model).__name__} with {model.config}, not a "
-                f"{config.name} with {wanted.config}; leave denoiser.name and denoiser.settings out to take the file's"
-            )
-    return model.train()
+    if config == DenoiserConfig(start=config.start):
+        return model.train()
+    wanted = denoisers.build(config.name, **drawn)
+    if not isinstance(wanted, type(model)) or {**model.config, **wanted.config} != {**wanted.config, **model.config}:
+        raise ValueError(
+            f"denoiser.start: {config.start} is a {type(model).__name__} with {model.config}, not a "
+            f"{config.name} with {wanted.config}; leave denoiser.name and denoiser.settings out to take the file's"
+        )
+    wanted.load_state_dict(model.state_dict(), strict=type(wanted) is type(model))
+    return wanted.train()
 
 
 class TrainingState:

@@ -1,0 +1,101 @@
+r"""Demosaicing and denoising at once: ``rgb = D(noisy) + residual``, of twice the sides of packed RAW.
+
+Domain: packed RAW ``(B, 4, h, w)``, R, Gr, Gb, B of an RGGB mosaic, to linear camera RGB ``(B, 3, 2h, 2w)``. D is Malvar,
+He and Cutler's linear interpolation (ICASSP 2004), of the transformed signal, whose noise is white. One stencil for
+each colour and each site of a cell makes it a convolution of stride 2. Idea of one network for both: Gharbi et al.,
+"Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
+"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.network import PACKED, conv, require_bounded
+from denoisers.networks import DRUNet, ResidualBlock
+from rawaug.bayer import CFA, demosaicing
+from rawaug.registry import DENOISERS
+
+RGB = 3
+REACH = 2
+"""Pixels that D looks at beyond its own."""
+
+
+def interpolated(packed: Tensor) -> Tensor:
+    """D of packed RAW: ``(B, 4, h, w)`` to ``(B, 3, 2h, 2w)``, as :func:`rawaug.bayer.demosaic` gives it."""
+    device = packed.device.type
+    # in bfloat16 the signal would lose the digits that hold its noise
+    full = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+    with full:
+        mosaic = F.pixel_shuffle(packed.float() if packed.dtype == torch.bfloat16 else packed, 2)
+        padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites: the pattern stays
+        return F.pixel_shuffle(F.conv2d(padded, _stencils().to(mosaic), stride=2), 2)
+
+
+@lru_cache
+def _stencils() -> Tensor:
+    """``(12, 1, 6, 6)``: of each colour and site, what Malvar's interpolation takes of the cell and its neighbours."""
+    found, kinds = demosaicing(CFA.RGGB, "malvar")
+    own = torch.zeros(1, *found.shape[1:])
+    own[0, REACH, REACH] = 1.0
+    found = torch.cat([own, found])
+    stencils = torch.zeros(RGB, 2, 2, 2 * REACH + 2, 2 * REACH + 2)
+    for colour, rows in enumerate(kinds):
+        for i, row in enumerate(rows):
+            for j, kind in enumerate(row):
+                stencils[colour, i, j, i : i + 2 * REACH + 1, j : j + 2 * REACH + 1] = found[kind]
+    return stencils.flatten(0, 2)[:, None]
+
+
+@DENOISERS.register("JointDRUNet")
+class JointDRUNet(DRUNet):
+    """:class:`denoisers.DRUNet` with a head for full colour: ``D(noisy + tail(x)) + detail(x)``.
+
+    Its features x give a correction of packed RAW, as in DRUNet, which D makes full colour, and what D cannot know, as
+    twelve planes that a pixel shuffle puts in place. The last layer of either starts at zero: an untrained network is D,
+    and one that starts from a DRUNet's weights is that network followed by D.
+
+    Args:
+        width, scales, blocks, limits, mend, domain, seed: see :class:`denoisers.DRUNet`.
+        refine: residual blocks before the twelve planes, at most 1000.
+
+    Example:
+        >>> noisy = torch.rand(2, 4, 33, 50)
+        >>> JointDRUNet(width=4)(noisy, torch.full_like(noisy, 1e-4)).shape
+        torch.Size([2, 3, 66, 100])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2, "refine": 1}
+    upscale: ClassVar[int] = 2
+
+    def __init__(
+        self,
+        width: int = 32,
+        scales: int = 4,
+        blocks: int = 1,
+        limits: bool = True,
+        mend: bool = True,
+        refine: int = 1,
+        domain: str = "anscombe",
+        seed: int = 0,
+    ) -> None:
+        require_bounded(seed, refine=refine)
+        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed)
+        own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
+        self.config = {**own, "refine": refine, "domain": domain}
+        self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
+        self.detail = conv(width, RGB * PACKED, bias=False)
+        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+        self.initialise(seed, self.tail, self.detail, *ends, gain=1.0)
+
+    def residual(self, features: Tensor) -> Tensor:
+        x = self.body(features)
+        return interpolated(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
+
+    def uncorrected(self, packed: Tensor) -> Tensor:
+        return interpolated(packed)
