@@ -26,6 +26,8 @@ FOLDER = Path(__file__).parent / "weights"
 """Of the shipped weights and their cards."""
 DEFAULT = "rawaug-small"
 """What denoises where no denoiser is named."""
+JOINT = "rawaug-joint"
+"""What demosaics and denoises where no network is named."""
 
 
 def build(name: str, **config: Any) -> Denoiser:
@@ -106,6 +108,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
             model = build(metadata.get("model", ""), **config)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes
     expected = model.state_dict()
     for key in sorted(expected.keys() | tensors.keys()):
         if key not in tensors or key not in expected:

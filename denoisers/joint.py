@@ -9,7 +9,6 @@ each colour and each site of a cell makes it a convolution of stride 2. Idea of 
 from __future__ import annotations
 
 from contextlib import nullcontext
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import torch
@@ -26,29 +25,18 @@ REACH = 2
 """Pixels that D looks at beyond its own."""
 
 
-def interpolated(packed: Tensor) -> Tensor:
-    """D of packed RAW: ``(B, 4, h, w)`` to ``(B, 3, 2h, 2w)``, as :func:`rawaug.bayer.demosaic` gives it."""
-    device = packed.device.type
-    # in bfloat16 the signal would lose the digits that hold its noise
-    full = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
-    with full:
-        mosaic = F.pixel_shuffle(packed.float() if packed.dtype == torch.bfloat16 else packed, 2)
-        padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites: the pattern stays
-        return F.pixel_shuffle(F.conv2d(padded, _stencils().to(mosaic), stride=2), 2)
-
-
-@lru_cache
 def _stencils() -> Tensor:
-    """``(12, 1, 6, 6)``: of each colour and site, what Malvar's interpolation takes of the cell and its neighbours."""
+    """``(12, 1, 6, 6)``: of each colour and site of a cell, what D takes of the cell and its neighbours."""
     found, kinds = demosaicing(CFA.RGGB, "malvar")
-    own = torch.zeros(1, *found.shape[1:])
+    side = 2 * REACH + 1
+    own = torch.zeros(1, side, side, device="cpu")
     own[0, REACH, REACH] = 1.0
     found = torch.cat([own, found])
-    stencils = torch.zeros(RGB, 2, 2, 2 * REACH + 2, 2 * REACH + 2)
+    stencils = torch.zeros(RGB, 2, 2, side + 1, side + 1, device="cpu")
     for colour, rows in enumerate(kinds):
         for i, row in enumerate(rows):
             for j, kind in enumerate(row):
-                stencils[colour, i, j, i : i + 2 * REACH + 1, j : j + 2 * REACH + 1] = found[kind]
+                stencils[colour, i, j, i : i + side, j : j + side] = found[kind]
     return stencils.flatten(0, 2)[:, None]
 
 
@@ -90,12 +78,21 @@ class JointDRUNet(DRUNet):
         self.config = {**own, "refine": refine, "domain": domain}
         self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
         self.detail = conv(width, RGB * PACKED, bias=False)
+        self.register_buffer("stencils", _stencils(), persistent=False)
         ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
         self.initialise(seed, self.tail, self.detail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
         x = self.body(features)
-        return interpolated(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
+        return self.uncorrected(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
 
     def uncorrected(self, packed: Tensor) -> Tensor:
-        return interpolated(packed)
+        """D of packed RAW, as :func:`rawaug.bayer.demosaic` gives it."""
+        device = packed.device.type
+        # in bfloat16 the signal would lose the digits that hold its noise
+        full = torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+        with full:
+            stencils = self.get_buffer("stencils")
+            mosaic = F.pixel_shuffle(packed.to(stencils), 2)
+            padded = F.pad(mosaic, (REACH,) * 4, mode="reflect")  # about the border sites: the pattern stays
+            return F.pixel_shuffle(F.conv2d(padded, stencils, stride=2), 2)

@@ -40,6 +40,7 @@ def test_the_recipes_are_all_there() -> None:
     assert {"fewshot", "unsupervised", "synthetic", "sidd/full", "sidd/fewshot", "sidd/unsupervised"} <= set(NAMES)
     assert {name: kind for name, kind in ALL.items() if kind != "training"} == {
         "ablation": "ablation",
+        "demosaic": "demosaic",
         "denoisers": "denoisers",
         "learned": "learned",
         "reconstruction": "reconstruction",

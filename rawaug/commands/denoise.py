@@ -4,9 +4,10 @@ r"""``rawaug denoise``: RAW files to denoised DNGs.
 
 on the mosaic as the sensor gave it, before any gain map, in tiles. The result has the source's levels, colour, lens
 corrections, orientation and EXIF and differs from it by noise alone; its NoiseProfile tag is gone with the noise, so
-that a RAW developer does not smooth once more. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the
-noise's variance is left, and NoiseProfile says so. A mosaic of another pattern than the network's is continued by a
-mirrored line on the sides where the patterns differ, and cropped after.
+that a RAW developer does not smooth once more. With ``--linear`` the network demosaics as well, and the result is camera
+RGB in a linear DNG. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the noise's variance is left, and
+NoiseProfile says so. A mosaic of another pattern than the network's is continued by a mirrored line on the sides where
+the patterns differ, and cropped after.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Annotated
 
 from torch import Tensor
 
-from denoisers.files import DEFAULT
+from denoisers.files import DEFAULT, JOINT
 from rawaug import bayer
 from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import (
@@ -60,6 +61,7 @@ def run(
     classical: Annotated[Spec | None, YAML] = None,
     noise: Annotated[tuple[float, float] | str, YAML] = "auto",
     strength: float = 1.0,
+    linear: bool = False,
     self_ensemble: bool = False,
     device: str = "auto",
     preview: str | None = None,
@@ -78,6 +80,7 @@ def run(
             that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or
             [shot_var, read_var].
         strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
+        linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
@@ -87,8 +90,8 @@ def run(
         ValueError: if a file of a folder could not be denoised, after all others; if a folder's output is named as a
             file, or a preview is asked of it.
     """
-    method = frame_denoiser(denoiser, classical, self_ensemble, device)
-    law = stored_noise(noise, DEFAULT if denoiser is None else denoiser)
+    method = frame_denoiser(denoiser, classical, self_ensemble, device, linear)
+    law = stored_noise(noise, denoiser or (JOINT if linear else DEFAULT))
     if not Path(source).is_dir():
         done = denoise_file(source, out, method, law, strength=strength, preview=preview, overwrite=overwrite)
         print_denoised(DenoisedFolder([done]))
@@ -168,7 +171,12 @@ def denoise_file(
         require_writable(path)
     if preview is not None and Path(preview).suffix.lower() not in (".jpg", ".jpeg", ".png"):
         raise ValueError(f"{preview}: the preview is a .jpg or .png")
-    done = _denoise_file(source, out, _made(method), noise, _checked(strength))
+    method = _made(method)
+    if preview is not None and method.linear:
+        raise ValueError(
+            f"--preview {preview}: shows mosaics that LibRaw demosaics; open a linear DNG in a RAW developer"
+        )
+    done = _denoise_file(source, out, method, noise, _checked(strength, method))
     if preview is not None:
         frame = read_raw(out)
         Path(preview).parent.mkdir(parents=True, exist_ok=True)
@@ -180,7 +188,9 @@ def _made(method: FrameDenoiser | str | Path) -> FrameDenoiser:
     return NetworkDenoiser(method) if isinstance(method, (str, Path)) else method
 
 
-def _checked(strength: float) -> float:
+def _checked(strength: float, method: FrameDenoiser) -> float:
+    if method.linear and strength != 1.0:
+        raise ValueError(f"--strength {strength}: of a linear DNG it is 1; there is no noisy full colour to mix in")
     if not 0.0 <= strength <= 1.0:
         raise ValueError(f"strength must be between 0 and 1, got {strength}; --noise takes higher levels")
     return strength
@@ -197,12 +207,17 @@ def _denoise_file(
     start = time.perf_counter()
     frame = read(source)
     shot_var, read_var, noise_source = levels_of(frame, noise) if method.reads_levels else (*_NO_NOISE, "not needed")
-    mosaic = frame.mosaic.lerp(method(frame, (shot_var, read_var)), strength)
+    image = method(frame, (shot_var, read_var))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if method.linear:
+        below = (image < -max(frame.black) / (frame.white - max(frame.black))).float().mean().item()
+        write_dng(out, frame, source, rgb=image)
+        return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
+    mosaic = frame.mosaic.lerp(image, strength)
     below = _clip_below_zero(mosaic, frame)
     known = (shot_var, read_var) if method.reads_levels else frame.noise_profile
     rest = (1 - strength) ** 2
     left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
     seconds = time.perf_counter() - start
     return Denoised(source, out, shot_var, read_var, noise_source, below, seconds, frame.camera, frame.iso)
@@ -245,7 +260,8 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
     require_writable(out, folder=True)
-    made, strength = _made(method), _checked(strength)
+    made = _made(method)
+    strength = _checked(strength, made)
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import Stabilised
-from denoisers.files import DEFAULT, find
+from denoisers.files import DEFAULT, JOINT, find
 from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -197,11 +197,15 @@ class FrameDenoiser(Protocol):
         """Whether the levels are used."""
 
     @property
+    def linear(self) -> bool:
+        """Whether the result is full colour."""
+
+    @property
     def settings(self) -> dict[str, Any]:
         """What the result depends on besides the frame and its levels, as JSON."""
 
     def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
-        """float32 ``(1, H, W)`` on the CPU, at most 1, not clipped at black."""
+        """float32 ``(1, H, W)``, of full colour ``(3, H, W)``, on the CPU, at most 1, not clipped at black."""
 
 
 class NetworkDenoiser:
@@ -219,6 +223,11 @@ class NetworkDenoiser:
         """Whether the network has a noise map or a variance-stabilising transform."""
         return self.model.reads_variance
 
+    @property
+    def linear(self) -> bool:
+        """Whether the network demosaics, too."""
+        return self.model.upscale > 1
+
     def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
         """See :class:`FrameDenoiser`."""
         return denoise_mosaic(self.model, self.cfa, frame, levels, self.self_ensemble)
@@ -227,21 +236,21 @@ class NetworkDenoiser:
 def denoise_mosaic(
     model: Denoiser, cfa: CFA, frame: Frame, levels: tuple[float, float], self_ensemble: bool = False
 ) -> Tensor:
-    """The frame's mosaic denoised by a network trained on mosaics of ``cfa``; see :class:`FrameDenoiser`."""
+    """The frame's mosaic, or full colour, by a network trained on mosaics of ``cfa``; see :class:`FrameDenoiser`."""
     height, width = frame.mosaic.shape[-2:]
     rows, columns = frame.cfa.shift_to(cfa)
     packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
     shot_var, read_var = levels
     variance = bayer.noise_variance(packed, shot_var, read_var)
     denoised = denoise(model, Sample(packed, packed, variance), cfa, 8 if self_ensemble else 1)
-    mosaic = bayer.unpack(denoised, cfa)[0]
-    return mosaic[..., rows : rows + height, columns : columns + width].clamp(max=1.0)
+    image = denoised[0] if model.upscale > 1 else bayer.unpack(denoised, cfa)[0]
+    return image[..., rows : rows + height, columns : columns + width].clamp(max=1.0)
 
 
 class ClassicalDenoiser:
     """A classical filter of :data:`rawaug.registry.FILTERS`, which needs no training."""
 
-    reads_levels = True
+    reads_levels, linear = True, False
 
     def __init__(self, spec: Spec) -> None:
         require_classical([spec])
@@ -260,11 +269,23 @@ class ClassicalDenoiser:
 
 
 def frame_denoiser(
-    denoiser: str | Path | None = None, classical: Spec | None = None, self_ensemble: bool = False, device: str = "auto"
+    denoiser: str | Path | None = None,
+    classical: Spec | None = None,
+    self_ensemble: bool = False,
+    device: str = "auto",
+    linear: bool = False,
 ) -> FrameDenoiser:
     """What denoises: the network, the classical filter, or the network that is taken where neither is named."""
     if classical is None:
-        return NetworkDenoiser(DEFAULT if denoiser is None else denoiser, self_ensemble, device)
-    if denoiser is not None or self_ensemble:
-        raise ValueError("classical: a filter takes neither --denoiser nor --self-ensemble; give one or the other")
+        name = denoiser or (JOINT if linear else DEFAULT)
+        network = NetworkDenoiser(name, self_ensemble, device)
+        if network.linear != linear:
+            raise ValueError(
+                f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}"
+                if linear
+                else f"--denoiser {name}: demosaics too, to a linear DNG; add --linear"
+            )
+        return network
+    if denoiser is not None or self_ensemble or linear:
+        raise ValueError("classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other")
     return ClassicalDenoiser(classical)

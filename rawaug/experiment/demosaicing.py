@@ -72,7 +72,9 @@ class JointRecipe(Recipe):
                 known = ", ".join((*bayer.STENCILS, *LIBRAW))
                 raise ValueError(f"demosaicing {name!r} is unknown; use one of {known}")
         if self.classical or self.untouched:
-            raise ValueError("classical and untouched: denoisers that are followed by a demosaicing are named in rivals")
+            raise ValueError(
+                "classical and untouched: denoisers that are followed by a demosaicing are named in rivals"
+            )
 
 
 @EXPERIMENTS.register("demosaic")
@@ -121,7 +123,9 @@ def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
         with rawpy.imread(str(path)) as raw:
             balance = [*gains.flatten().tolist(), gains[1].item()]
             algorithm = rawpy.DemosaicAlgorithm[method]
-            rgb = raw.postprocess(demosaic_algorithm=algorithm, user_wb=balance, adjust_maximum_thr=0, user_flip=0, **linear)
+            rgb = raw.postprocess(
+                demosaic_algorithm=algorithm, user_wb=balance, adjust_maximum_thr=0, user_flip=0, **linear
+            )
     return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None]
 
 

@@ -1,4 +1,4 @@
-r"""Bayer mosaics out, as DNG: ``d = round(y (white - black) + black)``, 16 bits a site.
+r"""Bayer mosaics and linear RGB out, as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
 
 ``AsShotNeutral`` is the colour of grey to the camera, ``1 / white_balance``. ``ColorMatrix1`` takes XYZ to the camera
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
@@ -26,14 +26,24 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rawaug import __version__
 from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.files import replacing
-from rawaug.io.gain_map import opcode_list
+from rawaug.io.gain_map import of_planes, opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
-from rawaug.io.tiff import ACTIVE_AREA, CFA_PHOTOMETRIC, DNG_VERSION, all_pages, main_mosaic, opened_tiff, tag_damage
+from rawaug.io.tiff import (
+    ACTIVE_AREA,
+    CFA_PHOTOMETRIC,
+    DNG_VERSION,
+    LINEAR_PHOTOMETRIC,
+    all_pages,
+    main_mosaic,
+    opened_tiff,
+    tag_damage,
+)
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
@@ -46,7 +56,11 @@ _EXIF_ORIENTATIONS = {0: 1, 1: 2, 3: 3, 2: 4, 4: 5, 6: 6, 7: 7, 5: 8}
 
 
 def write_dng(
-    path: str | Path, frame: RawFrame, source: str | Path | None = None, baseline_exposure: float = 0.0
+    path: str | Path,
+    frame: RawFrame,
+    source: str | Path | None = None,
+    baseline_exposure: float = 0.0,
+    rgb: Tensor | None = None,
 ) -> None:
     """Write a frame as a DNG, whole or not at all; the inverse of :func:`rawaug.io.read_raw`.
 
@@ -57,6 +71,7 @@ def write_dng(
         source: the RAW file that the frame was read from: its other metadata (a DNG's profiles, opcodes and crop;
             EXIF, GPS and XMP of any TIFF) is kept.
         baseline_exposure: stops by which a RAW developer should brighten; a DNG source's own value takes precedence.
+        rgb: linear camera RGB ``(3, H, W)`` to write in place of the mosaic, as a linear DNG.
 
     Raises:
         ValueError: if a digital number or a level does not fit 16 bits, the mosaic's sides are not even, or a gain,
@@ -70,14 +85,18 @@ def write_dng(
     """
     path = Path(path)
     _require_colour(frame, path)
-    numbers = digital_numbers(frame, path)
+    numbers = digital_numbers(frame, path) if rgb is None else linear_numbers(frame, rgb, path)
     size = numbers.shape[0], numbers.shape[1]
     carried = read_carried_tags(Path(source), size) if source is not None else CarriedTags("<", {}, {})
     # write an Exif directory if the source has none
     directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
     directories = {name: entries for name, entries in directories.items() if entries}
     own = _camera(frame) if DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
-    tags = own | carried.tags | _tags_of_the_pixels(frame)
+    tags = own | carried.tags | _tags_of_any_pixels(frame)
+    if rgb is None:
+        tags |= _tags_of_the_mosaic(frame)
+    else:
+        tags = {code: tag for code, tag in tags.items() if code not in _OF_MOSAICS} | _tags_of_full_colour(frame)
     pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
@@ -91,8 +110,9 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
         import imagecodecs
         import tifffile
 
-    height, width = numbers.shape
-    columns = numbers.reshape(height, width // 2, 2)  # even and odd ones are components: their colours differ
+    height, width, *colours = numbers.shape
+    # even and odd columns of a mosaic are components: their colours differ
+    columns = np.ascontiguousarray(numbers) if colours else numbers.reshape(height, width // 2, 2)
     software = f"rawaug {__version__}"
     tifffile.imwrite(
         path,
@@ -103,7 +123,8 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
         compression="jpeg",
         rowsperstrip=height,
         byteorder="<" if byte_order == "<" else ">",
-        photometric=CFA_PHOTOMETRIC,
+        planarconfig="contig" if colours else None,
+        photometric=LINEAR_PHOTOMETRIC if colours else CFA_PHOTOMETRIC,
         extratags=tags,
         software=software,
         metadata=None,
@@ -140,6 +161,26 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     return numbers
 
 
+def finer(frame: RawFrame) -> int:
+    """The power of two that a linear DNG's levels are those of its source times: means have finer steps than sites."""
+    return 2 ** int(math.log2(_BEYOND_16_BITS / frame.white))
+
+
+def _black_of_colours(frame: RawFrame) -> tuple[float, ...]:
+    red, *greens, blue = (level * finer(frame) for level in frame.black)
+    return red, sum(greens) / 2, blue
+
+
+def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
+    """Linear RGB as uint16 ``(H, W, 3)``; clipped where 16 bits, or the white level, end."""
+    size = frame.mosaic.shape[-2:]
+    if rgb.shape != (3, *size):
+        raise ValueError(f"{path}: full colour of this frame is (3, {size[0]}, {size[1]}), got {tuple(rgb.shape)}")
+    black, white = torch.tensor(_black_of_colours(frame)), frame.white * finer(frame)
+    numbers = rgb.permute(1, 2, 0) * (white - black) + black
+    return np.asarray(numbers.clamp(0, white).round().numpy().astype(np.uint16))
+
+
 def _camera(frame: RawFrame) -> dict[int, Tag]:
     make, _, model = frame.camera.partition(" ")
     names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
@@ -167,11 +208,13 @@ def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
     return _by_code(tags)
 
 
-def _tags_of_the_pixels(frame: RawFrame) -> dict[int, Tag]:
+def _tags_of_any_pixels(frame: RawFrame) -> dict[int, Tag]:
+    return _by_code([(254, LONG, 1, 0, True), (274, SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation], True)])
+
+
+def _tags_of_the_mosaic(frame: RawFrame) -> dict[int, Tag]:
     levels = [frame.black[CFA(frame.cfa).sites.index((i, j))] for i in (0, 1) for j in (0, 1)]
     tags: list[Tag] = [
-        (254, LONG, 1, 0, True),
-        (274, SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation], True),
         (33421, SHORT, 2, (2, 2), True),
         (33422, BYTE, 4, bytes("RGB".index(colour) for colour in CFA(frame.cfa).value), True),
         (50710, BYTE, 3, bytes((0, 1, 2)), True),
@@ -182,6 +225,25 @@ def _tags_of_the_pixels(frame: RawFrame) -> dict[int, Tag]:
     ]
     if frame.noise_profile is not None:
         tags.append((51041, DOUBLE, 2, frame.noise_profile, True))
+    return _by_code(tags)
+
+
+_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, 51009)
+"""Green split, Bayer's sharpness, antialias strength, and opcodes of what is before demosaicing."""
+
+
+def _tags_of_full_colour(frame: RawFrame) -> dict[int, Tag]:
+    """Levels by colour; shading maps of the mosaic's sites become maps of the planes."""
+    white = round(frame.white) * finer(frame)
+    tags: list[Tag] = [
+        (50713, SHORT, 2, (1, 1), True),
+        (50714, RATIONAL, 3, _rationals(_black_of_colours(frame), 2**14), True),
+        (50717, LONG, 3, (white, white, white), True),
+    ]
+    maps = [m for found in frame.gain_maps if found.on_mosaic for m in of_planes(found, frame.cfa)]
+    if maps:
+        opcodes = opcode_list(maps)
+        tags.append((51009, UNDEFINED, len(opcodes), opcodes, True))
     return _by_code(tags)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -97,6 +97,18 @@ def opcode_list(maps: Iterable[GainMap]) -> bytes:
         body = _GRID.pack(*m.area, *m.planes, *grid) + m.gains.permute(1, 2, 0).numpy().astype(">f4").tobytes()
         opcodes.append(_OPCODE.pack(_GAIN_MAP, _DNG_1_3, _MAY_BE_SKIPPED, len(body)) + body)
     return struct.pack(">I", len(opcodes)) + b"".join(opcodes)
+
+
+def of_planes(m: GainMap, cfa: CFA | str) -> list[GainMap]:
+    """A map of a mosaic's sites as maps of the planes R, G, B of the demosaiced picture.
+
+    Both greens have a map each, and a plane would be multiplied by both: the square root of either is taken.
+    """
+    if m.pitch != (2, 2):
+        return [replace(m, planes=(0, 3))]
+    colour = CFA(cfa).channels[m.area[0] % 2][m.area[1] % 2]
+    gains = m.gains.sqrt() if colour == 1 else m.gains
+    return [replace(m, area=(0, 0, *m.area[2:]), pitch=(1, 1), planes=(colour, 1), gains=gains)]
 
 
 def gains_at_sites(maps: Iterable[GainMap], cfa: CFA | str, height: int, width: int) -> Tensor:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rawpy
 import torch
 from torch import Tensor
 
 import denoisers
-from rawaug.bayer import CFA, mosaic
+from rawaug.bayer import CFA, mosaic, pattern
 from rawaug.cli import main
 from rawaug.commands.denoise import denoise_file, denoise_folder, run
 from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic, levels_of
@@ -355,3 +356,45 @@ def test_a_real_dng_keeps_its_gain_maps(tmp_path: Path, camera_files: Path, iden
     back = read_raw(tmp_path / "b.dng")
     assert len(back.gain_maps) == 4 and back.orientation == 1 and back.iso == 100
     assert torch.equal(back.shading_gains, cut.shading_gains) and torch.equal(back.mosaic, cut.mosaic)
+
+
+@pytest.fixture
+def joint(tmp_path: Path) -> Path:
+    """The weights of a network that interpolates."""
+    denoisers.save(denoisers.JointDRUNet(width=4, scales=2, mend=False), tmp_path / "joint.safetensors", {})
+    return tmp_path / "joint.safetensors"
+
+
+@pytest.mark.parametrize("own", list(CFA))
+def test_linear_dngs_have_the_colours_of_the_scene(tmp_path: Path, bayer_dng: Dng, joint: Path, own: CFA) -> None:
+    source, out = shot(tmp_path / "a.dng", bayer_dng, own), tmp_path / "out.dng"
+    run(str(source), str(out), linear=True, denoiser=str(joint), noise=(1e-9, 1e-9))
+    y, x = np.mgrid[0.05:0.6:96j, 0.05:0.8:128j]
+    with rawpy.imread(str(out)) as file:
+        numbers = file.raw_image_visible.astype(np.float64)
+    signal = (numbers / 4 - 511) / (16383 - 511)
+    for colour, expected in enumerate((x, y, (x + y) / 2)):
+        assert abs((signal[..., colour] - expected)[8:-8, 8:-8].mean()) < 1e-3, "no shift, no cast"
+
+
+def test_linear_output_and_the_network_must_agree(tmp_path: Path, bayer_dng: Dng, joint: Path, identity: Path) -> None:
+    source, out = str(shot(tmp_path / "a.dng", bayer_dng)), str(tmp_path / "out.dng")
+    refused: list[tuple[str, dict[str, Any]]] = [
+        (r"--linear: .*adding.* does not demosaic; use rawaug-joint", {"linear": True, "denoiser": str(identity)}),
+        (r"joint.*: demosaics too, to a linear DNG; add --linear", {"denoiser": str(joint)}),
+        (r"a filter takes no --denoiser, --self-ensemble or --linear", {"linear": True, "classical": "Wavelet"}),
+        (r"--strength 0\.5: of a linear DNG it is 1", {"linear": True, "denoiser": str(joint), "strength": 0.5}),
+        (r"--preview .*p\.png: shows mosaics", {"linear": True, "denoiser": str(joint), "preview": "p.png"}),
+    ]
+    for said, options in refused:
+        with pytest.raises(ValueError, match=said):
+            run(source, out, **options)
+    assert not Path(out).exists()
+
+
+def test_xtrans_is_refused_with_linear_output_too(tmp_path: Path, bayer_dng: Dng, joint: Path) -> None:
+    cell = bytes("RGB".index(colour) for colour in "".join(pattern("XTRANS").rows))
+    tags = [(33421, 3, 2, (6, 6), True), (33422, 1, 36, cell, True)]
+    source = bayer_dng(tmp_path / "x.dng", np.full((96, 96), 900, np.uint16), None, extra=tags)
+    with pytest.raises(ValueError, match="x.dng: has no Bayer mosaic but an X-Trans mosaic;"):
+        run(str(source), str(tmp_path / "out.dng"), linear=True, denoiser=str(joint))

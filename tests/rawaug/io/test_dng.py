@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic
 from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
+from rawaug.io.gain_map import parse_gain_maps
 from rawaug.io.raw import Exposure
 
 MATRIX = torch.tensor([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.6, 1.6]])
@@ -105,6 +106,43 @@ def test_metadata_goes_there_and_back(tmp_path: Path, flip: int) -> None:
     assert torch.equal(back.gain_maps[0].gains, gain_map.gains)
     assert back.exposure.seconds == pytest.approx(1 / 60, rel=1e-3) and back.exposure.f_number == pytest.approx(2.8)
     assert back.exposure.date == "2020:02:29 12:00:00"
+
+
+def test_linear_dngs_hold_full_colour_and_what_the_source_says(tmp_path: Path) -> None:
+    numbers = np.random.default_rng(0).integers(64, 1024, (32, 48)).astype(np.uint16)
+    shading = [
+        GainMap((i, j, 32, 48), (2, 2), (0, 1), (0.0, 0.0), (0.5, 0.5), torch.full((1, 3, 3), gain))
+        for (i, j), gain in zip(CFA.BGGR.sites, (1.5, 1.2, 1.2, 1.1), strict=True)
+    ]
+    shot = {"iso": 800.0, "noise_profile": (2e-3, 3e-6), "orientation": 6, "gain_maps": tuple(shading)}
+    exposure = Exposure(1 / 60, 2.8, 35.0, "2020:02:29 12:00:00")
+    frame = a_frame(numbers, CFA.BGGR, (60, 62, 66, 70), 1023, exposure=exposure, **shot)
+    write_dng(tmp_path / "mosaic.dng", frame)
+    rgb = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(0)) * 1.1 - 0.02
+    write_dng(tmp_path / "linear.dng", frame, tmp_path / "mosaic.dng", rgb=rgb)
+    black, white = torch.tensor([60.0, 64.0, 70.0]).reshape(3, 1, 1) * 64, 1023.0 * 64
+    expected = (rgb * (white - black) + black).clamp(0, white).round().permute(1, 2, 0).numpy()
+    with rawpy.imread(str(tmp_path / "linear.dng")) as file:
+        assert (file.raw_image_visible[..., :3] == expected).all(), "LibRaw reads it bit for bit"
+    with tifffile.TiffFile(tmp_path / "linear.dng") as linear, tifffile.TiffFile(tmp_path / "mosaic.dng") as mosaic:
+        of, before = linear.pages.first.tags, mosaic.pages.first.tags
+        assert (of[262].value, of[277].value) == (34892, 3)
+        assert [of[code].value for code in (50713, 50714, 50717)] == [
+            (1, 1),
+            tuple(number for level in (60, 64, 70) for number in (level * 64 * 2**14, 2**14)),
+            (1023 * 64,) * 3,
+        ]
+        for code in (274, 306, 50706, 50708, 50721, 50728, 50778, 34665):  # colour, names, orientation, EXIF
+            assert of[code].value == before[code].value, code
+        assert not {33421, 33422, 50710, 50711, 51041} & set(tag.code for tag in of)
+        maps = parse_gain_maps(of[51009].value, on_mosaic=False)
+    found = torch.ones(3)
+    for m in maps:
+        assert m.pitch == (1, 1) and m.area == (0, 0, 32, 48)
+        found[m.planes[0]] *= m.gains[0, 0, 0]
+    torch.testing.assert_close(found, torch.tensor([1.5, 1.2, 1.1]))
+    with pytest.raises(ValueError, match=r"full colour of this frame is \(3, 32, 48\), got \(3, 16, 24\)"):
+        write_dng(tmp_path / "other.dng", frame, rgb=rgb[:, ::2, ::2])
 
 
 def colour_patches() -> Tensor:

@@ -1,0 +1,96 @@
+"""The truth of full colour, what demosaicing makes of its mosaic, and the recipe in small."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA
+from rawaug.data.pairs import Pair
+from rawaug.experiment.demosaicing import JointRecipe, Scene, demosaiced, frozen_mosaic, full_colour, run
+from rawaug.experiment.recipe import ArmConfig, DataConfig
+from rawaug.noise import noise_model
+from rawaug.training.config import DenoiserConfig, TrainConfig
+
+NOISE = noise_model((1e-3, 1e-5))
+
+
+def a_pair(cfa: CFA = CFA.RGGB, name: str = "scene") -> Pair:
+    """A smooth scene of three colours, brighter than white in no channel, 192 x 256."""
+    y, x = torch.meshgrid(torch.linspace(0, 3, 192), torch.linspace(0, 4, 256), indexing="ij")
+    rgb = torch.stack([0.2 + 0.1 * x.sin(), 0.5 + 0.2 * y.cos(), 0.3 + 0.1 * (x + y).sin()])
+    srgb = torch.zeros(3, 192, 256, dtype=torch.uint8)
+    return Pair(name, srgb, bayer.mosaic(rgb, cfa), cfa, white_balance=(2.0, 1.0, 1.5))
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_a_pixel_of_the_truth_is_a_cell_of_the_frame(cfa: CFA) -> None:
+    pair = a_pair(cfa)
+    truth = full_colour(pair)
+    assert truth.shape == (1, 3, 96, 128)
+    cell = pair.raw[0, 20:22, 30:32].flatten().tolist()
+    by_colour = {c: [v for v, colour in zip(cell, cfa.value, strict=True) if colour == c] for c in "RGB"}
+    expected = [sum(values) / len(values) for values in by_colour.values()]
+    assert truth[0, :, 10, 15].tolist() == pytest.approx(expected)
+
+
+def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
+    one, again, other = (frozen_mosaic(a_pair(name=name), NOISE) for name in ("a", "a", "b"))
+    assert torch.equal(one.noisy, again.noisy) and not torch.equal(one.noisy, other.noisy)
+    relative = (one.noisy - bayer.pack_rgb(one.clean, CFA.RGGB)) / one.variance.sqrt()
+    assert relative.std().item() == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("method", ["malvar", "VNG", "PPG", "AHD", "DCB", "DHT", "AAHD"])
+def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
+    """LibRaw's result is in the same units, though it works on balanced RAW: red and blue are twice as bright there."""
+    scene = Scene(a_pair(), NOISE)
+    rgb = demosaiced(bayer.pack_rgb(scene.sample.clean, CFA.RGGB), scene.pair, method)
+    error = (rgb - scene.sample.clean)[..., 6:-6, 6:-6].abs().amax(dim=(0, 2, 3))
+    assert error.max() < 4e-3, error
+    assert scene.score(rgb).psnr > scene.score(rgb + 0.01).psnr > 35
+
+
+def small(folder: Path, **changes: Any) -> JointRecipe:
+    return JointRecipe(
+        data=DataConfig(pairs=None, validation_crop=128, test_crop=128, test_count=1),
+        camera="universal",
+        arms={"joint": ArmConfig(1.0)},
+        denoiser=DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2}),
+        train=TrainConfig(steps=2, batch=1, crop=32, validate_every=1),
+        out=str(folder),
+        **{"rivals": ["Wavelet"], "demosaicing": ["malvar", "DCB"], **changes},
+    )
+
+
+def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = run(small(tmp_path), test=[a_pair(name="test")], validation=[a_pair(name="validation")])
+    written = json.loads((tmp_path / "experiment" / "results.json").read_text())
+    assert list(written["rivals"]) == ["Wavelet, malvar", "Wavelet, DCB"]
+    plain = results["joint"][0]["plain"]
+    assert plain["psnr"] == pytest.approx(plain["psnr_noisy"], abs=1.0), "two steps from the interpolation of the noisy"
+    assert all(scores["psnr"] > plain["psnr_noisy"] + 3 for scores in written["rivals"].values())
+    assert "Wavelet, DCB" in capsys.readouterr().out
+
+
+def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="demosaicing 'AMAZE' is unknown; use one of bilinear, malvar, VNG"):
+        small(tmp_path, demosaicing=["AMAZE"])
+    with pytest.raises(ValueError, match="classical and untouched: .* are named in rivals"):
+        small(tmp_path, classical=["Wavelet"])
+    with pytest.raises(ValueError, match="rgb targets are made from pictures"):
+        replace(small(tmp_path), arms={"joint": ArmConfig(0.5)}, data=DataConfig())
+
+
+def test_developed_truth_and_result_share_exposure_and_colours() -> None:
+    scene = Scene(a_pair(), NOISE)
+    shown: list[Tensor] = [scene.develop(x) for x in (scene.sample.noisy, scene.sample.clean)]
+    assert shown[0].shape == (3, 48, 64) and shown[1].shape == (3, 96, 128)
+    assert abs(shown[0].mean() - shown[1].mean()) < 0.02
