@@ -1,9 +1,9 @@
 r"""Demosaicing and denoising at once: ``rgb = D(noisy) + residual``, of twice the sides of packed RAW.
 
-Domain: packed RAW ``(B, 4, h, w)``, R, Gr, Gb, B of an RGGB mosaic, to linear camera RGB ``(B, 3, 2h, 2w)``. D is Malvar,
-He and Cutler's linear interpolation (ICASSP 2004), of the transformed signal, whose noise is white. One stencil for
-each colour and each site of a cell makes it a convolution of stride 2. Idea of one network for both: Gharbi et al.,
-"Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
+Domain: packed RAW ``(B, 4, h, w)``, R, Gr, Gb, B of an RGGB mosaic, to linear camera RGB ``(B, 3, 2h, 2w)``. D is
+Malvar, He and Cutler's linear interpolation (ICASSP 2004), of the transformed signal, whose noise is white. One stencil
+for each colour and each site of a cell makes it a convolution of stride 2. One network for both is the idea of Gharbi
+et al., "Deep Joint Demosaicking and Denoising", SIGGRAPH Asia 2016.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class JointDRUNet(DRUNet):
     """:class:`denoisers.DRUNet` with a head for full colour: ``D(noisy + tail(x)) + detail(x)``.
 
     Its features x give a correction of packed RAW, as in DRUNet, which D makes full colour, and what D cannot know, as
-    twelve planes that a pixel shuffle puts in place. The last layer of either starts at zero: an untrained network is D,
-    and one that starts from a DRUNet's weights is that network followed by D.
+    twelve planes that a pixel shuffle puts in place. The last layer of either starts at zero: an untrained network is
+    D, and one that starts from a DRUNet's weights is that network followed by D.
 
     Args:
         width, scales, blocks, limits, mend, domain, seed: see :class:`denoisers.DRUNet`.

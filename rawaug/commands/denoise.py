@@ -4,10 +4,10 @@ r"""``rawaug denoise``: RAW files to denoised DNGs.
 
 on the mosaic as the sensor gave it, before any gain map, in tiles. The result has the source's levels, colour, lens
 corrections, orientation and EXIF and differs from it by noise alone; its NoiseProfile tag is gone with the noise, so
-that a RAW developer does not smooth once more. With ``--linear`` the network demosaics as well, and the result is camera
-RGB in a linear DNG. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the noise's variance is left, and
-NoiseProfile says so. A mosaic of another pattern than the network's is continued by a mirrored line on the sides where
-the patterns differ, and cropped after.
+that a RAW developer does not smooth once more. With ``--linear`` the network demosaics as well, and the result is
+camera RGB in a linear DNG. With a strength s below 1 the result is y + s (d - y): (1 - s)^2 of the noise's variance is
+left, and NoiseProfile says so. A mosaic of another pattern than the network's is continued by a mirrored line on the
+sides where the patterns differ, and cropped after.
 """
 
 from __future__ import annotations
@@ -173,9 +173,7 @@ def denoise_file(
         raise ValueError(f"{preview}: the preview is a .jpg or .png")
     method = _made(method)
     if preview is not None and method.linear:
-        raise ValueError(
-            f"--preview {preview}: shows mosaics that LibRaw demosaics; open a linear DNG in a RAW developer"
-        )
+        raise ValueError(f"--preview {preview}: is of mosaics; open a linear DNG in a RAW developer")
     done = _denoise_file(source, out, method, noise, _checked(strength, method))
     if preview is not None:
         frame = read_raw(out)

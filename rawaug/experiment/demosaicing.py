@@ -72,9 +72,7 @@ class JointRecipe(Recipe):
                 known = ", ".join((*bayer.STENCILS, *LIBRAW))
                 raise ValueError(f"demosaicing {name!r} is unknown; use one of {known}")
         if self.classical or self.untouched:
-            raise ValueError(
-                "classical and untouched: denoisers that are followed by a demosaicing are named in rivals"
-            )
+            raise ValueError("classical and untouched: denoisers to compare with are named in rivals")
 
 
 @EXPERIMENTS.register("demosaic")
@@ -85,8 +83,8 @@ def run(recipe: JointRecipe, overwrite: bool = False, **given: Sequence[Pair]) -
 
 def full_colour(pair: Pair) -> Tensor:
     """The truth of a frame: linear camera RGB ``(1, 3, H/2, W/2)`` cut to even sides, each pixel from one cell."""
-    red, *greens, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
-    rgb = torch.stack([red, sum(greens) / 2, blue], dim=1)
+    red, green, other_green, blue = bayer.pack(pair.raw[None], pair.cfa).unbind(1)
+    rgb = torch.stack([red, (green + other_green) / 2, blue], dim=1)
     height, width = (side // 2 * 2 for side in rgb.shape[-2:])
     return rgb[..., :height, :width].contiguous()
 
@@ -112,20 +110,27 @@ def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
 
     gains = torch.tensor(pair.white_balance).reshape(3, 1, 1) / min(pair.white_balance)
     room = gains.max()  # LibRaw clips at white what the gains lift beyond it
-    levels = {"black": (BLACK,) * 4, "white": WHITE, "white_balance": pair.white_balance}
-    known = {"daylight": pair.white_balance, "color_matrix": pair.color_matrix, "camera": "rawaug", "name": pair.name}
-    unknown = {"iso": None, "noise_profile": None, "orientation": 0}
-    low = -BLACK / (WHITE - BLACK)
+    frame = RawFrame(
+        mosaic=(mosaic[0] / room).clamp(-BLACK / (WHITE - BLACK), 1.0),
+        cfa=CFA.RGGB,
+        black=(BLACK,) * 4,
+        white=WHITE,
+        white_balance=pair.white_balance,
+        daylight=pair.white_balance,
+        color_matrix=pair.color_matrix,
+        camera=pair.camera,
+        iso=None,
+        noise_profile=None,
+        orientation=0,
+        name=pair.name,
+    )
+    settings = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
+    settings |= {"adjust_maximum_thr": 0, "user_flip": 0, "user_wb": [*gains.flatten().tolist(), gains[1].item()]}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "frame.dng"
-        write_dng(path, RawFrame((mosaic[0] / room).clamp(low, 1.0), CFA.RGGB, **levels, **known, **unknown))
-        linear = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
+        write_dng(path, frame)
         with rawpy.imread(str(path)) as raw:
-            balance = [*gains.flatten().tolist(), gains[1].item()]
-            algorithm = rawpy.DemosaicAlgorithm[method]
-            rgb = raw.postprocess(
-                demosaic_algorithm=algorithm, user_wb=balance, adjust_maximum_thr=0, user_flip=0, **linear
-            )
+            rgb = raw.postprocess(demosaic_algorithm=rawpy.DemosaicAlgorithm[method], **settings)
     return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None]
 
 

@@ -384,7 +384,7 @@ def test_linear_output_and_the_network_must_agree(tmp_path: Path, bayer_dng: Dng
         (r"joint.*: demosaics too, to a linear DNG; add --linear", {"denoiser": str(joint)}),
         (r"a filter takes no --denoiser, --self-ensemble or --linear", {"linear": True, "classical": "Wavelet"}),
         (r"--strength 0\.5: of a linear DNG it is 1", {"linear": True, "denoiser": str(joint), "strength": 0.5}),
-        (r"--preview .*p\.png: shows mosaics", {"linear": True, "denoiser": str(joint), "preview": "p.png"}),
+        (r"--preview .*p\.png: is of mosaics", {"linear": True, "denoiser": str(joint), "preview": "p.png"}),
     ]
     for said, options in refused:
         with pytest.raises(ValueError, match=said):
@@ -396,5 +396,5 @@ def test_xtrans_is_refused_with_linear_output_too(tmp_path: Path, bayer_dng: Dng
     cell = bytes("RGB".index(colour) for colour in "".join(pattern("XTRANS").rows))
     tags = [(33421, 3, 2, (6, 6), True), (33422, 1, 36, cell, True)]
     source = bayer_dng(tmp_path / "x.dng", np.full((96, 96), 900, np.uint16), None, extra=tags)
-    with pytest.raises(ValueError, match="x.dng: has no Bayer mosaic but an X-Trans mosaic;"):
+    with pytest.raises(ValueError, match=r"x\.dng: has no Bayer mosaic but an X-Trans mosaic;"):
         run(str(source), str(tmp_path / "out.dng"), linear=True, denoiser=str(joint))

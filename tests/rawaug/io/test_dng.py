@@ -134,7 +134,7 @@ def test_linear_dngs_hold_full_colour_and_what_the_source_says(tmp_path: Path) -
         ]
         for code in (274, 306, 50706, 50708, 50721, 50728, 50778, 34665):  # colour, names, orientation, EXIF
             assert of[code].value == before[code].value, code
-        assert not {33421, 33422, 50710, 50711, 51041} & set(tag.code for tag in of)
+        assert not {33421, 33422, 50710, 50711, 51041} & {tag.code for tag in of}
         maps = parse_gain_maps(of[51009].value, on_mosaic=False)
     found = torch.ones(3)
     for m in maps:
