@@ -150,8 +150,6 @@ class TrainingRun:
                     results[arm].append(self.evaluated(arm, models[arm], noise, isp, seed))
         if _leads():
             self.reported(results, models, noise, isp)
-            spent = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-            print(f"took {sum(self.seconds.values()):.0f} s: {spent}")
         return results
 
     @property
@@ -273,7 +271,6 @@ class TrainingRun:
             methods[name] = network_method(model.to(find_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
         return methods
 
-    @timed("other denoisers, report")
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
         recipe, cfa = self.recipe, isp.cfa
@@ -286,8 +283,7 @@ class TrainingRun:
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         write_json(everything, self.folder / "results.json")
         for name, method in others.items():
-            scores = [score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)]
-            classical[name] = with_own_noise(summary(scores), self.own)
+            classical[name] = self.scored(name, method, noise, cfa)
             write_json(everything, self.folder / "results.json")
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
@@ -304,10 +300,18 @@ class TrainingRun:
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
             for arm, found in searches.items()
         ]
-        _say(*reports(self.pictures), *self.unreadable, *searched, *self.usage(results))
+        spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
+        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
+    @timed("other denoisers")
+    def scored(self, name: str, method: Method, noise: NoiseModel, cfa: CFA) -> dict[str, Any]:
+        """The scores of what is not trained here."""
+        scores = [score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)]
+        return with_own_noise(summary(scores), self.own)
+
+    @timed("report")
     def pictured(self, page: Page, methods: Mapping[str, Method], noise: NoiseModel, cfa: CFA) -> Path:
         """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
         logs = {arm: [self.place(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
