@@ -1,6 +1,6 @@
-"""What a worker of benchmarks/fuzz.py does: read a file by every reader of its kind, and say what became of it.
+"""What becomes of a hostile file: every reader of its kind is tried, and on request the commands, as a user types them.
 
-On request the commands read it too, as a user would type them: status 0, or status 2 and one line on stderr.
+:func:`attempt` runs in the helper process of :mod:`rawaug.io.isolated`, which says what crashed or hung.
 """
 
 from __future__ import annotations
@@ -9,24 +9,40 @@ import contextlib
 import io
 import os
 import re
+import resource
 import shutil
+import signal
+import time
+import traceback
+import warnings
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection
+from functools import cache
 from pathlib import Path
+
+import torch
+
+import denoisers
+from rawaug import DictionaryISP
+from rawaug.cli import main
+from rawaug.commands.info import describe
+from rawaug.commands.run import with_values
+from rawaug.data.mat import read_value
+from rawaug.data.published import read_packed
+from rawaug.data.sidd.frames import colour_of, mosaic_of
+from rawaug.experiment.kinds import settings_of
+from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
+from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
+from rawaug.plugin.params import load_params
+from rawaug.training.state import first_network
+
+SECONDS, MEBIBYTES = 10, 2048
+"""Of a processor, and of memory, that a file may take."""
+COMMANDS_COST = 6
+"""So many times the seconds where commands read it too."""
 
 
 def readers(kind: str, path: Path) -> list[Callable[[], object]]:
     """Every reader in the package for this kind of file."""
-    import torch
-
-    import denoisers
-    from rawaug import DictionaryISP
-    from rawaug.commands.info import describe
-    from rawaug.data.mat import read_value
-    from rawaug.data.published import read_packed
-    from rawaug.data.sidd.frames import colour_of, mosaic_of
-    from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
-    from rawaug.plugin.params import load_params
 
     def frame_of() -> RawFrame:
         frame = read_raw(path)
@@ -65,13 +81,6 @@ def readers(kind: str, path: Path) -> list[Callable[[], object]]:
 
 def _set_up(path: Path) -> None:
     """A recipe as the command line sets it up, its networks without their memory."""
-    import torch
-
-    from rawaug.commands.run import with_values
-    from rawaug.experiment.kinds import settings_of
-    from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
-    from rawaug.training.state import first_network
-
     content = read_recipe(path)
     recipe = with_values(settings_of(kind_of(content, path)), content, path)
     try:
@@ -83,23 +92,25 @@ def _set_up(path: Path) -> None:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 
 
-def attempt(kind: str, path: Path) -> tuple[str, str]:
-    """``read``, ``refused`` or ``fault``, and why."""
+def read(kind: str, path: Path) -> tuple[str, str]:
+    """``read``, ``refused`` or ``fault``, and why: what became of a file by its readers."""
     outcome = "read", ""
-    for read in readers(kind, path):
+    for reader in readers(kind, path):
         try:
-            read()
+            reader()
         except (ValueError, OSError) as error:
             text = str(error)
             if "\n" in text or path.stem not in text:
                 return "fault", f"{type(error).__name__} without name, or of many lines: {text!r}"
             outcome = "refused", text
         except Exception as error:
-            import traceback
-
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            return "fault", f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
+            return "fault", _described(error)
     return outcome
+
+
+def _described(error: Exception) -> str:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------
@@ -132,9 +143,7 @@ def commands(kind: str, path: Path) -> list[list[str]]:
 
 
 def run(argv: Sequence[str]) -> tuple[str, str]:
-    """``read``, ``refused`` or ``fault``, and why: what became of one command line."""
-    from rawaug.cli import main
-
+    """Likewise, of one command line: status 0, or status 2 and one line on stderr."""
     said, wrong = io.StringIO(), io.StringIO()
     command = " ".join(argv[:2])
     try:
@@ -143,10 +152,7 @@ def run(argv: Sequence[str]) -> tuple[str, str]:
     except SystemExit as end:
         return "fault", f"{command}: exits with {end.code}: {wrong.getvalue()[-200:]!r}"
     except Exception as error:
-        import traceback
-
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        return "fault", f"{command}: {type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {error}"
+        return "fault", f"{command}: {_described(error)}"
     lines = [line for line in wrong.getvalue().splitlines() if line.startswith("rawaug: ")]
     if status == 2 and len(lines) == 1:
         return "refused", lines[0]
@@ -157,45 +163,38 @@ def run(argv: Sequence[str]) -> tuple[str, str]:
     return "read", ""
 
 
-def run_all(kind: str, path: Path) -> tuple[str, str]:
-    """The worst of what became of every command on this file."""
-    found = []
-    for argv in commands(kind, path):
-        _out(path).mkdir()
-        found.append(run(argv))
-        shutil.rmtree(_out(path))
-    return min(found, key=lambda one: ("fault", "refused", "read").index(one[0]), default=("read", ""))
-
-
 def _out(path: Path) -> Path:
     return path.parents[1] / f"{path.stem}-out"
 
 
-# -- the worker --------------------------------------------------------------------------------------------------------
+# -- in the helper process ---------------------------------------------------------------------------------------------
 
 
-def work(asked: Connection, log: str) -> None:
-    """Read what is asked for, ``(kind, path, by_commands)``, and answer each; a first answer says that all is there.
+def attempt(path: Path, kind: str, by_commands: bool) -> tuple[str, str]:
+    """The worst of what became of a file: :func:`read`, :func:`run`, or too much of a processor or of memory."""
+    _silence()
+    seconds, before = SECONDS * (COMMANDS_COST if by_commands else 1), time.process_time()
+    resource.setrlimit(resource.RLIMIT_CPU, (int(before) + 2 * seconds, resource.RLIM_INFINITY))  # SIGXCPU ends a hang
+    Path("/proc/self/clear_refs").write_text("5")  # forget the peak
+    found = [read(kind, path)]
+    for argv in commands(kind, path) if by_commands and found[0][0] != "fault" else ():
+        _out(path).mkdir()
+        found.append(run(argv))
+        shutil.rmtree(_out(path))
+    status = Path("/proc/self/status").read_text()
+    peak = int(re.findall(r"VmHWM:\s*(\d+)", status)[0]) / 1024
+    if peak > MEBIBYTES:
+        return "memory", f"{peak:.0f} MiB"
+    if time.process_time() - before > seconds:
+        return "hung", f"more than {seconds} s of a processor"
+    return min(found, key=lambda one: ("fault", "refused", "read").index(one[0]))
 
-    What decoders print goes to ``log``, and where Python was if one of them crashes.
-    """
-    import faulthandler
-    import warnings
 
-    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+@cache
+def _silence() -> None:
+    """What decoders print is not of interest."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
-        os.dup2(file, stream)
-    faulthandler.enable(file)
+        os.dup2(nowhere, stream)
     warnings.simplefilter("ignore")
-    os.environ["RAWAUG_READ_SECONDS"] = "0"  # this process is what a decoder may take down
-    for kind in ("dng", "recipe"):  # imports are no part of reading
-        attempt(kind, Path("none"))
-    asked.send(None)
-    with contextlib.suppress(EOFError):
-        while True:
-            kind, name, by_commands = asked.recv()
-            outcome, why = attempt(kind, Path(name))
-            if by_commands and outcome != "fault":
-                said = run_all(kind, Path(name))
-                outcome, why = said if said[0] == "fault" or outcome == "read" else (outcome, why)
-            asked.send((outcome, why))
+    signal.signal(signal.SIGXCPU, signal.SIG_DFL)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from functools import lru_cache
 from typing import Any
 
@@ -27,19 +27,6 @@ from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 N_VIEWS = 8  # flips and quarter turns of a picture: the dihedral group of the square
-
-
-class View(IntEnum):
-    """The eight views of :func:`turn` by name; ``LEFT`` and ``RIGHT`` are quarter turns."""
-
-    IDENTITY = 0
-    MIRROR = 1
-    FLIP = 2
-    HALF_TURN = 3
-    TRANSPOSE = 4
-    RIGHT = 5
-    LEFT = 6
-    ANTITRANSPOSE = 7
 
 
 class CFA(StrEnum):
@@ -198,7 +185,8 @@ def demosaicing(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int
 def turn(image: Tensor, view: int) -> Tensor:
     """One of the eight flips and quarter turns of ``(..., H, W)``; a mosaic's pattern moves along.
 
-    ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity.
+    ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity,
+    3 the half turn, 5 and 6 are the quarter turns to the right and to the left.
     """
     if not 0 <= view < N_VIEWS:
         raise ValueError(f"view must be in [0, {N_VIEWS}), got {view}")
@@ -221,22 +209,6 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     if not all(kept.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping its CFA")
     return kept
-
-
-def turn_packed(packed: Tensor, view: int) -> Tensor:
-    """Turn packed RAW ``(..., 4, h, w)`` as :func:`turn` does its mosaic, which then reads :meth:`CFA.turned`.
-
-    The planes turn, and a transposition exchanges Gr and Gb: the red row was the red column.
-
-    Example:
-        >>> raw = torch.rand(1, 1, 8, 6)
-        >>> turned = turn_packed(pack(raw, "RGGB"), View.LEFT)
-        >>> torch.equal(unpack(turned, CFA("RGGB").turned(View.LEFT)), turn(raw, View.LEFT))
-        True
-    """
-    _require_channels(packed, 4, "packed RAW")
-    turned = turn(packed, view)
-    return turned[..., [0, 2, 1, 3], :, :] if view & 4 else turned
 
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
@@ -362,7 +334,7 @@ class RandomTurn(_Transform):
 
     Example:
         >>> turn = RandomTurn("GRBG")
-        >>> turn.apply(torch.rand(1, 1, 8, 12), torch.tensor(View.FLIP)).shape
+        >>> turn.apply(torch.rand(1, 1, 8, 12), torch.tensor(2)).shape
         torch.Size([1, 1, 6, 12])
     """
 

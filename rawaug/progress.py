@@ -1,7 +1,6 @@
 """Progress on stderr: a bar in a terminal; elsewhere, as in the log of a job, one plain line every 30 seconds.
 
-A line of a log covers everything under way, as the images of an evaluation and the tiles of one of them. The
-environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. What takes less prints no line.
+The environment variable ``RAWAUG_PROGRESS_SECONDS`` sets another interval. What takes less prints no line.
 """
 
 from __future__ import annotations
@@ -9,18 +8,18 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
 from typing import Any, TextIO, TypeVar
-from weakref import WeakKeyDictionary
 
 from tqdm.asyncio import tqdm as terminal_tqdm
 from tqdm.auto import tqdm
 
 T = TypeVar("T")
 _quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+_LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} elapsed, {remaining} left{postfix}"
 
 
 @contextmanager
@@ -63,71 +62,26 @@ def progress(
         stream: in place of stderr.
     """
     stream = stream or sys.stderr
-    if total is None and isinstance(items, Sized):
-        total = len(items)
-    shown = shown and not _quiet.get()
-    if not shown or stream.isatty() or tqdm is not terminal_tqdm:  # tqdm.auto is another class in a notebook
-        settings: dict[str, Any] = {"desc": label, "unit": unit, "total": total, "initial": initial}
-        return tqdm(items, file=stream, leave=leave, disable=not shown, **settings)
-    return _Logged(items, label, unit, total, initial, stream)
+    settings: dict[str, Any] = {"desc": label, "unit": unit, "total": total, "initial": initial}
+    settings["disable"] = not shown or _quiet.get()
+    if stream.isatty() or tqdm is not terminal_tqdm:  # tqdm.auto is another class in a notebook
+        return tqdm(items, file=stream, leave=leave, **settings)
+    seconds = float(os.environ.get("RAWAUG_PROGRESS_SECONDS", "30"))
+    often = {"mininterval": seconds, "maxinterval": seconds, "delay": seconds, "miniters": 1}
+    return _Lines(items, file=stream, leave=False, bar_format=_LINE, **often, **settings)
 
 
-class _Log:
-    """Of one stream: what is under way, the outermost first, and when the last line was written."""
+class _Lines(terminal_tqdm):  # type: ignore[type-arg, misc]
+    """Writes a line where tqdm draws over the last one."""
 
-    def __init__(self) -> None:
-        self.under_way: list[_Logged] = []
-        self.written = time.monotonic()
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        self.fp.write(f"{self}\n")
+        return True
 
-
-_logs: WeakKeyDictionary[TextIO, _Log] = WeakKeyDictionary()
-
-
-class _Logged:
-    """Items counted in the lines of a log; see :func:`progress`."""
-
-    def __init__(
-        self, items: Iterable[Any], label: str, unit: str, total: int | None, initial: int, stream: TextIO
-    ) -> None:
-        self.items, self.label, self.unit, self.total, self.stream = items, label, unit, total, stream
-        self.initial = self.done = initial
-        self.began = time.monotonic()
-        self.postfix = ""
-        self.shown: int | None = None  # how many were done by the last line
-
-    def set_postfix_str(self, text: str, refresh: bool = False) -> None:
-        """Add ``text`` to the next line."""
-        self.postfix = f", {text}"
-
-    def __iter__(self) -> Iterator[Any]:
-        log = _logs.setdefault(self.stream, _Log())
-        log.under_way.append(self)
-        seconds = float(os.environ.get("RAWAUG_PROGRESS_SECONDS", "30"))
-        try:
-            for item in self.items:
-                yield item
-                self.done += 1
-                if time.monotonic() - log.written >= seconds:
-                    self._write(log)
-            if self.shown not in (None, self.done) and log.under_way == [self]:
-                self._write(log)
-        finally:
-            log.under_way.remove(self)
-
-    def _write(self, log: _Log) -> None:
-        self.stream.write("; ".join(map(str, log.under_way)) + "\n")
-        self.stream.flush()
-        log.written = time.monotonic()
-        for part in log.under_way:
-            part.shown = part.done
-
-    def __str__(self) -> str:
-        elapsed, done = time.monotonic() - self.began, self.done - self.initial
-        count = str(self.done) if self.total is None else f"{self.done}/{self.total}"
-        left = elapsed * (self.total - self.done) / done if self.total is not None and done else None
-        remaining = "?" if left is None else tqdm.format_interval(left)
-        interval = tqdm.format_interval(elapsed)
-        return f"{self.label}: {count} {self.unit}s, {interval} elapsed, {remaining} left{self.postfix}"
+    def close(self) -> None:
+        if not self.disable and self.n > self.last_print_n and self.last_print_t > self.start_t:
+            self.display()  # the end, where there was a line before
+        self.disable = True
 
 
 def timed(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:

@@ -175,11 +175,6 @@ class Registry(Mapping[str, Any]):
     def __len__(self) -> int:
         return len(list(iter(self)))
 
-    def known(self) -> dict[str, str]:
-        """What is known by name before the built-in modules are imported, with the place of each."""
-        offered = {name: str(point.value) for name, point in self._entry_points.items()}
-        return {**offered, **{name: _path(thing) for name, thing in self._things.items()}}
-
     def name_of(self, thing: Any) -> str | None:
         """The name that a thing is registered under, or None."""
         return next((name for name in (*self._things, *self) if self[name] is thing), None)

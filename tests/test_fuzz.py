@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -34,18 +35,16 @@ def test_damaged_files_are_read_or_refused_in_one_line(
 
 
 @pytest.mark.long
-@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
-def test_a_worker_that_dies_or_hangs_is_named_and_started_anew(fuzz: ModuleType, tmp_path: Path) -> None:
-    worker, missing = fuzz.Worker(tmp_path, seconds=1.0), tmp_path / "missing.jpg"
-    try:
-        for name, outcome, why in (
-            ("SIGSEGV", "crashed", "OpenImageIO: SIGSEGV"),
-            ("SIGSTOP", "hung", "more than 10 s of a processor, or 1 s in all"),
-        ):
-            assert worker.read("jpeg", missing) == ("refused", f"{missing}: no such picture file")
-            assert worker.process is not None
-            os.kill(worker.process.pid, getattr(signal, name))
-            found = worker.read("jpeg", missing)
-            assert found[0] == outcome and found[1].startswith(why)
-    finally:
-        worker.stop()
+def test_a_crash_and_a_hang_of_a_reader_are_told_apart(
+    fuzz: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missing = tmp_path / "missing.jpg"
+    assert fuzz.judged("jpeg", missing, False) == ("refused", f"{missing}: no such picture file")
+    for name, outcome in (("SIGSEGV", "crashed"), ("SIGXCPU", "hung")):
+        monkeypatch.setattr(fuzz, "attempt", partial(killed, getattr(signal, name)))
+        found = fuzz.judged("jpeg", missing, False)
+        assert found[0] == outcome and name in found[1] and "missing.jpg" in found[1]
+
+
+def killed(number: int, path: Path, kind: str, by_commands: bool) -> None:
+    os.kill(os.getpid(), number)

@@ -38,7 +38,7 @@ from rawaug.commands.frame_denoisers import (
     stored_noise,
 )
 from rawaug.commands.pair_maker import require_same_settings
-from rawaug.data.folders import RAW_EXTENSIONS, files_below
+from rawaug.data.folders import RAW_EXTENSIONS, files_in
 from rawaug.errors import escape
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
@@ -306,11 +306,8 @@ def _levels_by_shot(files: Sequence[Denoised]) -> Shots:
 def _targets(source: Path, out: Path) -> dict[Path, Path]:
     if out.resolve().is_relative_to(source.resolve()):
         raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
-    files = sorted(files_below(source, RAW_EXTENSIONS))
-    if not files:
-        raise ValueError(f"{source}: contains no RAW file; supported extensions are {', '.join(RAW_EXTENSIONS)}")
     targets: dict[Path, Path] = {}
-    for file in files:
+    for file in files_in(source, "RAW", RAW_EXTENSIONS):
         target = (out / file.relative_to(source)).with_suffix(".dng")
         if target in targets.values():
             raise ValueError(f"{file}: another file of {file.parent} has this stem, and both would become {target}")

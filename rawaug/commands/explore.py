@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rawaug.data.demo.pairs import demo_files
-from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
+from rawaug.data.folders import PICTURE_EXTENSIONS, files_in
 from rawaug.errors import extra
 from rawaug.explore.page import address, build, listening, server_of
 
@@ -37,12 +37,6 @@ def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
     if pictures is None:
         files = demo_files()
         return files, [f"{file.stem} (built in)" for file in files]
-    source = Path(pictures)
-    if source.is_file():
-        return [source], [source.name]
-    if not source.is_dir():
-        raise FileNotFoundError(f"{source}: no such picture, and no such folder of pictures")
-    files = sorted(files_below(source, PICTURE_EXTENSIONS))
-    if not files:
-        raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
-    return files, [file.relative_to(source).as_posix() for file in files]
+    files = files_in(pictures, "picture", PICTURE_EXTENSIONS)
+    above = pictures if Path(pictures).is_dir() else files[0].parent
+    return files, [file.relative_to(above).as_posix() for file in files]

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA
 from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
 from rawaug.data import (
@@ -24,20 +23,14 @@ from rawaug.data import (
     write_dnd_submission,
     write_submission,
 )
-from rawaug.data.sidd.blocks import BLOCKS, NoisyBlock
+from rawaug.data.pairs import NoisyBlock
+from rawaug.data.sidd.blocks import BLOCKS
 from rawaug.files import require_writable
 from rawaug.noise import estimate_noise
 from rawaug.progress import progress
 from rawaug.registry import Spec
 
 _UNUSED = (0.0, 0.0)
-
-
-class Block(NamedTuple):
-    """The mosaic ``(1, H, W)`` of a block, with its pattern."""
-
-    mosaic: Tensor
-    cfa: CFA
 
 
 def run(
@@ -74,27 +67,25 @@ def run(
 def submit_sidd(path: str, out: str, method: FrameDenoiser) -> int:
     """Write and check SIDD's submission; the number of blocks."""
     blocks = SiddBenchmark(path)
-    side = blocks[0].noisy.shape[-1]
+    side = blocks[0].mosaic.shape[-1]
     write_submission(out, _sidd_denoised(blocks, method), side)
     return len(check_submission(out, side))
 
 
 def _sidd_denoised(benchmark: SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
     for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
-        blocks = [benchmark[k] for k in range(first, first + BLOCKS)]
-        levels = _sidd_levels(benchmark, blocks) if method.reads_levels else _UNUSED
+        blocks = benchmark[first : first + BLOCKS]
+        levels = blocks[0].levels or (_estimated(blocks) if method.reads_levels else _UNUSED)
         for block in blocks:
-            yield method(Block(block.noisy, block.cfa), levels).clamp(0.0, 1.0)
+            yield method(block, levels).clamp(0.0, 1.0)
 
 
-def _sidd_levels(benchmark: SiddBenchmark, blocks: list[NoisyBlock]) -> tuple[float, float]:
-    """The frame's noise levels: published, else estimated from its noisy blocks."""
-    scene = blocks[0].name.rpartition("_")[0]
-    if scene in benchmark.levels:
-        return benchmark.levels[scene]
+def _estimated(blocks: list[NoisyBlock]) -> tuple[float, float]:
+    """The noise levels of a frame by its blocks."""
     try:
-        estimate = estimate_noise(torch.cat([block.noisy for block in blocks], dim=-1), blocks[0].cfa)
+        estimate = estimate_noise(torch.cat([block.mosaic for block in blocks], dim=-1), blocks[0].cfa)
     except ValueError as error:
+        scene = blocks[0].name.rpartition("_")[0]
         raise ValueError(
             f"{scene}: its noise cannot be estimated ({error}); put noise_level_functions.csv beside the blocks"
         ) from error
@@ -105,8 +96,7 @@ def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
     """Write and check DND's submission; the number of boxes."""
     boxes = Dnd(path)
     denoised = (
-        method(Block(box.noisy, box.cfa), (box.shot_var, box.read_var)).clamp(0.0, 1.0)
-        for box in progress(boxes, label="benchmark", unit="box")
+        method(box, box.levels or _UNUSED).clamp(0.0, 1.0) for box in progress(boxes, label="benchmark", unit="box")
     )
     write_dnd_submission(out, denoised)
     check_dnd_submission(out, boxes)

@@ -27,7 +27,7 @@ from rawaug.commands import OPTIONS, pair_shards, value_of
 from rawaug.commands.pair_files import picture_tasks, replay
 from rawaug.commands.pair_maker import TARGETS, Format, Outcome, PairMaker, Settings, Task, require_same_settings
 from rawaug.commands.pair_shards import PER_SHARD, replay_sample
-from rawaug.data.folders import PICTURE_EXTENSIONS, files_below
+from rawaug.data.folders import PICTURE_EXTENSIONS, files_in
 from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import LOCK, find_weights, locked, sha256
@@ -199,16 +199,9 @@ def _work_off(
 
 
 def _pictures(source: Path, out: Path) -> list[Path]:
-    if source.is_file():
-        return [source]
-    if not source.is_dir():
-        raise FileNotFoundError(f"{source}: no such folder of pictures, and no picture")
-    if out.resolve().is_relative_to(source):
+    if source.is_dir() and out.resolve().is_relative_to(source):
         raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
-    pictures = sorted(files_below(source, PICTURE_EXTENSIONS))
-    if not pictures:
-        raise ValueError(f"{source}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
-    return pictures
+    return files_in(source, "picture", PICTURE_EXTENSIONS)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------

@@ -13,41 +13,29 @@ from typing import Any
 
 from torch.utils.data import ConcatDataset
 
-from rawaug.data.check import DataReport, check
+from rawaug.data.check import check
 from rawaug.data.demo.camera import DemoCamera
 from rawaug.data.demo.drawn import Shapes, dead_leaves
 from rawaug.data.demo.pairs import demo_pairs, demo_photographs, demo_pictures
-from rawaug.data.dnd import Dnd, DndCrop, check_dnd_submission, write_dnd_submission
+from rawaug.data.dnd import Dnd, check_dnd_submission, write_dnd_submission
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
-from rawaug.data.pairs import Binned, LazyPairs, Pair
-from rawaug.data.published import RawBench, Rawir, Rgb2Raw, Zurich, fivek_pairs
-from rawaug.data.real import RealFrames
-from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission, write_submission
-from rawaug.data.sidd.frames import SiddFrames
+from rawaug.data.pairs import Binned, LazyPairs, NoisyBlock, Pair
+from rawaug.data.sidd.blocks import SiddBenchmark, check_submission, write_submission
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
     "Binned",
-    "DataReport",
     "DemoCamera",
     "Dnd",
-    "DndCrop",
+    "NoisyBlock",
     "Pair",
     "PairFolder",
     "PictureFolder",
-    "RawBench",
     "RawFolder",
-    "Rawir",
-    "RealFrames",
-    "Rgb2Raw",
     "Shapes",
     "SiddBenchmark",
-    "SiddBlocks",
-    "SiddFrames",
-    "SiddPlusBlocks",
-    "Zurich",
     "check",
     "check_dnd_submission",
     "check_submission",
@@ -55,7 +43,6 @@ __all__ = [
     "demo_pairs",
     "demo_photographs",
     "demo_pictures",
-    "fivek_pairs",
     "open_pairs",
     "open_pictures",
     "write_dnd_submission",

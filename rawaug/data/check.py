@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,9 +19,9 @@ from typing import Any
 from torch import Tensor
 
 from rawaug.data.dnd import Dnd
-from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below
+from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below, files_in
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
 from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission
 from rawaug.data.sidd.frames import SiddFrames, is_scene
@@ -40,18 +40,14 @@ class PartReport:
     what: str
     items: int = 0
     examined: int = 0
-    sizes: Counter[str] = field(default_factory=Counter)
-    cfas: Counter[str] = field(default_factory=Counter)
-    cameras: Counter[str] = field(default_factory=Counter)
-    iso: Counter[str] = field(default_factory=Counter)
-    levels: Counter[str] = field(default_factory=Counter)
+    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: PartReport) -> None:
         """Add another report's counts; a damaged file of many blocks is one line."""
-        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
-            getattr(self, name).update(getattr(other, name))
+        for what, counts in other.counts.items():
+            self.counts[what].update(counts)
         if other.signal is not None:
             low, high = self.signal or other.signal
             self.signal = min(low, other.signal[0]), max(high, other.signal[1])
@@ -60,12 +56,10 @@ class PartReport:
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} examined"
         lines = [f"{self.what}: {self.items}{examined}"]
-        for name in ("sizes", "cfas", "cameras", "iso", "levels"):
-            counts: Counter[str] = getattr(self, name)
-            if counts:
-                more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
-                shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
-                lines.append(f"  {name}: {shown}{more}")
+        for what, counts in self.counts.items():
+            more = f", {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
+            shown = ", ".join(f"{escape(value)} ({count})" for value, count in counts.most_common(_SHOWN))
+            lines.append(f"  {what}: {shown}{more}")
         if self.signal is not None:
             lines.append(f"  signal: {self.signal[0]:.4g} to {self.signal[1]:.4g}")
         lines.append(f"  damaged: {len(self.broken) or 'none'}")
@@ -164,16 +158,14 @@ def _fivek(numbers: set[str]) -> str:
     return f" (FiveK: {', '.join(parts)})" if parts else ""
 
 
-class _RawFrames(Sequence[RawFrame]):
+class _RawFrames(Lazy[RawFrame]):
     """RAW files, read without rendering them."""
 
     def __init__(self, path: Path) -> None:
-        self.files = [path] if path.is_file() else sorted(files_below(path, RAW_EXTENSIONS))
+        self.files = files_in(path, "RAW", RAW_EXTENSIONS)
+        super().__init__([str(file) for file in self.files])
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __getitem__(self, index: int) -> RawFrame:  # type: ignore[override]
+    def read(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
 
 
@@ -191,21 +183,13 @@ def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartRep
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
-    opening = pickle.dumps(open_part)
+    opening, names = pickle.dumps(open_part), getattr(items, "names", range(part.items))
     for index in range(part.examined):
         try:
-            part.add(isolated(_facts, opening, index, name=_name(items, index)))
+            part.add(isolated(_facts, opening, index, name=names[index]))
         except OSError as error:  # of the helper: a crash or a hang
             part.broken.append(str(error))
     return part
-
-
-def _name(items: Any, index: int) -> object:
-    """How the report of a crash names an item."""
-    if isinstance(items, PictureFolder):
-        return items.file(index)
-    names = items.files if isinstance(items, _RawFrames) else getattr(items, "names", range(len(items)))
-    return names[index]
 
 
 @lru_cache(maxsize=1)
@@ -218,7 +202,7 @@ def _facts(opening: bytes, index: int) -> PartReport:
     """A report on one item."""
     items, facts = _opened(opening), PartReport("")
     try:
-        _take(facts, items.read(index) if isinstance(items, PictureFolder) else items[index])
+        _take(facts, getattr(items, "read", items.__getitem__)(index))
     except (OSError, ValueError) as error:
         facts.broken.append(" ".join(str(error).split()))
     return facts
@@ -227,18 +211,19 @@ def _facts(opening: bytes, index: int) -> PartReport:
 def _take(part: PartReport, item: Any) -> None:
     """Count one item: a picture, pair, RAW frame or noisy block."""
     if isinstance(item, Tensor):
-        part.sizes[f"{item.shape[-2]} x {item.shape[-1]}"] += 1
+        part.counts["sizes"][f"{item.shape[-2]} x {item.shape[-1]}"] += 1
         return
-    raw: Tensor = item.raw if isinstance(item, Pair) else item.mosaic if isinstance(item, RawFrame) else item.noisy
-    part.sizes[f"{raw.shape[-2]} x {raw.shape[-1]}"] += 1
-    part.cfas[str(item.cfa)] += 1
+    raw: Tensor = item.raw if isinstance(item, Pair) else item.mosaic
+    part.counts["sizes"][f"{raw.shape[-2]} x {raw.shape[-1]}"] += 1
+    part.counts["cfas"][str(item.cfa)] += 1
     if isinstance(item, RawFrame):
         black = "/".join(f"{level:g}" for level in dict.fromkeys(item.black))
-        part.levels[f"black {black}, white {item.white:g}"] += 1
-    if getattr(item, "shot_var", None) is not None:
-        part.levels[f"shot_var {item.shot_var:.1e}, read_var {item.read_var:.1e}"] += 1
+        part.counts["levels"][f"black {black}, white {item.white:g}"] += 1
+    levels = (item.shot_var, item.read_var) if isinstance(item, Pair) else getattr(item, "levels", None)
+    if levels is not None and None not in levels:
+        part.counts["levels"]["shot_var {:.1e}, read_var {:.1e}".format(*levels)] += 1
     if camera := getattr(item, "camera", None):
-        part.cameras[camera] += 1
+        part.counts["cameras"][camera] += 1
     if iso := getattr(item, "iso", None):
-        part.iso[f"{iso:g}"] += 1
+        part.counts["iso"][f"{iso:g}"] += 1
     part.signal = raw.min().item(), raw.max().item()

@@ -11,47 +11,23 @@ Source: T. Plötz, S. Roth, "Benchmarking denoising algorithms with real photogr
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import color_matrix, white_balance
-from rawaug.data.mat import read_array, read_value
-from rawaug.data.pairs import Pair
+from rawaug.data.mat import normalised, read_array, read_value
+from rawaug.data.pairs import Lazy, NoisyBlock, Pair
 from rawaug.registry import DATASETS
 
 FRAMES, BOXES = 50, 20
 _EVALUATION = "1.0"
 
 
-@dataclass(frozen=True)
-class DndCrop:
-    """One box of a frame.
-
-    Attributes:
-        name: ``"0001_01"``, frame and box, counted from 1 as in the submission.
-        noisy: float32 ``(1, H, W)``, black 0, white 1, as published.
-        cfa: the pattern of ``noisy``, which is the frame's moved to the corner of the box.
-        shot_var, read_var: the published noise levels of the frame.
-        white_balance: as-shot multipliers of R, G, B, green being 1.
-        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
-    """
-
-    name: str
-    noisy: Tensor
-    cfa: CFA
-    shot_var: float
-    read_var: float
-    white_balance: tuple[float, float, float]
-    color_matrix: Tensor
-
-
-class Dnd(Sequence[DndCrop]):
+class Dnd(Lazy[NoisyBlock]):
     """The boxes, frame by frame: 1,000 of 512 x 512; one frame at a time is in memory.
 
     Args:
@@ -71,79 +47,52 @@ class Dnd(Sequence[DndCrop]):
         frames = read_value(info, "info")
         if not isinstance(frames, list):
             raise ValueError(f"{info}: info is not a struct array over the frames")
-        self.frames = [_Frame.of(frame, info, k) for k, frame in enumerate(frames)]
+        self.frames = [_frame(frame, info, k) for k, frame in enumerate(frames)]
         missing = [file for file in map(self.file, range(len(frames))) if not file.is_file()]
         if missing:
             raise FileNotFoundError(f"{missing[0]}: no such frame of DND; {len(missing)} of {len(frames)} are missing")
-        self._last: tuple[int, np.ndarray] | None = None
+        self.places = [(k, box) for k, frame in enumerate(self.frames) for box in range(len(frame.boxes))]
+        self._frame: tuple[int, Tensor] | None = None
+        super().__init__([f"{k + 1:04d}_{box + 1:02d}" for k, box in self.places])
 
     def file(self, frame: int) -> Path:
         """The file of a frame, counted from 0."""
         return self.path / "images_raw" / f"{frame + 1:04d}.mat"
 
-    def __len__(self) -> int:
-        return sum(len(frame.boxes) for frame in self.frames)
-
-    def __getitem__(self, index: int) -> DndCrop:  # type: ignore[override]
-        index = range(len(self))[index]
-        for k, frame in enumerate(self.frames):
-            if index < len(frame.boxes):
-                return self._crop(k, index)
-            index -= len(frame.boxes)
-        raise AssertionError("the index is below the sum of the boxes")
-
-    def _crop(self, k: int, box: int) -> DndCrop:
-        frame, noisy = self.frames[k], self._noisy(k)
+    def read(self, index: int) -> NoisyBlock:
+        k, box = self.places[index]
+        if self._frame is None or self._frame[0] != k:
+            self._frame = k, normalised(read_array(self.file(k), "Inoisy"), 2, self.file(k))
+        (_, noisy), frame = self._frame, self.frames[k]
         top, left, bottom, right = frame.boxes[box]
-        if not (0 <= top < bottom <= noisy.shape[0] and 0 <= left < right <= noisy.shape[1]):
-            raise ValueError(f"{self.file(k)}: box {box + 1} of info.mat extends beyond the frame {noisy.shape}")
-        return DndCrop(
-            name=f"{k + 1:04d}_{box + 1:02d}",
-            noisy=torch.from_numpy(np.ascontiguousarray(noisy[top:bottom, left:right]))[None],
-            cfa=frame.cfa.shifted(top, left),
-            shot_var=frame.shot_var,
-            read_var=frame.read_var,
-            white_balance=frame.white_balance,
-            color_matrix=frame.color_matrix,
-        )
-
-    def _noisy(self, k: int) -> np.ndarray:
-        if self._last is None or self._last[0] != k:
-            frame = read_array(self.file(k), "Inoisy")
-            low, high = float(frame.min()), float(frame.max())
-            if frame.ndim != 2 or not (low > -1 and high <= 1):
-                raise ValueError(
-                    f"{self.file(k)}: Inoisy {frame.shape} has values from {low:.4g} to {high:.4g}, expected at most 1"
-                )
-            self._last = k, frame.astype(np.float32)
-        return self._last[1]
+        if not (0 <= top < bottom <= noisy.shape[1] and 0 <= left < right <= noisy.shape[2]):
+            size = f"{noisy.shape[1]} x {noisy.shape[2]}"
+            raise ValueError(f"{self.file(k)}: box {box + 1} of info.mat extends beyond the frame of {size}")
+        mosaic = noisy[:, top:bottom, left:right].contiguous()
+        return NoisyBlock(self.names[index], mosaic, frame.cfa.shifted(top, left), frame.levels, *frame.colour)
 
 
-@dataclass(frozen=True)
-class _Frame:
+class _Frame(NamedTuple):
+    """What ``info`` says of a frame; boxes run from 0, and end outside."""
+
     boxes: list[tuple[int, int, int, int]]
     cfa: CFA
-    shot_var: float
-    read_var: float
-    white_balance: tuple[float, float, float]
-    color_matrix: Tensor
+    levels: tuple[float, float]
+    colour: tuple[tuple[float, float, float], Tensor]
 
-    @classmethod
-    def of(cls, info: dict[str, Any], file: Path, index: int) -> _Frame:
-        """From an element of the struct array; boxes then run from 0, and end outside."""
-        try:
-            boxes = np.asarray(info["boundingboxes"]).reshape(-1, 4).astype(int).tolist()
-            pattern = "".join("RGB"[int(colour) - 1] for colour in np.ravel(info["camera"]["pattern"]))
-            return cls(
-                [(top - 1, left - 1, bottom, right) for top, left, bottom, right in boxes],
-                CFA(pattern),
-                float(info["nlf"]["a"]),
-                float(info["nlf"]["b"]),
-                white_balance(info["camera"]["AsShotNeutral"]),
-                color_matrix(info["camera"]["ColorMatrix2"]),
-            )
-        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
-            raise ValueError(f"{file}: frame {index + 1} of info is not as published ({error})") from error
+
+def _frame(info: dict[str, Any], file: Path, index: int) -> _Frame:
+    try:
+        boxes = np.asarray(info["boundingboxes"]).reshape(-1, 4).astype(int).tolist()
+        camera, noise = info["camera"], info["nlf"]
+        return _Frame(
+            [(top - 1, left - 1, bottom, right) for top, left, bottom, right in boxes],
+            CFA("".join("RGB"[int(colour) - 1] for colour in np.ravel(camera["pattern"]))),
+            (float(noise["a"]), float(noise["b"])),
+            (white_balance(camera["AsShotNeutral"]), color_matrix(camera["ColorMatrix2"])),
+        )
+    except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        raise ValueError(f"{file}: frame {index + 1} of info is not as published ({error})") from error
 
 
 @DATASETS.register("dnd")

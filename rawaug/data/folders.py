@@ -9,9 +9,7 @@ worker opens one twice. Pairs that cannot be read are skipped and reported.
 from __future__ import annotations
 
 import logging
-import math
 import os
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -63,6 +61,24 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
                 yield Path(parent, file)
 
 
+def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
+    """:func:`files_below`, sorted, or ``path`` itself where it is a file.
+
+    Raises:
+        FileNotFoundError: if there is neither.
+        ValueError: if the folder contains no such file.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such {what} file or folder")
+    files = sorted(files_below(path, extensions))
+    if not files:
+        raise ValueError(f"{path}: contains no {what} file; supported extensions are {', '.join(extensions)}")
+    return files
+
+
 class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
@@ -92,14 +108,10 @@ class PictureFolder(Dataset[Tensor]):
         self, path: str | Path, min_side: int = 2, max_pixels: int = MAX_PIXELS, allowed_share: float = 0.05
     ) -> None:
         self.path = Path(path)
-        if not self.path.is_dir():
-            raise FileNotFoundError(f"{path}: no such folder of pictures")
         self.min_side, self.max_pixels, self.allowed_share = min_side, max_pixels, allowed_share
-        found = files_below(self.path, PICTURE_EXTENSIONS)
+        found = sorted(str(file.relative_to(path)) for file in files_in(path, "picture", PICTURE_EXTENSIONS))
         # an array, since the reference counts of a list would be copied into every forked worker, page by page
-        self._names = np.array([os.fsencode(name) for name in sorted(str(f.relative_to(self.path)) for f in found)])
-        if not len(self):
-            raise ValueError(f"{path}: contains no picture; supported extensions are {', '.join(PICTURE_EXTENSIONS)}")
+        self._names = np.array([os.fsencode(name) for name in found])
         self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
         # one slot a worker, which alone writes to it
         self._read = torch.zeros(_SLOTS, dtype=torch.int64).share_memory_()
@@ -118,6 +130,11 @@ class PictureFolder(Dataset[Tensor]):
                 self._count()
                 return picture
         raise AssertionError("the share of skipped files is checked before the last one is")
+
+    @property
+    def names(self) -> list[str]:
+        """The paths of the files."""
+        return [str(self.file(index)) for index in range(len(self))]
 
     def file(self, index: int) -> Path:
         """The file at ``index``."""
@@ -285,21 +302,16 @@ def left_out(pairs: Readable, of: str) -> list[str]:
     return [f"left out of {escape(of)}: {len(reasons)} of {len(pairs)} frames, unreadable", *map(escape, reasons)]
 
 
-def skip_broken(pairs: Sequence[Pair], of: str, seconds: float = math.inf, least: int = 1) -> Iterator[Pair]:
+def skip_broken(pairs: Sequence[Pair], of: str) -> Iterator[Pair]:
     """Iterate over the readable pairs; afterwards, print the skipped ones."""
     readable = pairs if isinstance(pairs, Readable) else Readable(pairs)
-    start = math.inf
-    for count, pair in enumerate(readable, start=1):
-        start = min(start, time.perf_counter())
-        yield pair
-        if count >= least and time.perf_counter() - start > seconds:
-            break
+    yield from readable
     if lines := left_out(readable, of):
         print("\n".join(lines))
 
 
 class RawFolder(LazyPairs):
-    """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of files.
+    """The RAW files of a folder and its subfolders, sorted by path; or one file; or a list of both.
 
     A pair's sRGB is the JPEG of the same stem beside the RAW file where there is one of the mosaic's size within 3% (it
     is turned into the sensor's orientation, both are cut to the smaller size about the centre, and the pair is not
@@ -332,15 +344,8 @@ class RawFolder(LazyPairs):
         jpeg_quality: int | None = None,
         max_pixels: int = MAX_PIXELS,
     ) -> None:
-        self.files = _raw_files(path) if isinstance(path, (str, Path)) else [Path(file) for file in path]
-        missing = [file for file in self.files if not file.is_file()]
-        if missing:
-            raise FileNotFoundError(f"{missing[0]}: no such RAW file")
-        if not self.files:
-            raise ValueError(
-                f"{path}: contains no RAW file; supported extensions are {', '.join(RAW_EXTENSIONS)}; "
-                "noisy/clean pairs of other formats are read as pairs:PATH"
-            )
+        given = [path] if isinstance(path, (str, Path)) else path
+        self.files = [file for one in given for file in files_in(one, "RAW", RAW_EXTENSIONS)]
         self.camera_jpeg = camera_jpeg
         self.adjust_maximum_thr, self.jpeg_quality, self.max_pixels = adjust_maximum_thr, jpeg_quality, max_pixels
         super().__init__(_names(self.files))
@@ -379,13 +384,6 @@ def _names(files: Sequence[Path]) -> list[str]:
         above = os.path.commonpath([file.resolve().parent for file in files])
         names = [file.resolve().relative_to(above).as_posix() for file in files]
     return names
-
-
-def _raw_files(path: str | Path) -> list[Path]:
-    path = Path(path)
-    if path.is_dir():
-        return sorted(files_below(path, RAW_EXTENSIONS))
-    return [path]
 
 
 def _jpeg_beside(file: Path) -> Path | None:

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from rawaug.errors import extra
 from rawaug.io.isolated import damage_as_os_error, isolated
@@ -81,6 +83,20 @@ def read_value(path: str | Path, name: str) -> Any:
     strings, numbers arrays without axes of length 1. A matrix of cells or structs is listed row by row.
     """
     return isolated(_read, Path(path), name, True)
+
+
+def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
+    """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
+    if values.ndim != axes or values.dtype.kind != "f" or not values.size:
+        raise ValueError(
+            f"{file}: holds {values.dtype} {values.shape}; normalised RAW must be floating point with {axes} axes"
+        )
+    low, high = float(values.min()), float(values.max())
+    if not (low > -1 and high <= 1):
+        raise ValueError(
+            f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0 and white at 1"
+        )
+    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
 
 
 def _read(path: Path, name: str, plain: bool) -> Any:

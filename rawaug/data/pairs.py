@@ -16,11 +16,11 @@ noise.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, groupby
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, overload, runtime_checkable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, overload, runtime_checkable
 
 import numpy as np
 import torch
@@ -31,6 +31,8 @@ from rawaug.bayer import CFA, bin_mosaic
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -188,47 +190,61 @@ class Sample(NamedTuple):
     variance: Tensor
 
 
-def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
-    """A frame that both hold, by its path or name; None if they share none."""
-    return min(_identities(first) & _identities(second), default=None)
+@dataclass(frozen=True)
+class NoisyBlock:
+    """A piece of a benchmark's frame of which only the noisy version is public.
+
+    Attributes:
+        name: as the benchmark counts: frame and block.
+        mosaic: float32 ``(1, H, W)``, black 0, white 1, as published.
+        cfa: the pattern of ``mosaic``, which begins at the corner of the block.
+        levels: (shot_var, read_var) where they are published.
+        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 where they are not known.
+        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
+    """
+
+    name: str
+    mosaic: Tensor
+    cfa: CFA
+    levels: tuple[float, float] | None = None
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
 
 
-def stamps(pairs: Sequence[Pair]) -> list[str]:
-    """A fingerprint for each frame, without reading its file."""
-    if isinstance(pairs, LazyPairs):
-        return [pairs.stamp(index) for index in range(len(pairs))]
-    return [_sampled(pair) for pair in pairs]
-
-
-def _identities(pairs: Sequence[Pair]) -> set[str]:
-    if not isinstance(pairs, LazyPairs):
-        return {pair.name for pair in pairs}
-    found = set()
-    for index, name in enumerate(pairs.names):
-        files = pairs.files_of(index)
-        found |= {str(file.resolve()) for file in files} if files else {name}
-    return found
-
-
-def _sampled(pair: Pair) -> str:
-    known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
-    images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
-    return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]
-
-
-class LazyPairs(Sequence[Pair], ABC):
-    """A sequence of pairs that reads one at a time; the last one stays in memory."""
-
-    max_pixels: int = MAX_PIXELS
-    """sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded."""
+class Lazy(Sequence[T], ABC, Generic[T]):
+    """A sequence of named items that reads one at a time; the last one stays in memory."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
-        self._last: tuple[int, Pair] | None = None
+        self._last: tuple[int, T] | None = None
 
     @abstractmethod
-    def read(self, index: int) -> Pair:
-        """The pair at ``index`` in [0, len)."""
+    def read(self, index: int) -> T:
+        """The item at ``index`` in [0, len)."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(len(self))[index]]
+        index = range(len(self))[index]
+        if self._last is None or self._last[0] != index:
+            self._last = index, self.read(index)
+        return self._last[1]
+
+
+class LazyPairs(Lazy[Pair]):
+    """Pairs, read when they are asked for."""
+
+    max_pixels: int = MAX_PIXELS
+    """sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded."""
 
     def files_of(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; none where its name does."""
@@ -239,47 +255,79 @@ class LazyPairs(Sequence[Pair], ABC):
         files = [f"{f.resolve()} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
         return " ".join(files) or self.names[index]
 
-    def __len__(self) -> int:
-        return len(self.names)
 
-    @overload
-    def __getitem__(self, index: int) -> Pair: ...
+class _InMemory(LazyPairs):
+    def __init__(self, pairs: Sequence[Pair]) -> None:
+        self.pairs = pairs
+        super().__init__([pair.name for pair in pairs])
 
-    @overload
-    def __getitem__(self, index: slice) -> list[Pair]: ...
+    def read(self, index: int) -> Pair:
+        return self.pairs[index]
 
-    def __getitem__(self, index: int | slice) -> Pair | list[Pair]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        index = range(len(self))[index]
-        if self._last is None or self._last[0] != index:
-            self._last = index, self.read(index)
-        return self._last[1]
+    def stamp(self, index: int) -> str:
+        pair = self.pairs[index]
+        known = repr((pair.name, pair.camera, pair.cfa, pair.white_balance, pair.raw.shape)).encode()
+        images = [image for image in (pair.srgb, pair.raw, pair.noisy) if image is not None]
+        return digest(known, *(image.flatten()[::4099].numpy().tobytes() for image in images))[:16]
+
+
+def lazy(pairs: Sequence[Pair]) -> LazyPairs:
+    """The pairs as ones whose names and files are known without reading them."""
+    return pairs if isinstance(pairs, LazyPairs) else _InMemory(pairs)
+
+
+def names_of(pairs: Sequence[Pair]) -> list[str]:
+    """Names of the pairs."""
+    return lazy(pairs).names
+
+
+def stamps(pairs: Sequence[Pair]) -> list[str]:
+    """A fingerprint for each frame, without reading its file."""
+    return [lazy(pairs).stamp(index) for index in range(len(pairs))]
+
+
+def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
+    """A frame that both hold, by its path or name; None if they share none."""
+    return min(_identities(lazy(first)) & _identities(lazy(second)), default=None)
+
+
+def _identities(pairs: LazyPairs) -> set[str]:
+    files = {index: pairs.files_of(index) for index in range(len(pairs))}
+    return {str(file.resolve()) for some in files.values() for file in some} | {
+        pairs.names[index] for index, some in files.items() if not some
+    }
+
+
+def require_split(kind: str, split: str, known: Iterable[str]) -> None:
+    """Raise ValueError if a dataset has no such split."""
+    if split not in known:
+        raise ValueError(f"{kind}: no split {split}; use one of {', '.join(known)}")
 
 
 class SomePairs(LazyPairs):
-    """Some pairs of a sequence, by index."""
+    """Some pairs of a sequence, by index; all of them by default."""
 
-    def __init__(self, pairs: Sequence[Pair], indices: Sequence[int]) -> None:
-        self.pairs, self.indices = pairs, list(indices)
-        known = names_of(pairs)
-        super().__init__([known[index] for index in self.indices])
+    def __init__(self, pairs: Sequence[Pair], indices: Iterable[int] | None = None) -> None:
+        self.pairs, self.indices = lazy(pairs), list(range(len(pairs)) if indices is None else indices)
+        super().__init__([self.pairs.names[index] for index in self.indices])
+        if isinstance(pairs, Labelled):
+            self.labels = [pairs.labels[index] for index in self.indices]
 
     def read(self, index: int) -> Pair:
         return self.pairs[self.indices[index]]
 
     def files_of(self, index: int) -> Sequence[Path]:
-        return self.pairs.files_of(self.indices[index]) if isinstance(self.pairs, LazyPairs) else ()
+        return self.pairs.files_of(self.indices[index])
 
     def stamp(self, index: int) -> str:
-        return self.pairs.stamp(self.indices[index]) if isinstance(self.pairs, LazyPairs) else _sampled(self[index])
+        return self.pairs.stamp(self.indices[index])
 
 
 class Middles(SomePairs):
     """The middle ``crop x crop`` of each pair."""
 
     def __init__(self, pairs: Sequence[Pair], crop: int) -> None:
-        super().__init__(pairs, range(len(pairs)))
+        super().__init__(pairs)
         self.crop = crop
 
     def read(self, index: int) -> Pair:
@@ -305,21 +353,14 @@ class Binned(SomePairs):
     def __init__(self, pairs: Sequence[Pair], factor: int) -> None:
         if factor < 1:
             raise ValueError(f"bin must be at least 1, got {factor}")
-        super().__init__(pairs, range(len(pairs)))
+        super().__init__(pairs)
         self.factor = factor
-        if isinstance(pairs, Labelled):
-            self.labels = pairs.labels
 
     def read(self, index: int) -> Pair:
         return super().read(index).binned(self.factor)
 
     def stamp(self, index: int) -> str:
         return f"{super().stamp(index)} binned by {self.factor}"
-
-
-def names_of(pairs: Sequence[Pair]) -> list[str]:
-    """Names of the pairs; lazy ones are not read."""
-    return list(pairs.names) if isinstance(pairs, LazyPairs) else [pair.name for pair in pairs]
 
 
 OWN_PICTURES = "pairs"

@@ -38,7 +38,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -47,9 +46,9 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.development import develop_mosaic
-from rawaug.data.folders import RAW_EXTENSIONS, RawFolder, files_below
+from rawaug.data.folders import RAW_EXTENSIONS, RawFolder, files_below, files_in
 from rawaug.data.formats import read_npz
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import LazyPairs, Pair, require_split
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
@@ -75,16 +74,9 @@ def fivek_pairs(
         cameras: some of :data:`CAMERAS`.
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum.
         jpeg_quality: the pictures as JPEGs of this quality give them back; None leaves them as they are.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or one of the split's DNGs is missing.
-        ValueError: if there is no such split or camera.
     """
-    path = Path(path)
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such folder of FiveK")
     wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
-    files = {found[1]: file for file in files_below(path) if (found := FIVEK_DNG.fullmatch(file.name))}
+    files = {found[1]: file for file in files_in(path, "FiveK") if (found := FIVEK_DNG.fullmatch(file.name))}
     missing = [number for number in wanted if number not in files]
     if missing:
         raise FileNotFoundError(
@@ -108,16 +100,13 @@ def fivek_numbers(camera: str, split: str) -> list[str]:
     splits = _splits()
     if camera not in CAMERAS:
         raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")
-    if split not in splits[camera]:
-        raise ValueError(f"fivek: no split {split}; use one of InvISP's: {', '.join(splits[camera])}")
+    require_split("fivek", split, splits[camera])
     return splits[camera][split].split()
 
 
 @cache
 def _splits() -> dict[str, dict[str, str]]:
-    content: dict[str, dict[str, str]] = json.loads(
-        resources.files("rawaug.data").joinpath("fivek.json").read_text(encoding="utf-8")
-    )
+    content: dict[str, dict[str, str]] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))
     return content
 
 
@@ -140,29 +129,22 @@ class Rawir(LazyPairs):
             ``train``, ``val`` or ``test``, only the one of the split is taken.
         split: ``"train"``, ``"validation"`` or ``"test"``.
         white: in digital numbers; by default as :data:`WHITE` says.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or an array has no picture beside it.
-        ValueError: if there is no such split, or it holds no pair.
-
-    Example:
-        >>> Rawir("data-s7", "train")[0].raw.shape  # doctest: +SKIP
-        torch.Size([1, 504, 504])
     """
 
     def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
+        require_split("rawir", split, RAWIR_FOLDERS)
         folder, self.white = Path(path), white
-        if split not in RAWIR_FOLDERS:
-            raise ValueError(f"rawir: no split {split}; use one of {', '.join(RAWIR_FOLDERS)}")
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{path}: no such folder of RAWIR")
         if any((folder / name).is_dir() for name in RAWIR_FOLDERS.values()):
             folder = folder / RAWIR_FOLDERS[split]
-        self.files = sorted(files_below(folder, _ARRAYS))
+        self.files = self.of_split(files_in(folder, "RAWIR", _ARRAYS), split)
         if not self.files:
-            raise ValueError(f"{folder}: contains no .npy or .npz file of RAWIR")
+            raise ValueError(f"{path}: has no pair for {split}; it needs files of {TENTH} RAWs")
         self.pictures = [picture_beside(file) for file in self.files]
         super().__init__([str(file.relative_to(folder).with_suffix("")) for file in self.files])
+
+    def of_split(self, files: list[Path], split: str) -> list[Path]:
+        """Those of a folder that belong to a split: here all, since splits are folders."""
+        return files
 
     def camera_of(self, file: Path) -> str:
         """The camera of a file, which the names do not say."""
@@ -230,28 +212,15 @@ class Rgb2Raw(Rawir):
     Args:
         path: contains the arrays, ``.npy`` or ``.npz``, with a picture beside each, at any depth.
         split: ``"train"``, ``"validation"`` or ``"test"``.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or an array has no picture beside it.
-        ValueError: if there is no such split, or it holds no pair.
-
-    Example:
-        >>> Rgb2Raw("train_rgb2raw", "test")[0].raw.shape  # doctest: +SKIP
-        torch.Size([1, 1024, 1024])
     """
 
-    def __init__(self, path: str | Path, split: str = "train") -> None:
-        super().__init__(path, split)
-        by_folder: dict[Path, list[str]] = {}
-        for file in self.files:
-            shots = by_folder.setdefault(file.parent, [])
-            shots += [] if _raw_id(file) in shots else [_raw_id(file)]
-        turn = {(folder, shot): k % TENTH for folder, shots in by_folder.items() for k, shot in enumerate(shots)}
-        kept = [k for k, file in enumerate(self.files) if turn[file.parent, _raw_id(file)] in _TURN[split]]
-        if not kept:
-            raise ValueError(f"{path}: has no pair of RGB2RAW for {split}; it needs files of {TENTH} RAWs")
-        for key in ("files", "pictures", "names"):
-            setattr(self, key, [getattr(self, key)[k] for k in kept])
+    def of_split(self, files: list[Path], split: str) -> list[Path]:
+        """By the place of a RAW among those of its folder."""
+        places: dict[Path, dict[str, int]] = {}
+        for file in files:
+            shots = places.setdefault(file.parent, {})
+            shots.setdefault(_raw_id(file), len(shots))
+        return [file for file in files if places[file.parent][_raw_id(file)] % TENTH in _TURN[split]]
 
     def camera_of(self, file: Path) -> str:
         return file.parent.name
@@ -274,34 +243,19 @@ class Zurich(LazyPairs):
         path: contains ``train`` and ``test`` with ``huawei_raw`` and ``canon`` in each.
         split: ``"train"`` or ``"test"``.
         black, white: in digital numbers of 10 bits. PNGs of 8 bits hold a quarter of them.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or a RAW has no picture.
-        ValueError: if there is no such split, or it holds no RAW.
-
-    Example:
-        >>> Zurich("Zurich-RAW-to-DSLR", "test")[0].registered  # doctest: +SKIP
-        False
     """
 
     def __init__(
         self, path: str | Path, split: str = "train", black: float = BLACK, white: float = ZURICH_WHITE
     ) -> None:
-        if split not in ("train", "test"):
-            raise ValueError(f"zurich: no split {split}; use train or test")
-        folder = Path(path) / split
-        if not (folder / "huawei_raw").is_dir():
-            raise FileNotFoundError(f"{folder / 'huawei_raw'}: no such folder of Zurich RAW to RGB")
-        self.files = sorted((folder / "huawei_raw").glob("*.png"), key=lambda file: (len(file.stem), file.stem))
-        if not self.files:
-            raise ValueError(f"{folder / 'huawei_raw'}: contains no PNG")
-        existing = {file.name for file in (folder / "canon").glob("*.jpg")}
-        missing = [file for file in self.files if f"{file.stem}.jpg" not in existing]
-        if missing:
-            raise FileNotFoundError(
-                f"{folder / 'canon' / missing[0].stem}.jpg: is missing, and {len(missing) - 1} others"
-            )
-        self.folder, self.black, self.white = folder, black, white
+        require_split("zurich", split, ("train", "test"))
+        self.folder, self.black, self.white = Path(path) / split, black, white
+        files = files_in(self.folder / "huawei_raw", "Zurich RAW to RGB", (".png",))
+        self.files = sorted(files, key=lambda file: (len(file.stem), file.stem))  # 2 comes before 10
+        existing = {file.stem for file in (self.folder / "canon").glob("*.jpg")}
+        if missing := [file.stem for file in self.files if file.stem not in existing]:
+            first = self.folder / "canon" / f"{missing[0]}.jpg"
+            raise FileNotFoundError(f"{first}: is missing, and {len(missing) - 1} others")
         super().__init__([f"{split}_{file.stem}" for file in self.files])
 
     def read(self, index: int) -> Pair:
@@ -338,20 +292,10 @@ class RawBench(LazyPairs):
     Args:
         path: contains the folders of the scenes.
         split: is ignored: the dataset has no splits.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or a scene has no ``gt``.
-        ValueError: if it holds no scene.
-
-    Example:
-        >>> RawBench("rawbench")[0].name  # doctest: +SKIP
-        'Scene_0001_ISO200_1'
     """
 
     def __init__(self, path: str | Path, split: str = "test") -> None:
-        if not Path(path).is_dir():
-            raise FileNotFoundError(f"{path}: no such folder of RawBench")
-        files = sorted(files_below(path, RAW_EXTENSIONS))
+        files = files_in(path, "RawBench", RAW_EXTENSIONS)
         self.files = [file for file in files if file.parent.name != "gt" and _NOISY_SHOT.fullmatch(file.stem)]
         if not self.files:
             raise ValueError(f"{path}: contains no RAW file named as Scene_0001_ISO3200_1.ARW")

@@ -20,7 +20,7 @@ import torch
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.development import develop_mosaic
-from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.data.pairs import LazyPairs, Pair, require_split
 from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
 
@@ -48,10 +48,9 @@ class RealFrames(LazyPairs):
     """
 
     def __init__(self, path: str = "", split: str = "test") -> None:
-        names = [name for name, frame in _frames().items() if frame["split"] == (path or split)]
-        if not names:
-            raise ValueError(f"real:{path or split}: unknown split; use one of train, validation, test")
-        super().__init__(names)
+        split = path or split
+        require_split("real", split, ("train", "validation", "test"))
+        super().__init__([name for name, frame in _frames().items() if frame["split"] == split])
 
     def read(self, index: int) -> Pair:
         name = self.names[index]

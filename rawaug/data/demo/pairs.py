@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rawaug.data.demo.camera import NOISE_LEVELS, DemoCamera
 from rawaug.data.demo.drawn import dead_leaves
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Pair, require_split
 from rawaug.errors import extra
 from rawaug.io import read_picture
 from rawaug.registry import DATASETS, PICTURES
@@ -44,7 +44,7 @@ def demo_photographs(split: str) -> dict[str, Tensor]:
         ValueError: if there is no such split.
         FileNotFoundError: if scikit-image's installation lacks them.
     """
-    _require_split(split)
+    require_split("demo", split, PHOTOGRAPHS)
     return dict(_photographs(split))
 
 
@@ -71,7 +71,7 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
         >>> pair.raw.shape, pair.cfa, pair.noisy is not None
         (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
-    _require_split(split)
+    require_split("demo", split, PHOTOGRAPHS)
     count = PAIRS[split] if count is None else count
     if count < 1:
         raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
@@ -155,8 +155,3 @@ def _folder() -> Path:
         import skimage
 
     return Path(skimage.__file__).parent / "data"
-
-
-def _require_split(split: str) -> None:
-    if split not in PHOTOGRAPHS:
-        raise ValueError(f"demo:{split}: unknown split; use one of {', '.join(PHOTOGRAPHS)}")

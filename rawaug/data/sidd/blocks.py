@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -38,8 +38,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_mosaic
 from rawaug.data.folders import files_below
-from rawaug.data.mat import read_array
-from rawaug.data.pairs import LazyPairs, Pair, captured_noise
+from rawaug.data.mat import normalised, read_array
+from rawaug.data.pairs import Lazy, LazyPairs, NoisyBlock, Pair, captured_noise
 from rawaug.data.sidd.frames import (
     HELD_BACK,
     Colour,
@@ -48,20 +48,11 @@ from rawaug.data.sidd.frames import (
     colour_of,
     indexed,
     noise_level_functions,
-    normalised,
 )
 from rawaug.registry import DATASETS
 
 LEAST_LIKENESS = 0.8
 """Correlation of the greens below which pictures do not show the blocks of the mosaics."""
-
-
-def read_block_pictures(file: Path, blocks: tuple[int, ...], side: tuple[int, int]) -> Tensor:
-    """Pictures uint8 ``(*blocks, 3, H, W)`` of the array that is named after its file."""
-    array = read_array(file, file.stem)
-    if array.dtype.name != "uint8" or array.shape != (*blocks, *side, 3):
-        raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the mosaics need uint8 {(*blocks, *side, 3)}")
-    return torch.from_numpy(array).movedim(-1, -3)
 
 
 def turned_like(pictures: Tensor, mosaics: Tensor, cfa: CFA, what: str) -> Tensor:
@@ -95,26 +86,6 @@ T = TypeVar("T")
 _NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
 
 
-class _Frame(NamedTuple):
-    """What the blocks of a frame have in common."""
-
-    cfa: CFA
-    camera: str
-    levels: tuple[float, float]
-    levels_from_clean: bool
-    colour: Colour | None = None
-    srgb: Tensor | None = None
-    noisy_srgb: Tensor | None = None
-
-
-class NoisyBlock(NamedTuple):
-    """A block of which only the noisy version is public: ``noisy`` float32 ``(1, H, W)`` with its pattern ``cfa``."""
-
-    name: str
-    noisy: Tensor
-    cfa: CFA
-
-
 class Once(Generic[T]):
     """Calls ``read`` once and keeps its value or its error."""
 
@@ -135,34 +106,62 @@ class Once(Generic[T]):
         return self.value
 
 
+class _Known(NamedTuple):
+    """What is stated of a frame: published levels, and its colour, if there are any."""
+
+    name: str
+    cfa: CFA
+    camera: str
+    levels: tuple[float, float] | None = None
+    colour: Colour | None = None
+
+
 class _Blocks(LazyPairs):
-    """Blocks, read all at once; properties shared by the 32 blocks of a frame are kept for the last frame."""
+    """Blocks, read all at once; what the 32 blocks of a frame share is kept for the last frame."""
 
     def __init__(self, path: Path, frames: Sequence[str]) -> None:
         self.path = path
         self._all = Once(self._read_all)
-        self._pictures: dict[str, Tensor] = {}
-        self._frame: tuple[int, _Frame] | None = None
+        self._frame: tuple[int, dict[str, Tensor], dict[str, Any]] | None = None
         super().__init__([f"{name}_{block:02d}" for name in frames for block in range(BLOCKS)])
 
     @abstractmethod
-    def _read_all(self) -> tuple[Tensor, Tensor]:
-        """Clean and noisy blocks, ``(frames, 32, 1, H, W)``."""
+    def _read_all(self) -> dict[str, Tensor]:
+        """``raw``, ``noisy`` and, where there are pictures, ``srgb`` and ``noisy_srgb``, ``(frames, 32, C, H, W)``."""
 
     @abstractmethod
-    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
-        """Name, pattern and camera of a frame; its published levels and its colour, if there are any."""
+    def _known(self, number: int) -> _Known:
+        """Of a frame."""
 
     def read(self, index: int) -> Pair:
         number, block = divmod(index, BLOCKS)
-        clean, noisy = (blocks[number] for blocks in self._all())
         if self._frame is None or self._frame[0] != number:
-            name, cfa, camera, known, colour = self._known(number)
-            what = f"{self.path}: {name}"
-            pictures = {key: turned_like(every[number], clean, cfa, what) for key, every in self._pictures.items()}
-            levels = known or captured_noise(clean.numpy(), noisy.numpy())
-            self._frame = number, _Frame(cfa, camera, levels, known is None, colour, **pictures)
-        return _pair(self.names[index], block, clean, noisy, self._frame[1])
+            self._frame = number, *self._shared(number)
+        _, images, shared = self._frame
+        known: dict[str, Any] = {key: image[block] for key, image in images.items()} | shared
+        if "srgb" not in images:
+            colours = known["white_balance"], known["color_matrix"]
+            known["srgb"] = develop_mosaic(known["raw"], known["cfa"], *colours)
+        return Pair(self.names[index], **known)
+
+    def _shared(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The images of a frame's blocks, turned alike, and what else of a :class:`Pair` they share."""
+        images, known = {key: every[number] for key, every in self._all().items()}, self._known(number)
+        for key in {"srgb", "noisy_srgb"} & images.keys():
+            images[key] = turned_like(images[key], images["raw"], known.cfa, f"{self.path}: {known.name}")
+        shot_var, read_var = known.levels or captured_noise(images["raw"].numpy(), images["noisy"].numpy())
+        gains, matrix, _ = known.colour or _NO_COLOUR
+        return images, {
+            "cfa": known.cfa,
+            "camera": known.camera,
+            "white_balance": gains,
+            "color_matrix": matrix,
+            "shot_var": shot_var,
+            "read_var": read_var,
+            "levels_from_clean": known.levels is None,
+            "color_known": known.colour is not None,
+            "rendered": "srgb" in images or known.colour is not None,
+        }
 
 
 class SiddBlocks(_Blocks):
@@ -173,30 +172,23 @@ class SiddBlocks(_Blocks):
 
     Args:
         path: contains ``ValidationNoisyBlocksRaw.mat`` and ``ValidationGtBlocksRaw.mat``, at any depth.
-
-    Raises:
-        FileNotFoundError: if one of them is not there.
-
-    Example:
-        >>> SiddBlocks("SIDD_Validation")[32].name  # doctest: +SKIP
-        '0021_001_GP_10000_05000_5500_N_00'
     """
 
     def __init__(self, path: str | Path) -> None:
         self.files = [find_file(Path(path), f"Validation{kind}BlocksRaw.mat") for kind in ("Gt", "Noisy")]
         super().__init__(Path(path), HELD_BACK)
 
-    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
+    def _known(self, number: int) -> _Known:
         shot = SiddScene.parse(HELD_BACK[number])
-        return shot.name, shot.cfa, shot.camera, self._levels.get(shot.name), self._colours.get(shot.name)
+        return _Known(shot.name, shot.cfa, shot.camera, self._levels.get(shot.name), self._colours.get(shot.name))
 
-    def _read_all(self) -> tuple[Tensor, Tensor]:
+    def _read_all(self) -> dict[str, Tensor]:
         clean, noisy = (_blocks_of_scenes(file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         self._levels = noise_level_functions(self.path)
         self._colours = _colours(self.path)
-        self._pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
-        return clean, noisy
+        pictures = _pictures(self.path, "Validation{}BlocksSrgb.mat", ("Gt", "Noisy"), clean)
+        return {"raw": clean, "noisy": noisy, **pictures}
 
 
 class SiddPlusBlocks(_Blocks):
@@ -206,10 +198,6 @@ class SiddPlusBlocks(_Blocks):
         path: contains ``siddplus_valid_noisy_raw.mat``, ``siddplus_valid_gt_raw.mat`` and a
             ``siddplus_*bayer_patterns.csv`` with a pattern for each frame of 32 blocks, at any depth; pictures in
             ``siddplus_valid_gt_srgb.mat`` and ``siddplus_valid_noisy_srgb.mat``, if there are any.
-
-    Raises:
-        FileNotFoundError: if one of them is not there.
-        ValueError: if a pattern is invalid.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -217,46 +205,42 @@ class SiddPlusBlocks(_Blocks):
         self.cfas = _patterns(find_file(Path(path), "siddplus_*bayer_patterns.csv"))
         super().__init__(Path(path), [f"siddplus_{k:02d}" for k in range(len(self.cfas))])
 
-    def _known(self, number: int) -> tuple[str, CFA, str, tuple[float, float] | None, Colour | None]:
-        return f"frame {number}", self.cfas[number], "SIDD+", None, None
+    def _known(self, number: int) -> _Known:
+        return _Known(f"frame {number}", self.cfas[number], "SIDD+")
 
-    def _read_all(self) -> tuple[Tensor, Tensor]:
+    def _read_all(self) -> dict[str, Tensor]:
         clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         if len(clean) != len(self):
             raise ValueError(f"{self.files[0]}: has {len(clean)} blocks, but there are patterns for {len(self)}")
         pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
-        self._pictures = {key: every.unflatten(0, (-1, BLOCKS)) for key, every in pictures.items()}
-        return clean.unflatten(0, (-1, BLOCKS)), noisy.unflatten(0, (-1, BLOCKS))
+        images = {"raw": clean, "noisy": noisy, **pictures}
+        return {key: every.unflatten(0, (-1, BLOCKS)) for key, every in images.items()}
 
 
-class SiddBenchmark(Sequence[NoisyBlock]):
+class SiddBenchmark(Lazy[NoisyBlock]):
     """The benchmark's noisy blocks, whose clean ones are not public; results go to :func:`write_submission`.
 
     Args:
-        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth, and ``noise_level_functions.csv`` if there is one,
-            whose (shot_var, read_var) are in ``levels`` by scene instance.
+        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth, and ``noise_level_functions.csv`` if there is one.
 
     Raises:
         FileNotFoundError: if the blocks are not there.
 
     Example:
         >>> blocks = SiddBenchmark("SIDD_Benchmark")  # doctest: +SKIP
-        >>> write_submission("SubmitRaw.csv", (denoise(b.noisy, b.cfa) for b in blocks))  # doctest: +SKIP
+        >>> write_submission("SubmitRaw.csv", (denoise(b.mosaic, b.cfa) for b in blocks))  # doctest: +SKIP
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.file = find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")
         self.levels = noise_level_functions(Path(path))
-        self._all = Once(partial(_blocks_of_scenes, self.file))
+        self._all = Once(partial(_blocks_of_scenes, find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")))
+        super().__init__([f"{scene}_{block:02d}" for scene in HELD_BACK for block in range(BLOCKS)])
 
-    def __len__(self) -> int:
-        return len(HELD_BACK) * BLOCKS
-
-    def __getitem__(self, index: int) -> NoisyBlock:  # type: ignore[override]
-        scene, block = divmod(range(len(self))[index], BLOCKS)
-        frame = SiddScene.parse(HELD_BACK[scene])
-        return NoisyBlock(f"{frame.name}_{block:02d}", self._all()[scene, block], frame.cfa)
+    def read(self, index: int) -> NoisyBlock:
+        scene, block = divmod(index, BLOCKS)
+        cfa, levels = SiddScene.parse(HELD_BACK[scene]).cfa, self.levels.get(HELD_BACK[scene])
+        return NoisyBlock(self.names[index], self._all()[scene, block], cfa, levels)
 
 
 @DATASETS.register("sidd")
@@ -306,13 +290,16 @@ def _matching(folder: Path, pattern: str) -> list[Path]:
 
 
 def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -> dict[str, Tensor]:
-    """Pictures of the clean and noisy blocks, as far as their files exist."""
-    found = {}
+    """Pictures uint8 of the clean and noisy blocks, with the axes of ``clean``, as far as their files exist."""
+    found, expected = {}, (*clean.shape[:-3], *clean.shape[-2:], 3)
     for key, kind in zip(("srgb", "noisy_srgb"), kinds, strict=True):
-        name = pattern.format(kind)
-        if _matching(path, name):
-            side = (clean.shape[-2], clean.shape[-1])
-            found[key] = read_block_pictures(find_file(path, name), tuple(clean.shape[:-3]), side)
+        if not _matching(path, name := pattern.format(kind)):
+            continue
+        file = find_file(path, name)
+        array = read_array(file, file.stem)
+        if array.dtype.name != "uint8" or array.shape != expected:
+            raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the mosaics need uint8 {expected}")
+        found[key] = torch.from_numpy(array).movedim(-1, -3)
     return found
 
 
@@ -344,31 +331,6 @@ def _colours(path: Path) -> dict[str, Colour]:
 def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:
     if clean.shape != noisy.shape:
         raise ValueError(f"{file}: holds {tuple(noisy.shape)}, its clean counterpart {tuple(clean.shape)}")
-
-
-def _pair(name: str, block: int, clean: Tensor, noisy: Tensor, frame: _Frame) -> Pair:
-    """Block ``block`` of a frame's mosaics ``(32, 1, H, W)``."""
-    colour = frame.colour or _NO_COLOUR
-    if frame.srgb is not None:
-        srgb = frame.srgb[block]
-    else:
-        srgb = develop_mosaic(clean[block], frame.cfa, colour.white_balance, colour.matrix)
-    return Pair(
-        name=name,
-        srgb=srgb,
-        raw=clean[block],
-        cfa=frame.cfa,
-        white_balance=colour.white_balance,
-        color_matrix=colour.matrix,
-        noisy=noisy[block],
-        shot_var=frame.levels[0],
-        read_var=frame.levels[1],
-        camera=frame.camera,
-        color_known=frame.colour is not None,
-        rendered=frame.srgb is not None or frame.colour is not None,
-        noisy_srgb=None if frame.noisy_srgb is None else frame.noisy_srgb[block],
-        levels_from_clean=frame.levels_from_clean,
-    )
 
 
 SIDE = 256

@@ -18,14 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import color_matrix, develop_mosaic, white_balance
 from rawaug.data.folders import files_below
-from rawaug.data.mat import read_array, read_value
+from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, measured_levels
 from rawaug.io import read_picture
 from rawaug.io.pictures import view_of_orientation
@@ -107,15 +105,6 @@ class SiddFrames(LazyPairs):
     Args:
         path: contains the folders of the scene instances, at any depth.
         left_out: scene instances that are not taken, by default those of validation and benchmark.
-
-    Raises:
-        FileNotFoundError: if there is no such folder.
-        ValueError: if it holds no frames, or a noisy frame without its clean one or its METADATA.
-
-    Example:
-        >>> pair = SiddFrames("SIDD_Medium_Raw")[0]  # doctest: +SKIP
-        >>> pair.name, pair.cfa, pair.raw.shape  # doctest: +SKIP
-        ('0001_001_S6_00100_00060_3200_L_010', <CFA.GRBG: 'GRBG'>, torch.Size([1, 3000, 5328]))
     """
 
     def __init__(self, path: str | Path, left_out: Sequence[str] = HELD_BACK) -> None:
@@ -174,20 +163,6 @@ class SiddFrames(LazyPairs):
 def mosaic_of(file: Path) -> Tensor:
     """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out."""
     return _even(normalised(read_array(file, "x"), 2, file))
-
-
-def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
-    """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
-    if values.ndim != axes or values.dtype.kind != "f" or not values.size:
-        raise ValueError(
-            f"{file}: holds {values.dtype} {values.shape}; normalised RAW must be floating point with {axes} axes"
-        )
-    low, high = float(values.min()), float(values.max())
-    if not (low > -1 and high <= 1):
-        raise ValueError(
-            f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0 and white at 1"
-        )
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
 
 
 def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:

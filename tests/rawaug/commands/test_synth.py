@@ -195,7 +195,7 @@ def test_lens_shading_comes_as_a_gain_map() -> None:
 
 
 def test_what_cannot_be_is_refused(tmp_path: Path, pictures: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="nowhere: no such folder of pictures"):
+    with pytest.raises(FileNotFoundError, match="nowhere: no such picture file or folder"):
         synth(tmp_path / "nowhere", tmp_path / "out")
     with pytest.raises(ValueError, match="is inside the picture folder"):
         synth(pictures, pictures / "out", workers=0)

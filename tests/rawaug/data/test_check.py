@@ -68,8 +68,10 @@ def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng:
     (tmp_path / "c.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:300])
     write_pictures(tmp_path)
     raws, pictures = check(tmp_path).parts
-    assert raws.what == "RAW files" and raws.items == 3 and dict(raws.cfas) == {"GRBG": 1, "BGGR": 1}
-    assert dict(raws.levels) == {"black 64, white 1023": 2} and dict(raws.cameras) == {"Maker Model 1": 2}
+    assert raws.what == "RAW files" and raws.items == 3 and dict(raws.counts["cfas"]) == {"GRBG": 1, "BGGR": 1}
+    assert dict(raws.counts["levels"]) == {"black 64, white 1023": 2} and dict(raws.counts["cameras"]) == {
+        "Maker Model 1": 2
+    }
     assert raws.signal == pytest.approx((936 / 959, 936 / 959)) and "c.dng" in raws.broken[0]
     assert pictures.what == "pictures" and pictures.items == 3
 
@@ -85,14 +87,14 @@ def test_every_dataset_is_recognised(tmp_path: Path, mat73: Writer) -> None:
     savemat(tmp_path / "sidd" / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
     savemat(tmp_path / "sidd" / "ValidationNoisyBlocksRaw.mat", {"ValidationNoisyBlocksRaw": blocks})
     frames, validation, benchmark = check(tmp_path / "sidd", first=40).parts
-    assert frames.what == "SIDD, full frames" and dict(frames.cfas) == {"GRBG": 1} and not frames.broken
+    assert frames.what == "SIDD, full frames" and dict(frames.counts["cfas"]) == {"GRBG": 1} and not frames.broken
     assert validation.items == 0 and "contains no ValidationGtBlocksRaw.mat" in validation.broken[0]
-    assert benchmark.items == 1280 and dict(benchmark.cfas) == {"GRBG": 32, "BGGR": 8}
+    assert benchmark.items == 1280 and dict(benchmark.counts["cfas"]) == {"GRBG": 32, "BGGR": 8}
 
     np.save(tmp_path / "a.npy", np.zeros((4, 6, 4), np.uint16))
     write_picture(tmp_path / "a.png", torch.zeros(3, 8, 12, dtype=torch.uint8))
     (rawir,) = (part for part in check(tmp_path, first=1).parts if part.what.startswith("RAWIR"))
-    assert rawir.items == 1 and dict(rawir.sizes) == {"8 x 12": 1} and not rawir.broken
+    assert rawir.items == 1 and dict(rawir.counts["sizes"]) == {"8 x 12": 1} and not rawir.broken
 
 
 def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
@@ -118,7 +120,7 @@ def test_a_crash_and_a_hang_are_named_and_the_rest_is_read(tmp_path: Path, monke
     monkeypatch.setattr(sys.modules["rawaug.data.check"], "PictureFolder", Crashing)
     monkeypatch.setenv("RAWAUG_READ_SECONDS", "5")
     (part,) = check(tmp_path).parts
-    assert part.sizes.total() == 2 and part.items == part.examined == 4
+    assert part.counts["sizes"].total() == 2 and part.items == part.examined == 4
     crash, hang = part.broken
     assert "1.png: crashes the decoder (SIGSEGV" in crash and "2.png: cannot be read within 5 s" in hang
 

@@ -232,9 +232,9 @@ class Deadly(PictureFolder):
 
 
 def test_nothing_to_read_is_reported_at_once(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="none: no such folder of pictures"):
+    with pytest.raises(FileNotFoundError, match="none: no such picture file or folder"):
         PictureFolder(tmp_path / "none")
-    with pytest.raises(ValueError, match=r"contains no picture; supported extensions are \.bmp"):
+    with pytest.raises(ValueError, match=r"contains no picture file; supported extensions are \.bmp"):
         PictureFolder(tmp_path)
     (tmp_path / "a.png").write_bytes(b"broken")
     with pytest.raises(ValueError, match=r"1 of 1 pictures are unusable.*a\.png: cannot be read"):

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 from rawaug.bayer import CFA, pack
-from rawaug.data import Rawir, Rgb2Raw, Zurich, check, fivek_pairs, open_pairs
-from rawaug.data.published import CAMERAS, fivek_numbers
+from rawaug.data import check, open_pairs
+from rawaug.data.published import CAMERAS, Rawir, Rgb2Raw, Zurich, fivek_numbers, fivek_pairs
 from rawaug.io import develop, write_picture
 from rawaug.io.pictures import through_jpeg
 
@@ -73,11 +73,11 @@ def test_missing_frames_are_reported(fivek: Path) -> None:
         fivek_pairs(fivek, "test")
     with pytest.raises(FileNotFoundError, match="414 of the 414 DNGs of fivek nikon, train"):
         open_pairs(f"fivek_nikon:{fivek}:train")
-    with pytest.raises(ValueError, match="fivek: no split validation; use one of InvISP's: train, test"):
+    with pytest.raises(ValueError, match="fivek: no split validation; use one of train, test"):
         open_pairs(f"fivek:{fivek}", split="validation")
     with pytest.raises(ValueError, match="fivek: no camera sony; use one of canon, nikon"):
         fivek_pairs(fivek, "test", ["sony"])
-    with pytest.raises(FileNotFoundError, match="no such folder of FiveK"):
+    with pytest.raises(FileNotFoundError, match="no such FiveK file or folder"):
         fivek_pairs(fivek / "none", "test", CAMERAS)
 
 
@@ -119,7 +119,7 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
     assert [pair.name for pair in open_pairs(f"rawir:{tmp_path / 'data-p20'}", "train")] == ["a"]
     (pair,) = open_pairs(f"rawir:{tmp_path / 'data-p20'}", "validation")
     assert pair.name == "b" and not pair.registered
-    with pytest.raises(ValueError, match=r"test: contains no \.npy or \.npz file"):
+    with pytest.raises(ValueError, match=r"test: contains no RAWIR file"):
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
 
 
@@ -148,7 +148,7 @@ def test_rgb2raw_keeps_whole_raws_of_every_phone_aside(tmp_path: Path) -> None:
     pair = open_pairs(f"rgb2raw:{tmp_path}", "test")[2]
     assert (pair.name, pair.camera, pair.balance_known) == ("iphone-x/20_0", "iphone-x", False)
     assert pair.raw[0, 0, 3].item() == pytest.approx(200 / 4095)
-    with pytest.raises(ValueError, match="has no pair of RGB2RAW for train; it needs files of 10 RAWs"):
+    with pytest.raises(ValueError, match="has no pair for train; it needs files of 10 RAWs"):
         write_pair(tmp_path / "one", "1_0", "png")
         Rgb2Raw(tmp_path / "one", "train")
 
@@ -167,7 +167,7 @@ def test_what_is_wrong_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").unlink()
     with pytest.raises(FileNotFoundError, match=r"a\.npy: has no \.jpg or \.png of the same stem"):
         Rawir(tmp_path)
-    with pytest.raises(FileNotFoundError, match="none: no such folder of RAWIR"):
+    with pytest.raises(FileNotFoundError, match="none: no such RAWIR file or folder"):
         Rawir(tmp_path / "none")
 
 
@@ -258,9 +258,9 @@ def test_what_is_wrong_with_zurich_is_reported(zurich: Path) -> None:
     Image.fromarray(np.full((4, 4), 5000, np.uint16)).save(zurich / "test" / "huawei_raw" / "0.png")
     with pytest.raises(ValueError, match=r"0\.png: has value 5000, more than 10 bits"):
         Zurich(zurich, "test")[0]
-    with pytest.raises(ValueError, match="zurich: no split validation; use train or test"):
+    with pytest.raises(ValueError, match="zurich: no split validation; use one of train, test"):
         open_pairs(f"zurich:{zurich}", "validation")
-    with pytest.raises(FileNotFoundError, match="no such folder of Zurich"):
+    with pytest.raises(FileNotFoundError, match="huawei_raw: no such Zurich RAW to RGB file or folder"):
         Zurich(zurich / "train")
 
 
@@ -288,8 +288,11 @@ def test_the_clean_frame_is_the_mean_at_iso_100_at_the_noisy_exposure(
 
 
 def test_what_is_missing_is_named(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
-    with pytest.raises(FileNotFoundError, match="no such folder of RawBench"):
+    with pytest.raises(FileNotFoundError, match="no such RawBench file or folder"):
         open_pairs(f"rawbench:{tmp_path / 'none'}")
+    with pytest.raises(ValueError, match="contains no RawBench file"):
+        open_pairs(f"rawbench:{tmp_path}")
+    bayer_dng(tmp_path / "IMG_0001.ARW", np.full((32, 32), 99, np.uint16))
     with pytest.raises(ValueError, match=r"contains no RAW file named as Scene_0001_ISO3200_1\.ARW"):
         open_pairs(f"rawbench:{tmp_path}")
     (tmp_path / "Scene_0002").mkdir()

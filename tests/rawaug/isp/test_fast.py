@@ -71,8 +71,8 @@ def test_any_stage_may_be_left_out(left_out: str) -> None:
 
 
 @pytest.mark.usefixtures("either_way")
-@pytest.mark.parametrize("view", bayer.View)
-def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: bayer.View) -> None:
+@pytest.mark.parametrize("view", range(bayer.N_VIEWS))
+def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: int) -> None:
     isp = curved_isp()
     frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     params = isp.choose(frame)
@@ -177,8 +177,8 @@ def error_below_white(isp: DictionaryISP, made: Tensor, x5: Tensor, params: ISPP
 
 
 @pytest.mark.usefixtures("either_way")
-@pytest.mark.parametrize("view", [bayer.View.IDENTITY, bayer.View.TRANSPOSE])
-def test_fast_forward_undoes_the_mask_where_the_crop_was(view: bayer.View) -> None:
+@pytest.mark.parametrize("view", [0, 4])
+def test_fast_forward_undoes_the_mask_where_the_crop_was(view: int) -> None:
     isp = forward_curved()
     x5 = 0.3 * torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     params = isp.choose(x5)

@@ -86,7 +86,7 @@ def test_pictures_are_many_and_differ() -> None:
 def test_open_by_name() -> None:
     assert [pair.name for pair in open_pairs("demo:validation")] == [pair.name for pair in demo_pairs("validation")]
     assert len(open_pairs("demo:", split="train")) == PAIRS["train"]
-    with pytest.raises(ValueError, match="demo:holdout: unknown split; use one of train, validation, test"):
+    with pytest.raises(ValueError, match="demo: no split holdout; use one of train, validation, test"):
         open_pairs("demo:holdout")
     with pytest.raises(ValueError, match="count must be at least 1"):
         demo_pairs("train", 0)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.commands.evaluate import evaluate
-from rawaug.data import SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd import blocks as sidd_blocks
+from rawaug.data.sidd.blocks import SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddScene
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.config import ISPConfig

@@ -17,9 +17,6 @@ from rawaug.commands.frame_denoisers import Frame
 from rawaug.commands.submit import submit_sidd
 from rawaug.data import (
     SiddBenchmark,
-    SiddBlocks,
-    SiddFrames,
-    SiddPlusBlocks,
     check,
     check_submission,
     open_pairs,
@@ -27,7 +24,8 @@ from rawaug.data import (
 )
 from rawaug.data.mat import read_array
 from rawaug.data.sidd import blocks as blocks_module
-from rawaug.data.sidd.frames import HELD_BACK, PHONES, SiddScene
+from rawaug.data.sidd.blocks import SiddBlocks, SiddPlusBlocks
+from rawaug.data.sidd.frames import HELD_BACK, PHONES, SiddFrames, SiddScene
 from rawaug.io import write_picture
 from rawaug.io.pictures import view_of_orientation
 
@@ -234,12 +232,12 @@ def test_the_benchmark_and_its_submission(blocks: Path, tmp_path: Path) -> None:
     benchmark = SiddBenchmark(blocks)
     noisy = list(benchmark)
     assert len(noisy) == 1280 and noisy[0].name == f"{HELD_BACK[0]}_00" and noisy[0].cfa == CFA.GRBG
-    assert torch.equal(noisy[0].noisy, SiddBlocks(blocks)[31].noisy)  # type: ignore[arg-type]
+    assert torch.equal(noisy[0].mosaic, SiddBlocks(blocks)[31].noisy)  # type: ignore[arg-type]
     for extension in ("csv", "mat"):
         path = tmp_path / f"SubmitRaw.{extension}"
-        write_submission(path, (block.noisy / 2 for block in benchmark), SIDE)
+        write_submission(path, (block.mosaic / 2 for block in benchmark), SIDE)
         read = check_submission(path, SIDE)
-        assert torch.equal(read, torch.stack([block.noisy / 2 for block in noisy]))
+        assert torch.equal(read, torch.stack([block.mosaic / 2 for block in noisy]))
 
 
 class Noted:
@@ -266,7 +264,7 @@ def test_the_command_takes_published_levels_or_asks_for_them(blocks: Path, tmp_p
     assert submit_sidd(str(tmp_path), out, method) == 1280
     assert [method.seen[32 * k] for k in (0, 7, 39)] == [(0.0, 1e-4), (7.0, 1e-4), (39.0, 1e-4)]
     written = check_submission(out, SIDE)
-    assert torch.equal(written[0], (SiddBenchmark(blocks)[0].noisy + 0.1).clamp(0.0, 1.0)) and written[32].max() == 0.0
+    assert torch.equal(written[0], (SiddBenchmark(blocks)[0].mosaic + 0.1).clamp(0.0, 1.0)) and written[32].max() == 0.0
     with pytest.raises(
         ValueError, match=rf"{HELD_BACK[0]}: its noise cannot be estimated .* put noise_level_functions"
     ):

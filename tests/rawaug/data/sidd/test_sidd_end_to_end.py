@@ -114,6 +114,6 @@ def test_sidd_full_trains_scores_and_writes_what_the_benchmark_takes(
     out = tmp_path / "SubmitRaw.csv"
     assert main(["submit", f"sidd:{sidd / 'SIDD_Validation'}", str(out), "--denoiser", str(weights)]) == 0
     assert "1280 blocks, checked" in capsys.readouterr().out
-    noisy = torch.stack([block.noisy for block in SiddBenchmark(sidd / "SIDD_Validation")])
+    noisy = torch.stack([block.mosaic for block in SiddBenchmark(sidd / "SIDD_Validation")])
     shift = (check_submission(out, SIDE) - noisy).abs().mean((1, 2, 3))
     assert (shift > 0.0).all() and shift.max() < 0.2, "each block is a denoised one of its own"
