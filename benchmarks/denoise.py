@@ -70,10 +70,7 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
         white_balance=(2.0, 1.0, 1.5),
         daylight=(2.0, 1.0, 1.5),
         color_matrix=torch.eye(3),
-        camera="unknown",
-        iso=None,
         noise_profile=(1e-3, 1e-5),
-        orientation=0,
         name="noise",
     )
     method = frame_denoiser(denoiser, device=str(device))

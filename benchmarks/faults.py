@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -149,11 +149,15 @@ def _run(folder: Path, log: Path, command: list[str], before: Callable[[], None]
         return 1
 
 
-def contents(folder: Path) -> dict[str, Any]:
-    """By name, what of each file is compared."""
+Files = dict[str, Any]
+"""By name, what of each file is compared."""
+
+
+def contents(folder: Path) -> Files:
+    """The files of a folder."""
     from rawaug.files import read_tensors
 
-    found: dict[str, Any] = {}
+    found: Files = {}
     for file in sorted(folder.rglob("*")):
         name = str(file.relative_to(folder))
         if not file.is_file() or file.suffix in LEFT_OUT or file.name.startswith("events.out"):
@@ -175,7 +179,7 @@ def fresh(folder: Path) -> Path:
 # -- kills ------------------------------------------------------------------------------------------------------------
 
 
-def uninterrupted(folder: Path, name: str) -> tuple[dict[str, Any], float]:
+def uninterrupted(folder: Path, name: str) -> tuple[Files, float]:
     """The files of a run that is left alone, and its seconds.
 
     Raises:
@@ -187,7 +191,7 @@ def uninterrupted(folder: Path, name: str) -> tuple[dict[str, Any], float]:
     return contents(folder / OUT), time.monotonic() - child.start
 
 
-def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole: dict[str, Any]) -> str | None:
+def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole: Files) -> str | None:
     """What went wrong with a run that was killed after ``delay`` seconds and run again; None if nothing did."""
     child = Child(fresh(folder), COMMANDS[name])
     time.sleep(delay)
@@ -203,15 +207,13 @@ def killed(folder: Path, name: str, number: signal.Signals, delay: float, whole:
     return f"{name}, {number.name} after {delay:.2f} s: {', '.join(different)} differ" if different else None
 
 
-def kills(folder: Path, names: list[str], count: int, seed: int) -> Iterator[tuple[str, list[str], float]]:
-    """By command: its faults, and the seconds of a run."""
-    for name in names:
-        whole, seconds = uninterrupted(folder, name)
-        moments = random.Random(f"{seed} {name}")
-        outcomes = (
-            killed(folder, name, SIGNALS[k % len(SIGNALS)], moments.uniform(0, seconds), whole) for k in range(count)
-        )
-        yield name, [outcome for outcome in outcomes if outcome], seconds
+def kills(folder: Path, name: str, count: int, seed: int, whole: Files, seconds: float) -> list[str]:
+    """What went wrong with ``count`` kills of a command."""
+    moments = random.Random(f"{seed} {name}")
+    outcomes = (
+        killed(folder, name, SIGNALS[k % len(SIGNALS)], moments.uniform(0, seconds), whole) for k in range(count)
+    )
+    return [outcome for outcome in outcomes if outcome]
 
 
 # -- other faults -----------------------------------------------------------------------------------------------------
@@ -226,9 +228,16 @@ def one_line(child: Child, *said: str) -> str | None:
     return f"status {status}: {text}"
 
 
-def full_disk(folder: Path, name: str) -> str | None:
+def unharmed(folder: Path, name: str, whole: Files, before: Callable[[], None]) -> str | None:
+    """What is wrong with a run under a fault that must change nothing."""
+    child = Child(fresh(folder), COMMANDS[name], before)
+    status = child.wait()
+    return None if status == 0 and contents(folder / OUT) == whole else f"status {status}: {child.said()}"
+
+
+def full_disk(folder: Path, name: str, whole: Files) -> str | None:
     """A disk with room for a part: one line, and the files that are there are whole."""
-    whole, _ = uninterrupted(folder, name)
+    Child(fresh(folder), COMMANDS[name]).wait()
     size = sum(file.stat().st_size for file in (folder / OUT).rglob("*") if file.is_file())
     with small_file_system(fresh(folder) / OUT, max(16, size // 2048)):
         if wrong := one_line(Child(folder, COMMANDS[name]), "No space left on device"):
@@ -246,9 +255,8 @@ def stop_at_work(folder: Path, child: Child) -> None:
     child.send(signal.SIGSTOP)
 
 
-def two_at_once(folder: Path, name: str) -> str | None:
+def two_at_once(folder: Path, name: str, whole: Files) -> str | None:
     """The second of two is refused; the first comes to its end."""
-    whole, _ = uninterrupted(folder, name)
     first = Child(fresh(folder), COMMANDS[name])
     stop_at_work(folder, first)
     first.log = first.log.rename(folder / "first.txt")
@@ -259,29 +267,23 @@ def two_at_once(folder: Path, name: str) -> str | None:
     return wrong or (None if contents(folder / OUT) == whole else "the first ended with other files")
 
 
-def few_descriptors(folder: Path, name: str) -> str | None:
+def few_descriptors(folder: Path, name: str, whole: Files) -> str | None:
     """64 open files are enough."""
-    whole, _ = uninterrupted(folder, name)
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    child = Child(fresh(folder), COMMANDS[name], lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (64, limit)))
-    status = child.wait()
-    return None if status == 0 and contents(folder / OUT) == whole else f"status {status}: {child.said()}"
+    return unharmed(folder, name, whole, lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (64, limit)))
 
 
-def jumping_clock(folder: Path, name: str) -> str | None:
+def jumping_clock(folder: Path, name: str, whole: Files) -> str | None:
     """A wall clock that jumps by years, back and forth, changes nothing."""
-    whole, _ = uninterrupted(folder, name)
     jumps = random.Random(0)
 
     def jump() -> None:
         time.time = lambda: jumps.uniform(0, 4e9)
 
-    child = Child(fresh(folder), COMMANDS[name], jump)
-    status = child.wait()
-    return None if status == 0 and contents(folder / OUT) == whole else f"status {status}: {child.said()}"
+    return unharmed(folder, name, whole, jump)
 
 
-def removed_folder(folder: Path, name: str) -> str | None:
+def removed_folder(folder: Path, name: str, whole: Files) -> str | None:
     """The output folder is removed in the middle: one line, no false success."""
     child = Child(fresh(folder), COMMANDS[name])
     stop_at_work(folder, child)
@@ -290,21 +292,21 @@ def removed_folder(folder: Path, name: str) -> str | None:
     return one_line(child, OUT)
 
 
-def unwritable_folder(folder: Path, name: str) -> str | None:
+def unwritable_folder(folder: Path, name: str, whole: Files) -> str | None:
     """An output folder on a file system that is mounted read-only."""
     with small_file_system(fresh(folder) / OUT, 64):
         subprocess.run(["mount", "-o", "remount,ro", str(folder / OUT)], check=True)
         return one_line(Child(folder, COMMANDS[name]), OUT, "Read-only file system")
 
 
-def little_shared_memory(folder: Path, name: str) -> str | None:
+def little_shared_memory(folder: Path, name: str, whole: Files) -> str | None:
     """Workers whose /dev/shm is full: one line; and the same command goes on to the same files where it is not."""
     if name not in WITH_WORKERS:
         raise Skipped("sends no tensors between processes")
     command = [*COMMANDS[name], *WITH_WORKERS[name]]
-    whole = Child(fresh(folder), command)
-    if status := whole.wait():
-        return f"with workers: status {status}: {whole.said()}"
+    alone = Child(fresh(folder), command)
+    if status := alone.wait():
+        return f"with workers: status {status}: {alone.said()}"
     expected = contents(folder / OUT)
     for kilobytes in SHARED_KILOBYTES:
         short = Child(fresh(folder), command, lambda size=kilobytes: small_shared_memory(size))  # type: ignore[misc]
@@ -329,14 +331,6 @@ FAULTS = {
 }
 
 
-def attempted(fault: str, folder: Path, name: str) -> tuple[str | None, str]:
-    """What is wrong, if anything, and what to say otherwise."""
-    try:
-        return FAULTS[fault](folder, name), "as it should be"
-    except Skipped as why:
-        return None, f"skipped: {why}"
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20, help="of each command")
@@ -351,11 +345,16 @@ def main(arguments: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_inputs(folder)
-        for command, wrong, seconds in kills(folder, args.commands, count, args.seed):
+        for command in args.commands:
+            whole, seconds = uninterrupted(folder, command)
+            wrong = kills(folder, command, count, args.seed, whole, seconds)
             results[command] = {"seconds": round(seconds, 2), "kills": count, "wrong": wrong}
             print(f"{command:8} {seconds:5.1f} s  {count} kills, {len(wrong)} wrong", flush=True)
             for fault in args.faults:
-                found, said = attempted(fault, folder, command)
+                try:
+                    found, said = FAULTS[fault](folder, command, whole), "as it should be"
+                except Skipped as why:
+                    found, said = None, f"skipped: {why}"
                 results[command][fault] = found
                 print(f"{command:8} {fault}: {found or said}", flush=True)
     took = round(time.perf_counter() - start)

@@ -180,9 +180,6 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFram
         "daylight": white_balance,
         "color_matrix": color_matrix,
         "camera": "rawaug dictionary ISP",
-        "iso": None,
-        "orientation": 0,
-        "name": "",
         "gain_maps": _shading_maps(augment, pair),
     }
     levels = noise_levels(pair)

@@ -76,7 +76,7 @@ def fivek_pairs(
         jpeg_quality: the pictures as JPEGs of this quality give them back; None leaves them as they are.
     """
     wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
-    files = {found[1]: file for file in files_in(path, "FiveK") if (found := FIVEK_DNG.fullmatch(file.name))}
+    files = {found[1]: file for file in files_in(path, "FiveK", (".dng",)) if (found := FIVEK_DNG.fullmatch(file.name))}
     missing = [number for number in wanted if number not in files]
     if missing:
         raise FileNotFoundError(

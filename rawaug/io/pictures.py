@@ -96,9 +96,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         ValueError: if the shape is wrong, a value leaves [0, 1], or the extension is unknown.
         OSError: if the file cannot be written.
     """
-    with extra("raw"):
-        import OpenImageIO as oiio
-
+    oiio = _oiio()
     if srgb.ndim != 3 or srgb.shape[0] != 3:
         raise ValueError(f"{path}: the picture must have shape (3, H, W), got {tuple(srgb.shape)}")
     pixels = srgb.detach().cpu().permute(1, 2, 0).numpy()
@@ -127,7 +125,8 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
 
     def kind(spec: Any) -> str:
         _require_srgb(spec, path)
-        return "float" if spec.format.basetype in _floating() else "uint8"
+        floats = _oiio().HALF, _oiio().FLOAT, _oiio().DOUBLE
+        return "float" if spec.format.basetype in floats else "uint8"
 
     pixels, spec = _decoded(path, max_pixels, kind)
     pixels = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
@@ -158,9 +157,7 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
 
 
 def _opened(path: Path) -> Any:
-    with extra("raw"):
-        import OpenImageIO as oiio
-
+    oiio = _oiio()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such picture file")
     require_utf8(path)
@@ -176,11 +173,11 @@ def require_utf8(path: Path) -> None:
         raise OSError(f"{os.fsencode(path)!r}: cannot be opened because its name is not UTF-8; rename it")
 
 
-def _floating() -> tuple[Any, ...]:
+def _oiio() -> Any:
     with extra("raw"):
-        import OpenImageIO as oiio
+        import OpenImageIO
 
-    return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
+    return OpenImageIO
 
 
 def _require_size(spec: Any, path: Path, max_pixels: int) -> None:

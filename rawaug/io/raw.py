@@ -127,11 +127,11 @@ class RawFrame:
     white_balance: tuple[float, float, float]
     daylight: tuple[float, float, float]
     color_matrix: Tensor
-    camera: str
-    iso: float | None
-    noise_profile: tuple[float, float] | None
-    orientation: int
-    name: str
+    camera: str = "unknown"
+    iso: float | None = None
+    noise_profile: tuple[float, float] | None = None
+    orientation: int = 0
+    name: str = ""
     color_known: bool = True
     gain_maps: tuple[GainMap, ...] = ()
     exposure: Exposure = UNKNOWN

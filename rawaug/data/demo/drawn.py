@@ -232,18 +232,6 @@ def _ellipse(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
     _brush(picture).ellipse([*(centre - half), *(centre + half)], fill=_colour(rng))
 
 
-def _box(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
-    _boxes(picture, centre, radius, rng, rng.random() * math.pi)
-
-
-def _upright(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
-    _boxes(picture, centre, radius, rng, rng.normal(0.0, 0.03))
-
-
-def _stripes(picture: Any, centre: np.ndarray, radius: float, rng: Rng) -> None:
-    _boxes(picture, centre, radius, rng, rng.random() * math.pi, stripes=int(rng.integers(2, 20)))
-
-
 def _boxes(picture: Any, centre: np.ndarray, radius: float, rng: Rng, angle: float, stripes: int = 0) -> None:
     """A box, and as many stripes of another colour across it."""
     half_width, half_height = radius * np.exp(rng.normal(0.0, 0.6, 2))
@@ -290,10 +278,12 @@ def _brush(picture: Any) -> Any:
 
 KINDS: dict[str, Callable[[Any, np.ndarray, float, Rng], None]] = {
     "ellipse": _ellipse,
-    "box": _box,
-    "upright box": _upright,
+    "box": lambda picture, at, radius, rng: _boxes(picture, at, radius, rng, rng.random() * math.pi),
+    "upright box": lambda picture, at, radius, rng: _boxes(picture, at, radius, rng, rng.normal(0.0, 0.03)),
     "polygon": _polygon,
-    "stripes": _stripes,
+    "stripes": lambda picture, at, radius, rng: _boxes(
+        picture, at, radius, rng, rng.random() * math.pi, stripes=int(rng.integers(2, 20))
+    ),
     "lettering": _lettering,
 }
 """How each kind of shape is drawn: ``(PIL picture, centre, radius, rng)``, in pixels of the oversampled picture."""

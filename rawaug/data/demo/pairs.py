@@ -45,7 +45,7 @@ def demo_photographs(split: str) -> dict[str, Tensor]:
         FileNotFoundError: if scikit-image's installation lacks them.
     """
     require_split("demo", split, PHOTOGRAPHS)
-    return dict(_photographs(split))
+    return dict(_read(PHOTOGRAPHS[split]))
 
 
 def demo_files() -> list[Path]:
@@ -108,7 +108,7 @@ def open_demo_pictures(path: str = "", min_side: int = 2) -> list[Tensor]:
 
 
 def _users_photographs() -> list[Tensor]:
-    return [*_photographs("train").values(), *_read(PICTURES_ONLY).values()]
+    return [*demo_photographs("train").values(), *_read(PICTURES_ONLY).values()]
 
 
 @cache
@@ -118,7 +118,7 @@ def _leaves(k: int, seed: int) -> Tensor:
 
 @cache
 def _pair(split: str, k: int, seed: int) -> Pair:
-    photographs = _photographs(split)
+    photographs = demo_photographs(split)
     scenes = list(photographs) if split == "train" else [*photographs, "leaves"]
     scene, turn = scenes[k % len(scenes)], k // len(scenes)
     generator = keyed_generator(seed, "demo pair", split, k)
@@ -139,10 +139,6 @@ def _random_crop(photograph: Tensor, generator: torch.Generator) -> Tensor:
     )
     crop = photograph[:, top : top + FRAME[0], left : left + FRAME[1]]
     return crop.flip(-1) if torch.rand((), generator=generator) < 0.5 else crop
-
-
-def _photographs(split: str) -> dict[str, Tensor]:
-    return _read(PHOTOGRAPHS[split])
 
 
 @cache
