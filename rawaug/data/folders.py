@@ -82,9 +82,9 @@ def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -
 class PictureFolder(Dataset[Tensor]):
     """The pictures of a folder and its subfolders, sorted by path: uint8 ``(3, H, W)`` of any size.
 
-    After every ``len(self)`` pictures read (an epoch), by however many workers, the files skipped so far are logged as
-    a warning; :attr:`skipped` and :meth:`report` list them at any time. Where a decoder crashes a worker,
-    :meth:`being_read` names the file, and ``rawaug data check`` finds all such files.
+    A file that cannot be used is logged with the reason when it is met; :attr:`skipped` and :meth:`report` list those
+    met so far, by whichever worker. Where a decoder crashes a worker, :meth:`being_read` names the file, and ``rawaug
+    data check`` finds all such files.
 
     Args:
         path: a folder; files with one of :data:`PICTURE_EXTENSIONS` are taken, links to folders are not followed.
@@ -114,9 +114,7 @@ class PictureFolder(Dataset[Tensor]):
         self._names = np.array([os.fsencode(name) for name in found])
         self._bad = torch.zeros(len(self), dtype=torch.uint8).share_memory_()
         # one slot a worker, which alone writes to it
-        self._read = torch.zeros(_SLOTS, dtype=torch.int64).share_memory_()
         self._reading = torch.full((_SLOTS,), -1, dtype=torch.int64).share_memory_()
-        self._epochs_logged = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._reasons: dict[int, str] = {}
         _OPENED.add(self)
 
@@ -127,7 +125,6 @@ class PictureFolder(Dataset[Tensor]):
         first = range(len(self))[index]
         for candidate in chain(range(first, len(self)), range(first)):
             if not self._bad[candidate] and (picture := self._attempt(candidate)) is not None:
-                self._count()
                 return picture
         raise AssertionError("the share of skipped files is checked before the last one is")
 
@@ -186,6 +183,7 @@ class PictureFolder(Dataset[Tensor]):
             return self.read(index)
         except (OSError, ValueError) as error:
             self._reasons[index] = str(error)
+            _log.warning("skipped: %s", escape(error))
         finally:
             self._reading[slot] = -1
         self._bad[index] = 1
@@ -198,15 +196,6 @@ class PictureFolder(Dataset[Tensor]):
                 f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
             )
         return None
-
-    def _count(self) -> None:
-        """Count a reading; the worker that completes an epoch logs what was skipped (two may, in a race)."""
-        self._read[_slot()] += 1
-        epoch = int(self._read.sum()) // len(self)
-        if epoch > self._epochs_logged[0]:
-            self._epochs_logged[0] = epoch
-            if self._bad.any():
-                _log.warning("%s", self.report())
 
 
 _OPENED: WeakSet[PictureFolder] = WeakSet()

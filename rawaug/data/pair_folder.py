@@ -74,11 +74,9 @@ class PairFolder(LazyPairs):
     Args:
         path: where the pairs are.
         split: is ignored: a folder has no splits.
-        noisy: pattern of the noisy files' names, or of their paths where it has a slash; other files are left out.
-            Without it all readable files must belong to a pair by the naming of ``rawaug synth``.
-        clean: pattern of the clean ones; by default ``noisy`` with the word noisy replaced by clean.
-        cfa: such as ``"RGGB"``, of files that do not state it.
-        black, white: levels of files that do not state them, in digital numbers; ``black`` is one, or R, Gr, Gb, B.
+        noisy: a pattern with a slash is one of paths; files of other names are left out. Without a pattern all readable
+            files must belong to a pair by the naming of ``rawaug synth``.
+        clean, cfa, black, white: as in :class:`PairSettings`.
 
     Raises:
         FileNotFoundError: if there is no such path, or a frame has no partner.

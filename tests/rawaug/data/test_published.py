@@ -119,7 +119,7 @@ def test_splits_are_folders_and_the_p20_is_not_registered(tmp_path: Path) -> Non
     assert [pair.name for pair in open_pairs(f"rawir:{tmp_path / 'data-p20'}", "train")] == ["a"]
     (pair,) = open_pairs(f"rawir:{tmp_path / 'data-p20'}", "validation")
     assert pair.name == "b" and not pair.registered
-    with pytest.raises(ValueError, match=r"test: contains no RAWIR file"):
+    with pytest.raises(FileNotFoundError, match="test: no such RAWIR file or folder"):
         open_pairs(f"rawir:{tmp_path / 'data-p20'}", "test")
 
 
@@ -192,7 +192,7 @@ def test_damaged_arrays_are_named_and_the_rest_is_read(damage: Callable[[bytes],
         Rawir(tmp_path)[1]
     assert "\n" not in str(error.value)
     (part,) = (part for part in check(tmp_path).parts if part.what.startswith("RAWIR"))
-    assert len(part.broken) == 1 and "b.npy" in part.broken[0] and part.sizes["12 x 16"] == 2
+    assert len(part.broken) == 1 and "b.npy" in part.broken[0] and part.counts["sizes"]["12 x 16"] == 2
 
 
 def test_an_archive_in_place_of_an_array(tmp_path: Path) -> None:
