@@ -67,16 +67,15 @@ def progress(
     if stream.isatty() or tqdm is not terminal_tqdm:  # tqdm.auto is another class in a notebook
         return tqdm(items, file=stream, leave=leave, **settings)
     seconds = float(os.environ.get("RAWAUG_PROGRESS_SECONDS", "30"))
-    often = {"mininterval": seconds, "maxinterval": seconds, "delay": seconds, "miniters": 1}
-    return _Lines(items, file=stream, leave=False, bar_format=_LINE, **often, **settings)
+    settings |= {"mininterval": seconds, "maxinterval": seconds, "delay": seconds, "miniters": 1}
+    return _Lines(items, file=stream, leave=False, bar_format=_LINE, **settings)
 
 
-class _Lines(terminal_tqdm):  # type: ignore[type-arg, misc]
+class _Lines(terminal_tqdm):
     """Writes a line where tqdm draws over the last one."""
 
-    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
         self.fp.write(f"{self}\n")
-        return True
 
     def close(self) -> None:
         if not self.disable and self.n > self.last_print_n and self.last_print_t > self.start_t:
