@@ -16,7 +16,7 @@ ones add up. Their parameters share one dictionary and one seed a picture, from 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -215,6 +215,10 @@ class DefectPixels(_FixedPattern):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         shares = {"dead_share": draw(self.dead, batch, generator), "hot_share": draw(self.hot, batch, generator)}
         return shares | {"seed": new_seeds(batch, generator)}
+
+    def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
+        """Frames of a burst, each with a seed of its own, have the defects of one sensor."""
+        return super().generators({**params, "seed": params.get("sensor_seed", params["seed"])}, device)
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         noisy = clean.clone() if out is None else out.copy_(clean)

@@ -72,7 +72,8 @@ class RawAugment(nn.Module):
         jpeg: of ``"srgb"``: lowest and highest quality of the JPEG that the noisy picture goes through (no JPEG).
         burst: number N of noisy frames of the scene that a pair holds, ``(B, N, ...)``; clean is that of the first. By
             default a single one, without the N.
-        motion: of a burst: largest shift in pixels and rotation in degrees, see :mod:`rawaug.plugin.bursts`.
+        motion: of a burst: largest shift in pixels and rotation in degrees, (2, 0.5) by default; see
+            :mod:`rawaug.plugin.bursts`.
         stops: of a burst: exposure of each frame in stops, for brackets; all alike by default.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
@@ -104,7 +105,7 @@ class RawAugment(nn.Module):
         demosaicing: str | Sequence[str] | None = None,
         jpeg: tuple[int, int] | None = None,
         burst: int | None = None,
-        motion: tuple[float, float] = (2.0, 0.5),
+        motion: tuple[float, float] | None = None,
         stops: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
@@ -116,6 +117,8 @@ class RawAugment(nn.Module):
         self.baked = frozen(BakedISP(isp))
         self.targets = Targets(target, demosaicing, jpeg, self.cfa)
         self.forward_pass = frozen(FastForward(isp)) if target == "srgb" else None
+        if burst is None and (motion, stops) != (None, None):
+            raise ValueError("motion and stops are those of a burst; give burst, or omit them")
         self.burst = None if burst is None else Burst(burst, motion, stops)
         self._draw(noise, sampling, strength, seed, exposure, light, tone)
 
@@ -303,7 +306,8 @@ class RawAugment(nn.Module):
         scene = self.baked.colours(srgb, params.isp, params.place, shaded=False)
         repeated = params.map(lambda t: t.repeat_interleave(burst.frames, 0))
         if "seed" in repeated.noise:
-            repeated.noise["seed"] = params.extras["frame_seed"].flatten()
+            seeds = {"sensor_seed": repeated.noise["seed"], "seed": params.extras["frame_seed"].flatten()}
+            repeated.noise.update(seeds)
         moved = burst.frames_of(scene, params.extras["motion"])
         frames = burst.exposed(self.baked.shade(moved, repeated.isp, repeated.place))
         noisy, clean, variance = (

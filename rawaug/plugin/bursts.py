@@ -2,7 +2,7 @@
 
 Frame k shows the scene of the first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor
 pixels: light is interpolated (bicubic) before the mosaic, so that each frame samples the scene at other places, and has
-noise of its own. The lens moves with the sensor: its shading stays where it is. What comes into view at the edges is
+noise of its own. Lens shading and defects of the sensor stay where they are. What comes into view at the edges is
 reflected.
 """
 
@@ -18,11 +18,17 @@ from torch import Tensor
 from rawaug.kernels.runtime import one_thread
 from rawaug.noise.models import new_seeds
 
+MOTION = (2.0, 0.5)
+"""Largest shift in pixels, and rotation in degrees."""
+
 
 class Burst:
     """How many frames there are, and how they move."""
 
-    def __init__(self, frames: int, motion: tuple[float, float], stops: Sequence[float] | None) -> None:
+    def __init__(
+        self, frames: int, motion: tuple[float, float] | None = None, stops: Sequence[float] | None = None
+    ) -> None:
+        motion = MOTION if motion is None else motion
         if not isinstance(frames, int) or frames < 1:
             raise ValueError(f"burst must be a number of frames, at least 1, got {frames!r}")
         if len(motion) != 2 or not min(motion) >= 0:

@@ -6,6 +6,7 @@ import io
 import json
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,6 +108,19 @@ def test_a_sample_is_replayed_bit_for_bit_and_only_from_its_picture(
     (tmp_path / described["picture"]).write_bytes((pictures / "z.png").read_bytes())
     with pytest.raises(ValueError, match=r"sub/a\.png: the picture .* has changed since"):
         replay_sample(described, tmp_path)
+
+
+def test_bursts_of_developed_pictures_are_replayed(pictures: Path, tmp_path: Path) -> None:
+    form: dict[str, Any] = {"target": "srgb", "jpeg": (60, 90), "burst": 2}
+    synth(pictures / "z.png", tmp_path, "webdataset", noise=FIXED, workers=0, **form)
+    (sample,) = samples(tmp_path).values()
+    noisy, clean = (torch.from_numpy(np.load(io.BytesIO(sample[f"{name}.npy"]))) for name in ("noisy", "clean"))
+    described = json.loads(sample["json"])
+    pair = replay_sample(described, pictures)
+    assert torch.equal(pair.noisy, noisy) and torch.equal(pair.clean, clean) and noisy.shape == (2, *clean.shape)
+    assert (described["height"], described["width"]) == tuple(clean.shape[-2:])
+    card = (tmp_path / "README.md").read_text()
+    assert "developed sRGB, float32 `(3, H, W)`" in card and "an axis of 2 frames" in card and "| burst | 2 |" in card
 
 
 def test_index_and_card_count_what_is_there(whole: Path) -> None:

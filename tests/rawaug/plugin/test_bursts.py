@@ -16,6 +16,7 @@ from rawaug.bayer import pack_rgb
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.stages import LensShading
 from rawaug.metrics import psnr
+from rawaug.noise import DefectPixels, RowNoise
 from rawaug.plugin.bursts import moved
 
 N = 8
@@ -47,6 +48,13 @@ def test_the_first_frame_is_the_single_one(universal: DictionaryISP, srgb: Tenso
     single, pair = RawAugment(universal)(srgb, seeded()), RawAugment(universal, burst=3)(srgb, seeded())
     assert torch.equal(pair.clean, single.clean)
     assert not torch.equal(pair.noisy[:, 0] - pair.clean, pair.noisy[:, 1] - pair.clean)
+
+
+def test_defects_of_the_sensor_stay_and_its_noise_does_not(universal: DictionaryISP, srgb: Tensor) -> None:
+    for noise, same in ((DefectPixels(dead=0.02, hot=0.02), True), (RowNoise(1e-4), False)):
+        pair = RawAugment(universal, noise=noise, burst=2, motion=(0, 0))(srgb, seeded())
+        assert not torch.equal(pair.noisy[:, 0], pair.clean)
+        assert torch.equal(pair.noisy[:, 0], pair.noisy[:, 1]) == same
 
 
 @pytest.mark.parametrize("attention", [False, True])
@@ -122,6 +130,8 @@ def test_linear_rgb_is_the_first_frame_s(universal: DictionaryISP, srgb: Tensor)
         ({"burst": 0}, "at least 1, got 0"),
         ({"burst": 2, "motion": (-1, 0)}, "motion must be"),
         ({"burst": 2, "stops": (0,)}, "each of 2 frames, got 1"),
+        ({"motion": (1, 0)}, "are those of a burst; give burst"),
+        ({"stops": (0, 1)}, "are those of a burst; give burst"),
     ],
 )
 def test_bursts_without_meaning_are_refused(universal: DictionaryISP, settings: Any, message: str) -> None:
