@@ -228,8 +228,9 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
     images = comparison_frame(frame)[: len(names)]
     example = torch.rand(1, model.channels, 70, 90)
     examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
+    stated = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
     with replacing(out) as partial:
-        to_onnx(model, examples, "denoised", partial, {"stride": str(model.stride), "info": json.dumps(info)})
+        to_onnx(model, examples, "denoised", partial, stated)
         session, values = session_of(partial), feeds(names, images)
         with torch.inference_mode():
             expected = model(*images)

@@ -48,6 +48,22 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
         assert (torch.from_numpy(denoised) - expected).abs().max() < 1e-4
 
 
+def test_full_colour_is_exported_as_well(tmp_path: Path) -> None:
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name, reason="pip install rawaug[export]")
+    model, files = (
+        denoisers.JointDRUNet(width=4, scales=2),
+        [tmp_path / f"joint.{kind}" for kind in ("safetensors", "onnx")],
+    )
+    model.initialise(seed=1, gain=0.5)
+    denoisers.save(model, files[0], {"cfa": "RGGB"})
+    export(*files)
+    frame = Block(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
+    both = [frame_denoiser(file, linear=True)(frame, (1e-3, 1e-5)) for file in files]
+    assert both[0].shape == (3, 130, 94) and both[0].std() > 0.01
+    assert (both[0] - both[1]).abs().max() < 1e-4
+
+
 def test_of_the_exporter_errors_alone_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     below = logging.getLogger("exporter.registration")
     with errors_only("exporter"):
