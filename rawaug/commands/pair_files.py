@@ -2,8 +2,8 @@ r"""A pair on disk: ``NAME.npz``, or ``NAME_clean`` and ``NAME_noisy`` as ``.dng
 
 :mod:`rawaug.data.formats` says what these hold; the frames of a burst are ``NAME_noisy_0`` and so on, in NPZ one array.
 ``NAME.safetensors``, the parameters that replay the pair, is written last: a pair is there when its parameters are. A
-DNG's black level is as high as the darkest noisy value needs, so that
-nothing is clipped at black; the clean file has the same levels.
+DNG's black level is as high as the darkest noisy value needs, so that nothing is clipped at black; all files of a pair
+have the same levels.
 """
 
 from __future__ import annotations

@@ -67,7 +67,8 @@ class AugmentParams(NamedTuple):
 class RawPair(NamedTuple):
     """A training pair, packed R, Gr, Gb, B; without the leading B where it comes from a Dataset.
 
-    RAW of other patterns than Bayer's (:mod:`rawaug.bayer`) is ``(B, 1, H, W)`` in all three.
+    RAW of other patterns than Bayer's (:mod:`rawaug.bayer`) is ``(B, 1, H, W)`` in all three. Other targets and bursts
+    have the shapes that :class:`rawaug.RawAugment` states.
 
     Args:
         noisy: ``(B, 4, H/2, W/2)``, at most 1, not clipped at 0.
