@@ -49,9 +49,9 @@ class FitConfig:
         size: "small" has at most 8 atoms a dictionary and narrow encoders: with encoders 0.12 M parameters instead
             of 0.52 M, without them about 5,000 in either case.
         atoms: largest number of atoms in each dictionary; more frames than that are clustered.
-        reach: atoms of gains that no frame had are added up to ``atoms``, red and blue gains this factor (and the
-            digital gain its fourth root) to either side of the frames' mean, so that the hull holds other light as
-            well; 1 adds none.
+        reach: gain atoms that no frame had are added, up to ``atoms`` in all: the frames' mean with red and blue gains
+            multiplied and divided by this factor (the digital gain by its fourth root), so that the hull holds other
+            light as well; 1 adds none.
         steps: refinement steps of each direction.
         pixels: random pixels kept of each frame.
         batch: pixels of each frame in a step.
@@ -59,8 +59,8 @@ class FitConfig:
         shading: "on" fits the lens shading mask, "off" omits the stage, "auto" keeps a mask that removes
             at least half of the squared error.
         tone: "learned" is the tone network and gamma of the paper, "curve" a monotone curve as a table, the same for R,
-            G and B. "auto" fits both without some of the frames and takes that which is better on these, given their
-            as-shot gains; with one frame, "learned".
+            G and B. "auto" fits both with some of the frames held out and keeps the one that is better on those, given
+            their as-shot gains; with one frame, "learned".
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
