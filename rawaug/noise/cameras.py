@@ -22,7 +22,7 @@ if they contained a white balance, so the green ones serve all channels: photons
 every filter. It measures after demosaicing and on fine details, where noise has been averaged: for four cameras that
 ELD measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All
 are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100
-is then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out, and counted.
+is then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out.
 
 *Measured cameras.* Between the ISO values of a fitted camera's files, the logarithms of both variances are linear in
 that of the ISO: the gain grows with the ISO, in steps where an amplifier is switched, which a table follows better than
@@ -47,6 +47,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from rawaug.noise.levels import (
     EldLevels,
@@ -83,8 +84,6 @@ class Profiles(NamedTuple):
     names: tuple[str, ...]
     table: Tensor
     rows: Tensor
-    rows_left_out: int
-    cameras_left_out: tuple[str, ...]
 
     def limits(self) -> Tensor:
         """Logarithms of the lowest and highest ISO of each camera, ``(N, 2)``."""
@@ -95,31 +94,22 @@ class Profiles(NamedTuple):
 @cache
 def published_profiles() -> Profiles:
     """The package's ``profiles.tsv``; the geometric mean where a camera has an ISO twice."""
-    cameras: dict[str, dict[float, list[tuple[float, float]]]] = {}
-    left_out = 0
+    cameras: dict[str, dict[float, list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
     for line in text.splitlines()[2:]:
         maker, model, iso, *variances = line.split("\t")
-        rows = cameras.setdefault(f"{maker} {model}", defaultdict(list))
-        shot_var, read_var = float(variances[1]) * SHOT_ON_MOSAIC, float(variances[4]) * READ_ON_MOSAIC
-        if shot_var > 0 and read_var > 0:
-            rows[math.log(float(iso))].append((math.log(shot_var), math.log(read_var)))
-        else:
-            left_out += 1
-    names = tuple(name for name, rows in cameras.items() if rows)
-    length = torch.tensor([len(cameras[name]) for name in names])
-    table = torch.zeros(3, len(names), int(length.max()), dtype=torch.float64)
-    table[0] = math.inf
-    for camera, name in enumerate(names):
-        for row, (log_iso, levels) in enumerate(sorted(cameras[name].items())):
-            means = torch.tensor(levels, dtype=torch.float64).mean(dim=0)
-            table[:, camera, row] = torch.tensor([log_iso, *means.tolist()], dtype=torch.float64)
-    return Profiles(names, table, length, left_out, tuple(name for name, rows in cameras.items() if not rows))
-
-
-def profile_names() -> list[str]:
-    """The cameras that have a profile."""
-    return list(published_profiles().names)
+        levels = float(variances[1]) * SHOT_ON_MOSAIC, float(variances[4]) * READ_ON_MOSAIC
+        if min(levels) > 0:
+            cameras[f"{maker} {model}"][math.log(float(iso))].append([math.log(level) for level in levels])
+    tables = []
+    for rows in cameras.values():
+        means = [torch.tensor(found, dtype=torch.float64).mean(dim=0) for _, found in sorted(rows.items())]
+        isos = torch.tensor(sorted(rows), dtype=torch.float64)
+        tables.append(torch.cat([isos[:, None], torch.stack(means)], dim=1))
+    length = torch.tensor([len(rows) for rows in tables])
+    table = pad_sequence(tables, batch_first=True).permute(2, 0, 1).contiguous()
+    table[0, torch.arange(table.shape[2]) >= length[:, None]] = math.inf
+    return Profiles(tuple(cameras), table, length)
 
 
 class ProfileLevels:
@@ -131,20 +121,19 @@ class ProfileLevels:
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
         profiles = published_profiles()
-        limits = profiles.limits()
-        if camera.casefold() == ANY_CAMERA:
-            measured = (round(math.exp(limits.min())), round(math.exp(limits.max())))
-            wanted = torch.tensor(iso_limits(ANY_CAMERA, iso, measured), dtype=torch.float64).log()
-            limits = torch.stack([limits[:, 0].clamp_min(wanted[0]), limits[:, 1].clamp_max(wanted[1])], dim=1)
-            self.cameras = (limits[:, 0] <= limits[:, 1] + _ROUNDING).nonzero()[:, 0]
-        else:
-            index = profiles.names.index(spelled(camera, profiles.names))
-            low, high = (round(value) for value in limits[index].exp().tolist())
-            limits[index] = torch.tensor(iso_limits(profiles.names[index], iso, (low, high)), dtype=torch.float64).log()
-            self.cameras = torch.tensor([index])
-        if not len(self.cameras):
+        names = profiles.names
+        if camera.casefold() != ANY_CAMERA:
+            names = (spelled(camera, names),)
+        chosen = torch.tensor([profiles.names.index(name) for name in names])
+        limits = profiles.limits()[chosen]
+        measured = (round(math.exp(limits.min())), round(math.exp(limits.max())))
+        wanted = iso_limits(names[0] if len(names) == 1 else ANY_CAMERA, iso, measured)
+        low, high = torch.tensor(wanted, dtype=torch.float64).log()
+        limits = torch.stack([limits[:, 0].clamp_min(low), limits[:, 1].clamp_max(high)], dim=1)
+        within = limits[:, 0] <= limits[:, 1] + _ROUNDING
+        if not within.any():
             raise ValueError(f"no camera has a profile within ISO {iso}; widen the range")
-        self.limits = limits[self.cameras]
+        self.cameras, self.limits = chosen[within], limits[within]
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         device = generator.device
@@ -284,7 +273,7 @@ def camera_names() -> list[str]:
 
 def noise_names() -> list[str]:
     """Every name that :func:`noise_model` knows."""
-    return [*NOISE, *published()["presets"], *camera_names(), ANY_CAMERA, *profile_names()]
+    return [*NOISE, *published()["presets"], *camera_names(), ANY_CAMERA, *published_profiles().names]
 
 
 def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
@@ -293,42 +282,32 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
     Raises:
         ValueError: if the name is unknown, has no law by ISO, or the ISO is outside the measured range.
     """
-    if isinstance(spec, str):
-        return _of_name(spec, iso)
-    if spec and all(isinstance(name, str) for name in spec):
+    if isinstance(spec, str) and spec in _by_iso():
+        return _by_iso()[spec](iso)
+    if isinstance(spec, str) and spec not in published()["presets"]:
+        return _of_profile(spec, iso)
+    if not isinstance(spec, str) and spec and all(isinstance(name, str) for name in spec):
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
-    _require_no_iso(spec, iso)
+    if iso is not None:
+        raise ValueError(
+            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
+        )
+    if isinstance(spec, str):
+        return Preset(spec)
     if not isinstance(spec, Sequence) or len(spec) != 2:
         raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
     return FixedLevels(*(float(value) for value in spec))
 
 
-def _of_name(name: str, iso: Iso) -> NoiseLevels:
-    if name in _by_iso():
-        return _by_iso()[name](iso)
-    if name in published()["presets"]:
-        _require_no_iso(name, iso)
-        return Preset(name)
-    return _of_profile(name, iso)
-
-
-def _require_no_iso(spec: str | Sequence[float] | Sequence[str], iso: Iso) -> None:
-    if iso is not None:
-        raise ValueError(
-            f"noise {spec!r} does not depend on ISO; omit iso, or use one of the cameras {', '.join(camera_names())}"
-        )
-
-
 def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
     if spec.casefold() != ANY_CAMERA:
         try:
-            spelled(spec, profile_names())
+            spelled(spec, published_profiles().names)
         except ValueError as unknown:
             short = [*published()["presets"], *camera_names(), *NOISE]
-            listed = ", ".join(short)
             raise ValueError(
-                f"noise {spec!r} is unknown: {unknown}; use one of {listed}, {ANY_CAMERA!r}, maker and model of a "
-                f"camera, or (shot_var, read_var){nearest(spec, short)}; one of your own: rawaug --import FILE.py"
+                f"noise {spec!r} is unknown: {unknown}; use one of {', '.join(short)}, {ANY_CAMERA!r}, maker and model "
+                f"of a camera, or (shot_var, read_var){nearest(spec, short)}; one of your own: rawaug --import FILE.py"
             ) from None
     return ProfileLevels(spec, iso)
 

@@ -23,9 +23,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from rawaug.data.pairs import Pair
 
 
+WORST_FIT = 0.5
+"""R^2 below which the points follow no line."""
 BLOCK = 8
 _order = torch.arange(BLOCK)[:, None] + torch.arange(BLOCK)
 _inner = (torch.arange(BLOCK)[:, None] > 0) & (torch.arange(BLOCK) > 0)
@@ -57,7 +59,6 @@ _CLIP_MARGIN = 4.0  # in standard deviations of a pixel
 _MIN_BLOCKS = 30  # a level's
 _MIN_POINTS = 6
 _ROUNDS = 10
-_WORST_FIT = 0.5  # R^2 below which the points follow no line
 
 _OUTLIER = 8.0  # in robust standard deviations: hot pixels, not tails
 _PILED_UP = 0.25  # share of pixels at the lowest value, above which nothing can be measured
@@ -90,8 +91,7 @@ class NoiseEstimate:
     points: NoisePoints
 
 
-@dataclass(frozen=True)
-class _Blocks:
+class _Blocks(NamedTuple):
     """What is known of each block, tensors ``(N,)``: mean, mean energies of the DCT bands, and the room to clipping."""
 
     channel: Tensor
@@ -102,6 +102,10 @@ class _Blocks:
     top: Tensor
     to_black: Tensor
     to_white: Tensor
+
+    def take(self, index: Tensor) -> _Blocks:
+        """Some of the blocks."""
+        return _Blocks(*(values[index] for values in self))
 
 
 def estimate_noise(
@@ -126,8 +130,7 @@ def estimate_noise(
     measured = [_measure(frame, cfa) for frame in frames]
     if not measured:
         raise ValueError("no frames given to measure the noise of")
-    blocks = _Blocks(*(torch.cat([getattr(m, f.name) for m in measured]) for f in fields(_Blocks)))
-    levels = _split_levels(blocks)
+    levels = _split_levels(_Blocks(*map(torch.cat, zip(*measured, strict=True))))
     points = _start(levels)
     for _ in range(_ROUNDS):
         shot, read = _fit(points, read_var)[0]
@@ -179,19 +182,15 @@ def _split_levels(blocks: _Blocks) -> list[_Blocks]:
         index = torch.nonzero(blocks.channel == channel).flatten()
         index = index[blocks.signal[index].argsort()]
         count = min(32, max(4, len(index) // 200))
-        levels += [_take(blocks, part) for part in index.tensor_split(count) if len(part) >= _MIN_BLOCKS]
+        levels += [blocks.take(part) for part in index.tensor_split(count) if len(part) >= _MIN_BLOCKS]
     if len(levels) < _MIN_POINTS:
         raise ValueError("too few blocks without clipped pixels to estimate noise; give larger or more frames")
     return levels
 
 
-def _take(blocks: _Blocks, index: Tensor) -> _Blocks:
-    return _Blocks(*(getattr(blocks, f.name)[index] for f in fields(_Blocks)))
-
-
 def _start(levels: list[_Blocks]) -> NoisePoints:
     """The first guess: in each level the twentieth of the blocks that vary least in the low frequencies."""
-    flattest = [_take(b, b.low.argsort()[: max(_MIN_BLOCKS, len(b.low) // 20)]) for b in levels]
+    flattest = [b.take(b.low.argsort()[: max(_MIN_BLOCKS, len(b.low) // 20)]) for b in levels]
     return _gather([(b, b.high.median() / _MEDIAN) for b in flattest])
 
 
@@ -205,7 +204,7 @@ def _points(levels: list[_Blocks], shot_var: float, read_var: float) -> NoisePoi
         keep = torch.nonzero(clear & no_outlier & (b.low < _FLAT * expected)).flatten()
         if len(keep) == 0:
             continue
-        flat, expected = _take(b, keep), expected[keep]
+        flat, expected = b.take(keep), expected[keep]
         # the ratio to the line, so that a wide level is not skewed by its spread of signals
         chosen.append((flat, (flat.high / expected).median() / _MEDIAN * expected.mean()))
     if not chosen:
@@ -287,17 +286,11 @@ def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
         estimate = estimate_noise(whole.raw, whole.cfa)
     except ValueError:
         return None
-    return None if estimate.r2 < _WORST_FIT else (estimate.shot_var / factor**2, estimate.read_var / factor**2)
+    return None if estimate.r2 < WORST_FIT else (estimate.shot_var / factor**2, estimate.read_var / factor**2)
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:
-    """The part of a mean squared error that the own noise of the reference makes up: a denoiser that leaves none has 1.
-
-    Args:
-        levels: of :func:`own_noise`.
-        reference: RAW of any shape, black 0, white 1.
-        squared_error: the mean over the reference, on this scale.
-    """
+    """The part of a mean squared error that the own noise of the reference, of these levels, makes up; at best 1."""
     shot_var, read_var = levels
     return (shot_var * float(reference.mean()) + read_var) / squared_error
 
@@ -352,20 +345,13 @@ def _measure_dark(planes: Tensor) -> Tensor:
 _CHANNELS = (("R", "tab:red"), ("Gr", "tab:olive"), ("Gb", "tab:green"), ("B", "tab:blue"))
 
 
-def plot_noise(
-    estimate: NoiseEstimate,
-    path: str | Path | None = None,
-    *,
-    title: str = "",
-    reference: tuple[float, float] | None = None,
-) -> Figure:
+def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title: str = "") -> Figure:
     """Variance against signal, with linear axes and with logarithmic ones, which show the shadows.
 
     Args:
         estimate: of :func:`rawaug.noise.estimate.estimate_noise`.
         path: where to save it (``.png``, ``.pdf``, ``.svg``), or None.
         title: above the figure.
-        reference: another (shot_var, read_var) to draw beside the line, such as that of the DNG's NoiseProfile.
 
     Returns:
         The matplotlib figure.
@@ -387,10 +373,6 @@ def plot_noise(
             if shown.any():
                 axes.scatter(signal[shown], variance[shown], s=14, color=colour, label=label)
         axes.plot(line, estimate.shot_var * line + estimate.read_var, color="black", lw=1.2, label=name)
-        if reference is not None:
-            shot_var, read_var = reference
-            label = f"{shot_var:.3g} y + {read_var:.3g}   (reference)"
-            axes.plot(line, shot_var * line + read_var, color="black", lw=1.2, ls="--", label=label)
         axes.set(xscale=scale, yscale=scale, xlabel="signal (white = 1)", ylabel="variance")
         if scale == "linear":
             axes.set(xlim=(0, right), ylim=(0, 1.3 * variance[used].max()))

@@ -45,6 +45,12 @@ def published() -> dict[str, Any]:
     return data
 
 
+def _known(what: str, name: str, table: dict[str, Any]) -> Any:
+    if name not in table:
+        raise ValueError(f"{what} {name!r} is unknown; use one of {', '.join(table)}")
+    return table[name]
+
+
 def uniform(generator: torch.Generator, *shape: int) -> Tensor:
     """Draws from [0, 1), float32 on the generator's device."""
     return torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32)
@@ -109,10 +115,7 @@ class Preset:
     """
 
     def __init__(self, name: str) -> None:
-        presets = published()["presets"]
-        if name not in presets:
-            raise ValueError(f"noise preset {name!r} is unknown; use one of {', '.join(presets)}")
-        law = presets[name]
+        law = _known("noise preset", name, published()["presets"])
         self.name = name
         self.shot_range: tuple[float, float] = tuple(law["shot"])
         self.line: dict[str, float] = law["read_line"]
@@ -141,11 +144,9 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
 
 
 def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
-    """(shot_var, read_var), each ``(B,)`` float32, at ISO values ``(B,)`` within a table of two rows or more.
+    """(shot_var, read_var), each ``(B,)`` float32, at ISO values ``(B,)``, linear in the logarithms.
 
-    Args:
-        table: logarithms of ISO, shot_var and read_var, ``(3, N)`` float64, the ISO values ascending.
-        iso: where to read it, linearly in the logarithms.
+    ``table`` ``(3, N >= 2)`` float64 has those of ISO, shot_var and read_var, the ISO values ascending.
     """
     x, shot, read = table
     at = iso.log().double()
@@ -170,10 +171,8 @@ class SiddLevels:
     """
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
-        phones = published()["sidd_noise_level_function"]["cameras"]
-        if phone not in phones:
-            raise ValueError(f"SIDD phone {phone!r} is unknown; use one of {', '.join(phones)}")
-        rows = sorted((float(key), *pair) for key, pair in phones[phone].items())
+        levels = _known("SIDD phone", phone, published()["sidd_noise_level_function"]["cameras"])
+        rows = sorted((float(iso), *pair) for iso, pair in levels.items())
         self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
         self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
 
@@ -203,9 +202,7 @@ class EldLevels:
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
         law = published()["eld"]
-        if camera not in law["cameras"]:
-            raise ValueError(f"ELD camera {camera!r} is unknown; use one of {', '.join(law['cameras'])}")
-        self.camera: dict[str, Any] = law["cameras"][camera]
+        self.camera: dict[str, Any] = _known("ELD camera", camera, law["cameras"])
         self.white_dn = float(law["white_dn"])
         self.lowest_iso = float(law["iso"][0])
         self.iso = iso_limits(camera, iso, tuple(law["iso"]))

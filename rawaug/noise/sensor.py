@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -100,54 +101,49 @@ def _tukey_lambda(u: Tensor, shape: float) -> Tensor:
     return log_u.mul_(shape).expm1_().sub_(log_v.mul_(shape).expm1_()).div_(shape)
 
 
-class RowNoise(NoiseModel):
-    """Banding: each row of the sensor has a Gaussian offset of variance ``row_var``, a number or a range, white = 1.
+class _Banding(NoiseModel):
+    """A Gaussian offset of each line of the sensor, of the variance that the parameter ``key`` says."""
+
+    key: ClassVar[str]
+    across: ClassVar[int]
+    line_of_plane: ClassVar[list[int]]
+    """Of the two lines of a cell, that which R, Gr, Gb and B lie in."""
+
+    def __init__(self, line_var: Range) -> None:
+        _require_not_negative(**{self.key: line_var})
+        self.line_var = line_var
+
+    def sample(self, batch: int, generator: torch.Generator) -> Params:
+        return {self.key: draw(self.line_var, batch, generator), "seed": new_seeds(batch, generator)}
+
+    @torch.no_grad()
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        lines = drawn_normals(clean[:, :2].narrow(self.across, 0, 1), self.generators(params, clean.device))
+        lines *= per_picture(params[self.key], clean).sqrt()
+        return torch.add(clean, lines[:, self.line_of_plane], out=out)
+
+    def variance(self, clean: Tensor, params: Params) -> Tensor:
+        return per_picture(params[self.key], clean).expand_as(clean).clone()
+
+
+class RowNoise(_Banding):
+    """Banding: each row of the sensor has a Gaussian offset of this variance, a number or a range, white = 1.
 
     R and Gr lie in one row of the mosaic and share its offset; Gb and B share that of the next.
     """
 
-    stream = "row"
-
-    def __init__(self, row_var: Range) -> None:
-        _require_not_negative(row_var=row_var)
-        self.row_var = row_var
-
-    def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"row_var": draw(self.row_var, batch, generator), "seed": new_seeds(batch, generator)}
-
-    @torch.no_grad()
-    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        rows = drawn_normals(clean[:, :2, :, :1], self.generators(params, clean.device))
-        rows *= per_picture(params["row_var"], clean).sqrt()
-        return torch.add(clean, rows.repeat_interleave(2, dim=1), out=out)
-
-    def variance(self, clean: Tensor, params: Params) -> Tensor:
-        return per_picture(params["row_var"], clean).expand_as(clean).clone()
+    stream, key = "row", "row_var"
+    across, line_of_plane = -1, [0, 0, 1, 1]
 
 
-class ColumnNoise(NoiseModel):
-    """Banding: each column of the sensor has a Gaussian offset of variance ``column_var``, as in :class:`RowNoise`.
+class ColumnNoise(_Banding):
+    """Banding: each column of the sensor has a Gaussian offset, as in :class:`RowNoise`.
 
     R and Gb share the offset of one column, Gr and B that of the next.
     """
 
-    stream = "column"
-
-    def __init__(self, column_var: Range) -> None:
-        _require_not_negative(column_var=column_var)
-        self.column_var = column_var
-
-    def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"column_var": draw(self.column_var, batch, generator), "seed": new_seeds(batch, generator)}
-
-    @torch.no_grad()
-    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        columns = drawn_normals(clean[:, :2, :1], self.generators(params, clean.device))
-        columns *= per_picture(params["column_var"], clean).sqrt()
-        return torch.add(clean, columns.repeat(1, 2, 1, 1), out=out)
-
-    def variance(self, clean: Tensor, params: Params) -> Tensor:
-        return per_picture(params["column_var"], clean).expand_as(clean).clone()
+    stream, key = "column", "column_var"
+    across, line_of_plane = -2, [0, 1, 0, 1]
 
 
 class _FixedPattern(NoiseModel):
@@ -161,33 +157,26 @@ class BlackOffset(_FixedPattern):
     """A black level that is off by N(0, sd^2) in each picture, the same for all colours; ``sd`` with white = 1."""
 
     stream = "black_offset"
+    colours: ClassVar[tuple[int, ...]] = ()
+    """Shape of a picture's offsets."""
 
     def __init__(self, sd: float) -> None:
         _require_not_negative(sd=sd)
         self.sd = sd
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"black_offset": self.sd * normal(generator, batch)}
+        return {self.stream: self.sd * normal(generator, batch, *self.colours)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        return torch.add(clean, per_picture(params["black_offset"], clean), out=out)
+        return torch.add(clean, params[self.stream].to(clean).reshape(len(clean), -1, 1, 1), out=out)
 
 
-class ColourBias(_FixedPattern):
+class ColourBias(BlackOffset):
     """An offset N(0, sd^2) of each of R, Gr, Gb and B in each picture, ``sd`` with white = 1: a cast in the shadows."""
 
     stream = "colour_bias"
     by_plane = True
-
-    def __init__(self, sd: float) -> None:
-        _require_not_negative(sd=sd)
-        self.sd = sd
-
-    def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {"colour_bias": self.sd * normal(generator, batch, 4)}
-
-    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        return torch.add(clean, params["colour_bias"].to(clean)[:, :, None, None], out=out)
+    colours = (4,)
 
 
 class DefectPixels(_FixedPattern):
