@@ -55,7 +55,6 @@ class CameraMatrices(NamedTuple):
 
     names: tuple[str, ...]
     xyz_to_camera: Tensor
-    rejected: dict[str, int]
 
     def distinct(self) -> Tensor:
         """The different ones among the matrices ``(M, 3, 3)``: bodies that share a sensor often share a matrix."""
@@ -73,21 +72,16 @@ def published_cameras() -> CameraMatrices:
     rows = [line.split("\t") for line in text.splitlines()[2:]]
     matrices = torch.tensor([[float(value) for value in row[2:11]] for row in rows], dtype=torch.float64)
     matrices = matrices.reshape(-1, 3, 3) / 1e4
-    reasons = {
-        "four-colour sensor": torch.tensor([row[12] != "" for row in rows]),
-        "singular": torch.linalg.det(matrices).abs() < 1e-3,
-        "response not positive": ~(responses(matrices, white_point(D65)) > 0).all(dim=1),
-    }
     gains = white_balance(matrices, white_point(D65))[:, 0::2]
-    reasons["implausible gains"] = ~((gains >= DAYLIGHT_GAINS[0]) & (gains <= DAYLIGHT_GAINS[1])).all(dim=1)
-    reasons["implausible colour"] = ~(colour_matrix(matrices).abs().amax(dim=(1, 2)) <= LARGEST_ENTRY)
-    believed = torch.ones(len(rows), dtype=torch.bool)
-    rejected = {}
-    for reason, where in reasons.items():
-        rejected[reason] = int((where & believed).sum())
-        believed &= ~where
+    believed = (
+        torch.tensor([row[12] == "" for row in rows])  # three colours
+        & (torch.linalg.det(matrices).abs() >= 1e-3)
+        & (responses(matrices, white_point(D65)) > 0).all(dim=1)
+        & ((gains >= DAYLIGHT_GAINS[0]) & (gains <= DAYLIGHT_GAINS[1])).all(dim=1)
+        & (colour_matrix(matrices).abs().amax(dim=(1, 2)) <= LARGEST_ENTRY)
+    )
     names = tuple(f"{row[0]} {row[1]}" for row, kept in zip(rows, believed.tolist(), strict=True) if kept)
-    return CameraMatrices(names, normalised(matrices[believed]), rejected)
+    return CameraMatrices(names, normalised(matrices[believed]))
 
 
 def normalised(xyz_to_camera: Tensor) -> Tensor:

@@ -42,8 +42,10 @@ def with_white_balance(
         if balance.shape not in ((3,), (1, 3), (batch, 3)):
             raise ValueError(f"white_balance must be (3,) or ({batch}, 3), got {tuple(balance.shape)}")
         _require_factor("white_balance", balance)
-        balance = balance / balance[..., 1:2]
-        params = _in_light(isp, params, balance.expand_as(params.gains))
+        balance = (balance / balance[..., 1:2]).expand_as(params.gains)
+        weights = isp.colour.weights_for(balance)
+        matrix, gains = isp.colour.combine(weights), isp.colour.gains_for(balance, weights)
+        params = params._replace(colour_weights=weights, matrix=matrix, gains=gains)
     if digital_gain is not None:
         digital = torch.as_tensor(digital_gain, dtype=params.gains.dtype, device=params.gains.device).reshape(-1, 1)
         if len(digital) not in (1, batch):
@@ -57,13 +59,6 @@ def with_white_balance(
 def _require_factor(name: str, value: Tensor) -> None:
     if not (value.isfinite() & (value > 0)).all():
         raise ValueError(f"{name} must be positive, got {value.flatten().tolist()}")
-
-
-def _in_light(isp: StagedISP, params: ISPParams, balance: Tensor) -> ISPParams:
-    weights = isp.colour.weights_for(balance)
-    return params._replace(
-        colour_weights=weights, matrix=isp.colour.combine(weights), gains=isp.colour.gains_for(balance, weights)
-    )
 
 
 def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:

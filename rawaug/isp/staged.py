@@ -88,7 +88,8 @@ class StagedISP(ReverseISP):
 
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
-        self._config = config or ISPConfig()
+        self.config = config or ISPConfig()
+        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
         with initialised_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
             if self.config.cameras:
@@ -98,11 +99,6 @@ class StagedISP(ReverseISP):
             self.stages = nn.ModuleDict({stage.name: stage for stage in made})
             self.reverse_encoders, self.forward_encoders = Encoders(self.config), Encoders(self.config)
         self.use_encoders(self.config.encoders, seed)
-
-    @property
-    def config(self) -> ISPConfig:
-        """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
-        return self._config
 
     @property
     def cfa(self) -> CFA:
@@ -130,7 +126,7 @@ class StagedISP(ReverseISP):
         config = replace(self.config, **changes)
         if absent := [name for name in config.stages if name not in self.stages]:
             raise ValueError(f"stages: {absent[0]!r} is not in this ISP, which has {' '.join(self.stages)}")
-        self._config = config
+        self.config = config
         self.stages = nn.ModuleDict({name: self.stages[name] for name in config.stages})
         for stage in self.ordered_stages:
             stage.config = config

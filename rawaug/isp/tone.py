@@ -46,6 +46,11 @@ def srgb_to_linear(code: Tensor) -> Tensor:
     return torch.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055).clamp_min(0.0) ** 2.4)
 
 
+def inverse_smoothstep(x: Tensor) -> Tensor:
+    """``1/2 - sin(asin(1 - 2x) / 3)`` on [0, 1], the inverse of ``3x^2 - 2x^3``."""
+    return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
+
+
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Pictures ``(B, C, H, W)``, uint8 or float in [0, 1], through one table ``(B, 1021)`` each; float32."""
     return through_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
@@ -65,15 +70,11 @@ def tone_tables() -> dict[str, Tensor]:
     """The published curves by name: tables ``(1021,)`` float32 from 0 to 1, not decreasing."""
     code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
     display = srgb_to_linear(code)
-    tables = {"linear": display.float(), "upi": _inverse_smoothstep(code).float()}
+    tables = {"linear": display.float(), "upi": inverse_smoothstep(code).clamp_min(0.0).pow(2.2).float()}
     text = resources.files("rawaug.isp").joinpath("facts/tone_curves.json").read_text("utf-8")
     for name, points in json.loads(text)["curves"].items():
         tables[name] = _inverse(points, display).float()
     return tables
-
-
-def _inverse_smoothstep(code: Tensor) -> Tensor:
-    return (0.5 - torch.sin(torch.asin(1.0 - 2.0 * code) / 3.0)).clamp_min(0.0) ** 2.2
 
 
 def _inverse(points: Sequence[Sequence[float]], display: Tensor) -> Tensor:

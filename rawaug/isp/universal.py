@@ -9,7 +9,6 @@ light.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -158,19 +157,22 @@ def _name_of(matrix: Tensor, names: Sequence[str], matrices: Tensor) -> str:
     return names[int((matrices == matrix).flatten(1).all(dim=1).nonzero()[0])]
 
 
-def main() -> None:
-    """Write the ISP and print what its hulls hold."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", required=True, help="the .safetensors file to write")
-    parser.add_argument("--atoms", type=int, default=10, help="colour atoms")
-    parser.add_argument("--tones", type=int, help="tone atoms; all curves by default")
-    parser.add_argument("--gains", type=int, default=16, help="gain atoms")
-    options = parser.parse_args()
-    isp = universal_isp(options.atoms, options.tones, options.gains)
-    isp.save(options.out)
+def main(*, out: str, atoms: int = 10, tones: int | None = None, gains: int = 16) -> None:
+    """Write the ISP and print what its hulls hold.
+
+    Args:
+        out: the .safetensors file to write.
+        atoms: colour atoms.
+        tones: tone atoms; all curves by default.
+        gains: gain atoms.
+    """
+    isp = universal_isp(atoms, tones, gains)
+    isp.save(out)
     for what, share in isp.info["holds"].items():
         print(f"{what}: {share:.1%} within 45 dB")
 
 
 if __name__ == "__main__":
-    main()
+    from cyclopts import run
+
+    run(main)

@@ -113,7 +113,8 @@ class FitConfig:
     def __post_init__(self) -> None:
         if isinstance(self.encoder_training, Mapping):
             object.__setattr__(self, "encoder_training", EncoderTraining(**self.encoder_training))
-        for key, least in {"atoms": 1, "pixels": 1, "batch": 1, "steps": 0, "joint_steps": 0, "prior_steps": 0}.items():
+        positive, counts = ("atoms", "pixels", "batch"), ("steps", "joint_steps", "curve_steps", "prior_steps")
+        for key, least in {**dict.fromkeys(positive, 1), **dict.fromkeys(counts, 0)}.items():
             if getattr(self, key) is not None:
                 require_between(key, getattr(self, key), least, MOST)
         require_between("seed", self.seed, -(2**63), 2**63 - 1)
@@ -125,7 +126,5 @@ class FitConfig:
                 raise ValueError(f"{key} must be {' or '.join(values)}, got {getattr(self, key)!r}")
         if unknown := set(self.isp) - {key.name for key in fields(ISPConfig)}:
             raise ValueError(f"isp: unknown keys {sorted(unknown)}; use {[key.name for key in fields(ISPConfig)]}")
-        if self.curve_steps is not None and self.curve_steps < 0:
-            raise ValueError(f"curve_steps must be at least 0, got {self.curve_steps}")
         if not any(STAGES[name].makes <= 2 for name in self.isp.get("stages", POINTWISE_STAGES)):
             raise ValueError("isp: a fit needs a stage up to x2, such as tone or gamma")

@@ -15,7 +15,7 @@ parameters come back that served these best, which may be those of the start.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -29,20 +29,31 @@ Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
 
 
-def folds_of(frames: FitFrames, folds: int) -> Iterator[tuple[FitFrames, FitFrames, str]]:
-    """The frames that each fold leaves out, those that it keeps, and its name."""
-    every = range(len(frames.shots))
+def gain_left_out(frames: FitFrames, folds: int, gain: Callable[[FitFrames, FitFrames, str], float]) -> float:
+    """Mean over the frames of ``gain(left out, kept, name of the fold)``, every frame being left out once."""
+    every, total = range(len(frames.shots)), 0.0
     for fold in range(folds):
         out = every[fold::folds]
-        yield frames.some(out), frames.some([k for k in every if k not in out]), f" without part {fold + 1} of {folds}"
+        kept = frames.some([k for k in every if k not in out])
+        total += len(out) * gain(frames.some(out), kept, f" without part {fold + 1} of {folds}")
+    return total / len(every)
 
 
 def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> None:
     """Train and keep the encoders, or leave the constants, as ``config.encoders`` says."""
+
+    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
+        """dB by which encoders beat constants on frames that no stage of the fit has seen."""
+        other = refit(kept, part, config)
+        other.use_encoders(False)
+        constants = decibels(other, out)
+        _train(other, kept, config, descent, f"encoders{part}")
+        return decibels(other, out) - constants
+
     wanted = config.encoders
     isp.use_encoders(False)
     if wanted == "auto" and len(frames.shots) >= config.encoder_training.fewest_frames:
-        gain = _gain_on_frames_left_out(frames, config, descent, refit)
+        gain = gain_left_out(frames, config.encoder_training.folds, better)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
@@ -92,18 +103,6 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
         piece = image[..., top : top + height, left : left + width]
         pieces.append(piece.flip(-1) if flip else piece)
     return pieces[0], pieces[1]
-
-
-def _gain_on_frames_left_out(frames: FitFrames, config: FitConfig, descent: Descent, refit: Refit) -> float:
-    """Mean dB by which encoders beat constants on frames that no stage of the fit has seen."""
-    gain = 0.0
-    for out, kept, part in folds_of(frames, config.encoder_training.folds):
-        isp = refit(kept, part, config)
-        isp.use_encoders(False)
-        constants = decibels(isp, out)
-        _train(isp, kept, config, descent, f"encoders{part}")
-        gain += len(out.shots) * (decibels(isp, out) - constants)
-    return gain / len(frames.shots)
 
 
 MANY_FRAMES = 50

@@ -31,7 +31,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, cycle_error, decibels, reading_error
-from rawaug.isp.fit.encoders import Refit, folds_of, train_encoders, train_jointly
+from rawaug.isp.fit.encoders import Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
@@ -47,13 +47,15 @@ def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tupl
     """The settings with ``tone`` decided, and the curve's gain in dB if it was compared."""
     if config.tone != "auto":
         return config, None
-    count, gain = len(frames.shots), 0.0
-    if count < 2:
+    if len(frames.shots) < 2:
         return replace(config, tone="learned"), None
-    for out, kept, part in folds_of(frames, min(FOLDS, count)):
+
+    def better(out: FitFrames, kept: FitFrames, part: str) -> float:
         learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
         curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
-        gain += len(out.shots) * (decibels(curve, out, True) - decibels(learned, out, True)) / count
+        return decibels(curve, out, True) - decibels(learned, out, True)
+
+    gain = gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
     return replace(config, tone="curve" if gain > 0 else "learned"), gain
 
 

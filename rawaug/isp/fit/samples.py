@@ -163,19 +163,12 @@ def _blocks(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.G
 
 
 class Blocks(NamedTuple):
-    """An unregistered pair, averaged over blocks.
+    """An unregistered pair, averaged over blocks."""
 
-    Args:
-        srgb: ``(3, h, w)``, averaged in linear light.
-        raw: ``(3, h, w)``.
-        clipped: ``(h, w)`` whether any site of the block is.
-        place: ``(1, 2, h, w)`` in the full frame.
-    """
-
-    srgb: Tensor
-    raw: Tensor
-    clipped: Tensor
-    place: Tensor
+    srgb: Tensor  # (3, h, w), averaged in linear light
+    raw: Tensor  # (3, h, w)
+    clipped: Tensor  # (h, w), whether any site of the block is
+    place: Tensor  # (1, 2, h, w), in the full frame
 
 
 def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
