@@ -16,6 +16,7 @@ import torch
 
 from rawaug.data import open_pairs
 from rawaug.isp.fit import FitConfig
+from rawaug.paper.baselines import Training
 from rawaug.paper.methods import ROWS, fit_family, score_rows
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -36,7 +37,7 @@ def main() -> None:
         table[count] = []
         for subset in progress(range(options.subsets), label=f"{count} frames", unit="subset"):
             order = torch.randperm(len(pairs), generator=keyed_generator("subset", count, subset)).tolist()
-            fitted = fit_family("dictionary", [pairs[k] for k in order[:count]], FitConfig(), (0.0, 0, 0), seed=0)
+            fitted = fit_family("dictionary", [pairs[k] for k in order[:count]], FitConfig(), Training())
             scores = [score_rows(fitted, pairs[k], options.patches)["rows"] for k in order[count:]]
             table[count].append({row: sum(s[row] for s in scores) / len(scores) for row in scores[0]})
     rows = list(next(iter(table.values()))[0])

@@ -1,4 +1,4 @@
-"""``rawaug fit``: RAW files in, an ISP file out."""
+"""``rawaug fit``: RAW files in, an ISP file out; in Python :func:`rawaug.fit`, of :mod:`rawaug.training.camera`."""
 
 from __future__ import annotations
 

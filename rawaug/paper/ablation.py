@@ -1,37 +1,50 @@
-r"""The contribution of each stage: PSNR of every intermediate image of the reverse pass against the RAW.
+r"""What the stages and the learned parts of an ISP are worth, on frames that no stage of a fit has seen.
 
-``x, x1, ..., x5`` against the demosaiced RAW, in RGB, in luminance Y and in chrominance UV (ITU-R BT.601), as in the
-ablation figure of Conde et al., AAAI 2022; with each frame's as-shot gains and blind. And the other way round: fits
-that lack one stage, measured on frames left out.
+*Stages*: PSNR of every intermediate image ``x, x1, ..., x5`` of the reverse pass against the demosaiced RAW, in RGB, in
+luminance Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of Conde et al., AAAI 2022; with each
+frame's as-shot gains and blind. And the other way round: fits that lack one stage.
+
+*Learned parts*: encoders, end-to-end training, the loss on the images between the stages and that on the weights'
+consistency ("Training" in the paper) are switched off one by one. Each seed draws its own frames: photographs, cameras
+in turn, lights, and which photographs are left out; all variants of a seed share them, so that differences are within a
+seed. Each fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.data import open_pairs
+from rawaug.data import PictureFolder, open_pairs, open_pictures
+from rawaug.data.demo.pairs import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free
-from rawaug.files import write_json
+from rawaug.files import fingerprint, write_json
 from rawaug.isp import conditioning
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
-from rawaug.isp.fit.samples import block_averages
+from rawaug.isp.fit.descent import cycle_error
+from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.metrics import psnr, worst_and_best_quarter
+from rawaug.paper.frames import synthetic_frames
+from rawaug.paper.methods import resumed
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS
+from rawaug.registry import EXPERIMENTS, checked_settings
+from rawaug.seeding import keyed_generator
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """RGB to YUV, ITU-R BT.601."""
@@ -86,12 +99,11 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
         for stage, value in values.items():
             without[stage].append(value)
     means = {given: torch.tensor(curves).mean(0).tolist() for given, curves in stagewise.items()}
-    result = {"settings": asdict(ablation), "stages": means, "without": {k: _mean(v) for k, v in without.items()}}
+    result = {"settings": asdict(ablation), "stages": means, "without": {k: fmean(v) for k, v in without.items()}}
     write_json(result, folder / "ablation.json")
-    picture = _draw(
-        means, result["without"], folder / "ablation.png", f"{ablation.data}: {len(pairs)} frames, each left out"
-    )
-    _print(result)
+    picture = folder / "ablation.png"
+    _draw(result, picture, f"{ablation.data}: {len(pairs)} frames, each left out")
+    _print_stages(result)
     print(f"picture: {picture}")
     return result
 
@@ -148,17 +160,13 @@ def _decibels(difference: Tensor) -> float:
     return float(-10.0 * (difference**2).mean().log10())
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: Path, title: str) -> Path:
+def _draw(result: dict[str, Any], path: Path, title: str) -> None:
     with extra("train"):
         from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 4), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(2, 2, 1.3))
-    for axis, (given, rows) in zip(axes, means.items(), strict=False):
+    for axis, (given, rows) in zip(axes, result["stages"].items(), strict=False):
         for k, space in enumerate(SPACES):
             axis.plot(range(len(TITLES)), [row[k] for row in rows], marker="o", label=space)
         axis.set_xticks(range(len(TITLES)), [t.replace(" ", "\n") for t in TITLES])
@@ -166,19 +174,161 @@ def _draw(means: dict[str, list[list[float]]], without: dict[str, float], path: 
         axis.set_ylabel("PSNR against RAW (dB)")
         axis.grid(alpha=0.3)
         axis.legend()
-    axes[-1].barh([f"without {k}" if k != "none" else "all stages" for k in without], list(without.values()))
+    without = {"all stages" if k == "none" else f"without {k}": value for k, value in result["without"].items()}
+    axes[-1].barh(list(without), list(without.values()))
     axes[-1].set_xlabel("PSNR_r, as-shot gains (dB)")
     axes[-1].invert_yaxis()
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
-    return path
 
 
-def _print(result: dict[str, Any]) -> None:
+def _print_stages(result: dict[str, Any]) -> None:
     sections = [
         [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
         for given, rows in result["stages"].items()
     ]
     print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
     print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))
+
+
+CAMERAS = (
+    *("Canon EOS 5D Mark III", "Nikon D750", "Sony ILCE-7M3", "Fujifilm X-T3", "Panasonic DC-GH5"),
+    *("Olympus E-M1 Mark II", "Pentax K-3", "Samsung Galaxy S7"),
+)
+PIXELS = 8192
+"""Of a frame on which the forward pass is scored."""
+COLUMNS = {
+    "psnr_r": "PSNR_r",
+    "worst25": "worst 25%",
+    "as_shot": "as-shot gains",
+    "forward": "RAW to sRGB",
+    "cycle": "cycle",
+}
+
+
+@dataclass
+class ComponentAblation:
+    """What the learned parts are worth.
+
+    Args:
+        experiment: "learned".
+        name: of the folder in ``out`` that it writes.
+        pictures: a folder of photographs of 288 x 448 or more, or "demo:"; one frame is made of each.
+        cameras: published ones, in turn.
+        frames: number of frames that an ISP is fitted to.
+        left_out: number of further frames that it is scored on.
+        fit: of the ISP with all parts.
+        variants: by name, the keys of ``fit`` in which a fit differs.
+        seed: of the first run.
+        seeds: number of runs, each with frames of its own.
+        out: folder of all runs.
+    """
+
+    experiment: str = "learned"
+    name: str = "learned"
+    pictures: str = "demo:"
+    cameras: list[str] = field(default_factory=lambda: list(CAMERAS))
+    frames: int = 64
+    left_out: int = 32
+    fit: FitConfig = field(default_factory=lambda: FitConfig(encoders="on", joint_steps=1000))
+    variants: dict[str, dict[str, Any]] = field(default_factory=lambda: {"all parts": {}})
+    seed: int = 0
+    seeds: int = 3
+    out: str = "runs"
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.left_out, self.seeds, len(self.variants), len(self.cameras)) < 1:
+            raise ValueError("frames, left_out, seeds, variants and cameras must each be at least one")
+        for name, changes in self.variants.items():
+            if "seed" in changes:
+                raise ValueError(f"variants: {name}: all variants of a run share its seed; set seed, not fit.seed")
+            replace(self.fit, **checked_settings(f"variants: {name}", FitConfig, changes))
+
+    def shortest(self) -> ComponentAblation:
+        """A few steps of every variant, on two frames."""
+        few = {name: changes | {"steps": 2, "joint_steps": 0} for name, changes in self.variants.items()}
+        return replace(
+            self, frames=2, left_out=1, fit=replace(self.fit.shortest(), joint_steps=0), variants=few, seeds=1
+        )
+
+
+@EXPERIMENTS.register("learned")
+def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> dict[str, dict[str, Any]]:
+    """Run it: a table, and ``table.json`` with every figure; ``overwrite`` replaces another of its name."""
+    pictures = open_pictures(learned.pictures, min_side=min(FRAME))
+    folder = claim(learned, overwrite)
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in learned.variants}
+    for seed in range(learned.seed, learned.seed + learned.seeds):
+        chosen = photographs(pictures, learned, seed)
+        frames = synthetic_frames(chosen[: learned.frames], learned.cameras, seed, "train")
+        left_out = synthetic_frames(chosen[learned.frames :], learned.cameras, seed, "left-out")
+        for name, changes in progress(learned.variants.items(), label=f"seed {seed}", unit="fit"):
+            config = replace(learned.fit, **changes, seed=seed)
+            place = folder / f"seed{seed}" / f"{name.replace(' ', '-').replace('/', '_')}.json"
+            found[name].append(variant_scores(place, config, frames, left_out))
+    rows = {name: _row(runs) for name, runs in found.items()}
+    write_json({"settings": asdict(learned), "rows": rows}, folder / "table.json")
+    _print_components(rows, learned)
+    return rows
+
+
+def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:
+    """As many as are needed, in a random order, of those that hold a frame; ValueError if there are fewer."""
+    order = torch.randperm(len(pictures), generator=keyed_generator(seed, "photographs")).tolist()
+    large = (p for p in (pictures[k] for k in order) if p.shape[-2] >= FRAME[0] and p.shape[-1] >= FRAME[1])
+    chosen = list(islice(large, learned.frames + learned.left_out))
+    if len(chosen) < learned.frames + learned.left_out:
+        raise ValueError(
+            f"pictures: {learned.pictures} has {len(chosen)} of {FRAME[0]} x {FRAME[1]} or more, but frames and "
+            f"left_out together need {learned.frames + learned.left_out}; give a larger folder or smaller numbers"
+        )
+    return chosen
+
+
+def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_out: Sequence[Pair]) -> dict[str, Any]:
+    """The scores of one fit, from its file where it is there."""
+    sums = [float(pair.raw.double().sum()) for pair in (*frames, *left_out)]
+    place.parent.mkdir(parents=True, exist_ok=True)
+
+    def measured() -> dict[str, Any]:
+        isp = fit_isp(frames, config, progress=False, state=place.with_suffix(".state"))
+        scores = [score(isp, pair) for pair in left_out]
+        by_name = {name: [one[name] for one in scores] for name in scores[0]}
+        return {"joint": isp.info.get("joint"), "parameters": isp.reverse_parameters, **by_name}
+
+    return resumed(place, fingerprint("learned", asdict(config), sums), measured)
+
+
+@torch.no_grad()
+def score(isp: DictionaryISP, pair: Pair) -> dict[str, float]:
+    """PSNR in dB of both passes on a frame; the forward one pointwise, under the setting that it chooses itself."""
+    part = sample_pixels([pair], PIXELS, seed=0).pixels
+    forward = cycle_error(isp, part, isp.forward(pair.raw[None]).params, {}, FitConfig())
+    srgb = pair.srgb[None].float() / 255.0
+    return {
+        "psnr_r": psnr_r(isp, pair),
+        "as_shot": psnr_r(isp, pair, white_balance=True),
+        "forward": float(-10.0 * forward.log10()),
+        "cycle": psnr(isp.cycle_without_mosaic(srgb), srgb).item(),
+    }
+
+
+def _row(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Each column's mean over frames, one a seed."""
+    means = {key: [fmean(run[key]) for run in runs] for key in COLUMNS if key != "worst25"}
+    worst = [worst_and_best_quarter(run["psnr_r"])[0] for run in runs]
+    return means | {"worst25": worst, "joint": [run["joint"] for run in runs], "parameters": runs[0]["parameters"]}
+
+
+def _print_components(rows: dict[str, dict[str, Any]], learned: ComponentAblation) -> None:
+    first = next(iter(rows.values()))
+    cells = []
+    for name, row in rows.items():
+        apart = [a - b for a, b in zip(row["psnr_r"], first["psnr_r"], strict=True)]
+        figures = [mean_and_spread(row[key], 2) for key in COLUMNS]
+        cells.append([name, *figures, "" if row is first else mean_and_spread(apart, 2)])
+    title = (
+        f"{learned.name}: fitted to {learned.frames} frames of {len(learned.cameras)} cameras, scored on "
+        f"{learned.left_out} others, seeds: {learned.seeds}; dB"
+    )
+    print_rows(title, ["fit", *COLUMNS.values(), "PSNR_r beside the first"], cells)

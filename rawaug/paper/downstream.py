@@ -67,10 +67,6 @@ class DownstreamConfig:
     denoiser: DenoiserConfig = field(default_factory=DenoiserConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
-    def sampling(self) -> tuple[object, ...]:
-        """What the training samples depend on."""
-        return self.noise, self.exposure
-
     def shortest(self) -> DownstreamConfig:
         """One step, one small test frame."""
         one = replace(self.train, steps=1, batch=2, warmup=1, validate_every=1, checkpoint_every=1)

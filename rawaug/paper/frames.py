@@ -69,11 +69,8 @@ def _scene(picture: Tensor, generator: torch.Generator, name: str) -> Tensor:
             f"{name}: a picture must be {FRAME[0]} x {FRAME[1]} or larger, got {tuple(picture.shape[-2:])}"
         )
     small = F.avg_pool2d(picture[None].float(), factor)[0].round().to(torch.uint8)
-    top, left = (
-        int(torch.randint(side - size + 1, (), generator=generator))
-        for side, size in zip(small.shape[-2:], FRAME, strict=True)
-    )
-    return bayer.crop(small, top // 2 * 2, left // 2 * 2, *FRAME)
+    scene: Tensor = bayer.RandomCrop(FRAME)(small, generator)
+    return scene
 
 
 def overexposed(pair: Pair) -> Pair:

@@ -28,11 +28,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import singledispatch
-from itertools import pairwise
+from functools import partial, singledispatch
+from itertools import pairwise, product
 from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import torch
@@ -42,7 +43,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
-from rawaug.files import find_weights
+from rawaug.files import find_weights, write_json
 from rawaug.isp import conditioning
 from rawaug.isp.config import ISPParams, ReverseISP
 from rawaug.isp.fit import FitConfig, fit_isp
@@ -50,17 +51,13 @@ from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame, placed
 from rawaug.metrics import PATCH, psnr
-from rawaug.paper.baselines import BASELINES, InvISP, fit_baseline
+from rawaug.paper.baselines import BASELINES, BaselineISP, Training, fit_baseline
 from rawaug.paper.baselines.base import CropTrainedISP
-from rawaug.paper.baselines.upi import SmoothstepISP
 from rawaug.seeding import keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
 ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "oracle weights"}
 SAMPLES = 64
-
-Maker = Callable[[Tensor, Tensor], Tensor]
-"""An sRGB patch and its place in the frame to a mosaic."""
 
 
 class Fitted(NamedTuple):
@@ -71,10 +68,13 @@ class Fitted(NamedTuple):
     parameters: int
 
 
-def kept(path: Path, key: str) -> dict[str, Any] | None:
-    """The figures of a fit that an earlier run wrote under the same key."""
-    known: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-    return known if known.get("key") == key else None
+def resumed(path: Path, key: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """The figures that an earlier run wrote to ``path`` under the same key, else measured and written."""
+    figures: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    if figures.get("key") != key:
+        figures = {"key": key, **measure()}
+        write_json(figures, path)
+    return figures
 
 
 def is_method(family: str) -> bool:
@@ -93,10 +93,8 @@ def learns_by_descent(family: str) -> bool:
     return family in BASELINES and issubclass(BASELINES[family], CropTrainedISP)
 
 
-def fit_family(
-    family: str, pairs: Sequence[Pair], config: FitConfig, budget: tuple[float, int, int], seed: int
-) -> Fitted:
-    """Fit a family to pairs of one CFA; methods that learn by descent have a budget of (seconds, crop, batch)."""
+def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, training: Training) -> Fitted:
+    """Fit a family to pairs of one CFA, with the seed of ``training``."""
     start = time.perf_counter()
     if family not in FAMILIES:
         isp = DictionaryISP.from_pretrained(family)
@@ -104,13 +102,12 @@ def fit_family(
             raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
         return Fitted(isp, 0.0, isp.reverse_parameters)
     if family.startswith("dictionary"):
-        isp = fit_isp(pairs, replace(config, seed=seed, encoders="on" if family == "dictionary-encoders" else "off"))
+        encoders = "on" if family == "dictionary-encoders" else "off"
+        isp = fit_isp(pairs, replace(config, seed=training.seed, encoders=encoders))
         return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
     method = BASELINES[family]
-    start_of: dict[str, Any] = {"seed": seed} if issubclass(method, CropTrainedISP) else {}
-    model = method(cfa=pairs[0].cfa, **start_of)
-    seconds, crop, batch = budget
-    fit_baseline(model, pairs, seconds, crop=crop, batch=batch, seed=seed)
+    start_of: dict[str, Any] = {"seed": training.seed} if issubclass(method, CropTrainedISP) else {}
+    model = fit_baseline(method(cfa=pairs[0].cfa, **start_of), pairs, training)
     return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
 
 
@@ -123,7 +120,7 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
     model = fitted.model
     if not pair.registered:
         return {"rows": _block_rows(model, pair), "mpix_s": None}
-    makers = {row: _maker(model, setting) for row, setting in settings(model, pair).items()}
+    makers = _makers(model, pair)
     start = time.perf_counter()
     rows = {row: windows_psnr(make, pair, patches) for row, make in makers.items()}
     if "oracle" in rows:  # chosen by the error on some pixels of the frame, which is not the mean of the patches' PSNR
@@ -135,24 +132,23 @@ def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any
 
 def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
     """InvISP's PSNR (:func:`balanced_psnr`) of every row that the family fills."""
-    found = settings(fitted.model, pair)
-    return {row: balanced_psnr(_maker(fitted.model, setting), pair) for row, setting in found.items()}
+    return {row: balanced_psnr(make, pair) for row, make in _makers(fitted.model, pair).items()}
+
+
+def _makers(model: ReverseISP, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
+    """Row to the function from an sRGB patch and its place in the frame to a mosaic."""
+    return {row: partial(_made, model, setting) for row, setting in settings(model, pair).items()}
+
+
+def _made(model: ReverseISP, setting: Any, patch: Tensor, place: Tensor) -> Tensor:
+    return model.make(patch, setting, place)
 
 
 @singledispatch
-def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
-    """Row to the camera setting that it is made with; a method that knows nothing of settings has one row."""
-    return {"blind": None}
-
-
-@settings.register
-def _(model: SmoothstepISP, pair: Pair) -> dict[str, Any]:
-    return {"blind": None} | ({"as-shot": model.balanced(pair.white_balance)} if pair.balance_known else {})
-
-
-@settings.register
-def _(model: InvISP, pair: Pair) -> dict[str, Any]:
-    return {"blind": None} | ({"as-shot": pair.white_balance} if pair.balance_known else {})
+def settings(model: BaselineISP, pair: Pair) -> dict[str, Any]:
+    """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
+    balanced = model.balanced(pair.white_balance) if pair.balance_known else None
+    return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})
 
 
 @singledispatch
@@ -167,10 +163,6 @@ def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
 def _(model: DictionaryISP, pair: Pair) -> dict[str, float]:
     rows = {"blind": psnr_r(model, pair)}
     return rows | ({"as-shot": psnr_r(model, pair, white_balance=True)} if pair.balance_known else {})
-
-
-def _maker(model: ReverseISP, setting: Any) -> Maker:
-    return lambda patch, place: model.make(patch, setting, place)
 
 
 @settings.register
@@ -210,15 +202,13 @@ def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
         through.append(psnr(model.cycle(x), x).item())
         if (back := model.cycle_without_mosaic(x)) is not None:
             without.append(psnr(back, x).item())
-    result_ = {"cycle": sum(through) / len(through)}
-    return result_ | ({"cycle_without_mosaic": sum(without) / len(without)} if without else {})
+    return {"cycle": fmean(through)} | ({"cycle_without_mosaic": fmean(without)} if without else {})
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:
     """What the mosaic and bilinear interpolation alone leave of sRGB pictures: the ceiling of a cycle through them."""
     values = [as_float(p[None]) for p in pictures]
-    scores = [psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values]
-    return sum(scores) / len(scores)
+    return fmean(psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values)
 
 
 GAMMA = 2.2
@@ -231,20 +221,14 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
     if not pair.registered:
         raise ValueError(f"{pair.name}: is not registered pixel by pixel, so it has no balanced PSNR")
     height, width = pair.raw.shape[-2:]
+    edges = ([k * side // PARTS // 2 * 2 for k in range(PARTS)] + [side] for side in (height, width))
     values = []
-    for rows in _parts(height):
-        for columns in _parts(width):
-            piece = (None, slice(None), rows, columns)
-            size = rows.stop - rows.start, columns.stop - columns.start
-            place = place_in_frame(*size, (rows.start, columns.start), (height, width))
-            made = make(pair.srgb[piece], place).clamp(0.0, 1.0)
-            values.append(psnr(_seen(made, pair), _seen(pair.raw[piece], pair)).item())
-    return sum(values) / len(values)
-
-
-def _parts(side: int) -> Iterator[slice]:
-    edges = [k * side // PARTS // 2 * 2 for k in range(PARTS)] + [side]
-    return (slice(first, last) for first, last in pairwise(edges))
+    for (top, bottom), (left, right) in product(*map(pairwise, edges)):
+        piece = (None, slice(None), slice(top, bottom), slice(left, right))
+        place = place_in_frame(bottom - top, right - left, (top, left), (height, width))
+        made = make(pair.srgb[piece], place).clamp(0.0, 1.0)
+        values.append(psnr(_seen(made, pair), _seen(pair.raw[piece], pair)).item())
+    return fmean(values)
 
 
 def _seen(raw: Tensor, pair: Pair) -> Tensor:
@@ -267,7 +251,7 @@ FLOOR = 1e-3
 @torch.no_grad()
 def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPParams:
     """The best setting for the frame among what descent finds and the ``others``, one or more."""
-    pixels, _ = sample_pixels([pair], PIXELS, seed=0)
+    pixels = sample_pixels([pair], PIXELS, seed=0).pixels
     start = None
     if isp.config.cameras:
         own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))

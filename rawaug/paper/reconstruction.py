@@ -8,11 +8,12 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 
 from __future__ import annotations
 
-import statistics
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from pathlib import Path
+from statistics import fmean, median
 from typing import Any
 
 import torch
@@ -29,6 +30,7 @@ from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper.baselines import Training
 from rawaug.paper.downstream import DownstreamConfig, psnr_d
 from rawaug.paper.frames import PERTURBED
 from rawaug.paper.methods import (
@@ -39,9 +41,9 @@ from rawaug.paper.methods import (
     cycle_psnr,
     fit_family,
     is_method,
-    kept,
     learns_by_descent,
     mosaic_only_psnr,
+    resumed,
     score_rows,
 )
 from rawaug.plugin.pictures import even_sided
@@ -169,16 +171,16 @@ class Comparison:
 @EXPERIMENTS.register("reconstruction")
 def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[str, Any]]:
     """Run a comparison; the rows as in ``table.json``; ``overwrite`` replaces another of its name."""
-    prepared = PreparedComparison(comparison, overwrite)
+    require_free(comparison, overwrite)
+    table = Table(comparison)
     claim(comparison, overwrite)
-    return prepared.table()
+    return table.filled()
 
 
-class PreparedComparison:
+class Table:
     """A comparison whose data are open and checked; nothing is written yet."""
 
-    def __init__(self, settings: Comparison, overwrite: bool = False) -> None:
-        require_free(settings, overwrite)
+    def __init__(self, settings: Comparison) -> None:
         if settings.downstream is not None:
             require_trainable("cpu", 1, settings.downstream.train.precision)
         self.settings, self.folder = settings, run_folder(settings)
@@ -189,106 +191,109 @@ class PreparedComparison:
         if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
             where, count = settings.test or settings.data, len(self.scored)
             raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
-        self._fitted: tuple[str, Fitted] | None = None
+        self._fitted: dict[str, Fitted] = {}
         side = settings.downstream.train.crop if settings.downstream else 2
         pictures = open_pictures(settings.pictures, min_side=side)
         self.pictures = [even_sided(pictures[k]) for k in range(len(pictures))]
 
-    def table(self) -> dict[str, dict[str, Any]]:
+    def filled(self) -> dict[str, dict[str, Any]]:
         """All rows; printed, and written with every single figure."""
-        rows: dict[str, dict[str, Any]] = {}
-        for family, scale in self._families():
-            rows |= self._rows(family, scale)
+        settings, rows = self.settings, dict[str, dict[str, Any]]()
+        for family in settings.methods:
+            rows |= self._rows(family, 1.0)
+            if settings.longer and learns_by_descent(family):
+                rows |= self._rows(family, settings.longer)
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
-        write_json({"settings": asdict(self.settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
-        frames, settings = len(next(iter(rows.values()))["frames"]), self.settings
+        write_json({"settings": asdict(settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
+        frames = len(next(iter(rows.values()))["frames"])
         on = f"one of {frames} frames left out" if settings.test is None else f"{frames} frames of {settings.test}"
         title = f"{settings.name}: {on}, seeds: {settings.seeds}, {settings.data}"
         print_methods(title, rows, settings.balanced, ceiling)
         return rows
 
-    def _families(self) -> Iterator[tuple[str, float]]:
-        for family in self.settings.methods:
-            yield family, 1.0
-            if self.settings.longer and learns_by_descent(family):
-                yield family, self.settings.longer
-
     def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
-        settings, longer = self.settings, scale != 1.0
+        settings, longer, names = self.settings, scale != 1.0, names_of(self.scored)
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
         frames = range(settings.longer_frames if longer else len(self.scored))
-        names = names_of(self.scored)
-        bar = progress([(s, k) for s in seeds for k in frames], label=f"{family} x{scale:g}", unit="fit")
-        folds = [(seed, frame, self._fold(family, scale, seed, frame)) for seed, frame in bar]
+        folds: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
+        for seed, frame in progress(list(product(seeds, frames)), label=f"{family} x{scale:g}", unit="fit"):
+            folds[seed].append(self._fold(family, scale, seed, frame))
+        every = [fold for of_seed in folds.values() for fold in of_seed]
+        speeds = [fold["mpix_s"] for fold in every if fold["mpix_s"] is not None]
         whole = {} if longer else self._whole(family)
+
+        def by_seed(kind: str, row: str) -> list[list[float]]:
+            return [[fold[kind][row] for fold in of_seed] for of_seed in folds.values()]
+
         rows = {}
-        for row in folds[0][2]["rows"]:
-            by_seed = [[fold["rows"][row] for s, _, fold in folds if s == seed] for seed in seeds]
-            quarters = [worst_and_best_quarter(values) for values in by_seed]
-            name = row_name(family, row)
-            name = f"{name}, {scale:g} times as long" if longer else name
+        for row in every[0]["rows"]:
+            values = by_seed("rows", row)
+            name = row_name(family, row) + (f", {scale:g} times as long" if longer else "")
             rows[name] = {
-                "psnr_r": [statistics.fmean(values) for values in by_seed],
-                "frames": {names[k]: [values[k] for values in by_seed] for k in frames},
-                "worst25": [worst for worst, _ in quarters],
-                "best25": [best for _, best in quarters],
-                "seconds": statistics.fmean(fold["seconds"] for *_, fold in folds),
-                "mpix_s": _median([fold["mpix_s"] for *_, fold in folds]),
-                "parameters": folds[0][2]["parameters"],
+                "psnr_r": [fmean(of_seed) for of_seed in values],
+                "frames": {names[k]: [of_seed[k] for of_seed in values] for k in frames},
+                "worst25": [worst_and_best_quarter(of_seed)[0] for of_seed in values],
+                "best25": [worst_and_best_quarter(of_seed)[1] for of_seed in values],
+                "seconds": fmean(fold["seconds"] for fold in every),
+                "mpix_s": median(speeds) if speeds else None,
+                "parameters": every[0]["parameters"],
                 **(whole if row == "blind" else {}),
             }
-            if row in folds[0][2].get("balanced", {}):
-                by_seed = [[fold["balanced"][row] for s, _, fold in folds if s == seed] for seed in seeds]
-                rows[name]["balanced"] = [statistics.fmean(values) for values in by_seed]
+            if row in every[0].get("balanced", {}):
+                rows[name]["balanced"] = [fmean(of_seed) for of_seed in by_seed("balanced", row)]
         return rows
 
     def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
         """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
         settings, name = self.settings, names_of(self.scored)[frame]
-        budget = (settings.seconds * scale, settings.crop, settings.batch)
+        training = self._training(seed, scale)
         measured = settings.patches, settings.balanced, settings.perturbed
-        key = fingerprint(family, budget, seed, *measured, *self._frames())
+        key = fingerprint(family, asdict(training), *measured, *self._frames())
         path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
-        if (known := kept(path, key)) is not None:
-            return known
-        pair = self.scored[frame]
+        return resumed(path, key, lambda: self._scored(family, training, frame, key))
+
+    def _scored(self, family: str, training: Training, frame: int, key: str) -> dict[str, Any]:
+        """The figures of one fold."""
+        settings, pair = self.settings, self.scored[frame]
         if settings.test:
             pair = pair.in_pattern(self.pairs[0].cfa)
-            if self._fitted is None or self._fitted[0] != key:
-                self._fitted = key, fit_family(family, self.pairs, self.fit, budget, seed)
-            fitted = self._fitted[1]
+            if key not in self._fitted:
+                self._fitted = {key: fit_family(family, self.pairs, self.fit, training)}
+            fitted = self._fitted[key]
         else:
-            fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, budget, seed)
+            fitted = fit_family(family, [p for p in self.pairs if p is not pair], self.fit, training)
         result = score_rows(fitted, pair, settings.patches)
         for kind in settings.perturbed:
             found = score_rows(fitted, PERTURBED[kind](pair), settings.patches)["rows"]
             result["rows"] |= {f"{row}, {kind}": value for row, value in found.items()}
         if settings.balanced:
             result["balanced"] = balanced_rows(fitted, pair)
-        result |= {**fitted.model.info, "key": key, "seconds": fitted.seconds, "parameters": fitted.parameters}
-        write_json(result, path)
-        return result
+        return result | {**fitted.model.info, "seconds": fitted.seconds, "parameters": fitted.parameters}
 
     def _whole(self, family: str) -> dict[str, Any]:
         """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
         settings = self.settings
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
         seeds = range(settings.seed, settings.seed + settings.seeds)
-        budget = (settings.seconds, settings.crop, settings.batch)
-        after = downstream and asdict(downstream)
-        key = fingerprint(family, budget, list(seeds), settings.pictures, *self._frames(), after)
-        path = self._path(f"{family}-all-frames")
-        if (known := kept(path, key)) is not None:
-            return known
-        fitted = fit_family(family, self.pairs, self.fit, budget, settings.seed)
-        result: dict[str, Any] = {"key": key, **cycle_psnr(fitted, self.pictures)}
-        if downstream:
-            samples = (family, budget, settings.seed, settings.pictures, *self._frames(), *downstream.sampling())
-            trained = weights_key(downstream.denoiser, downstream.train, samples, validation="watched")
-            place = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
-            result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
-        write_json(result, path)
-        return result
+        training = self._training(settings.seed)
+        samples = (family, asdict(training), settings.pictures, *self._frames())
+        key = fingerprint(*samples, list(seeds), downstream and asdict(downstream))
+
+        def measured() -> dict[str, Any]:
+            fitted = fit_family(family, self.pairs, self.fit, training)
+            result: dict[str, Any] = cycle_psnr(fitted, self.pictures)
+            if downstream:
+                drawn = (*samples, downstream.noise, downstream.exposure)
+                trained = weights_key(downstream.denoiser, downstream.train, drawn, validation="watched")
+                place = self.folder / f"{family.replace('/', '_')}-denoisers-{trained}"
+                result["psnr_d"] = [psnr_d(fitted.model, self.pictures, downstream, place, seed) for seed in seeds]
+            return result
+
+        return resumed(self._path(f"{family}-all-frames"), key, measured)
+
+    def _training(self, seed: int, scale: float = 1.0) -> Training:
+        settings = self.settings
+        return Training(settings.seconds * scale, crop=settings.crop, batch=settings.batch, seed=seed)
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""
@@ -334,8 +339,3 @@ def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
     cfa = CFA(pair.cfa)
     noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
     return replace(pair, noisy=noisy)
-
-
-def _median(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return statistics.median(known) if known else None

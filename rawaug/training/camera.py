@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -25,19 +24,11 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.io import read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import (
-    IsoLevel,
-    MeasuredLevels,
-    NoiseEstimate,
-    estimate_noise,
-    from_dark_frames,
-    plot_noise,
-)
+from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_noise, from_dark_frames, plot_noise
+from rawaug.noise.estimate import WORST_FIT
 
 WATCHED_PATCHES = 4
 """Of each held-out frame, scored while the fit goes on."""
-WORST_FIT = 0.5
-"""R^2 below which the points do not follow a line."""
 MOST_FRAMES = 32
 """Largest number of frames measured, since all are in memory."""
 _UNKNOWN = "unknown"
@@ -52,12 +43,16 @@ class MeasuredFrame(NamedTuple):
     iso: float | None
 
 
-@dataclass(frozen=True)
-class CameraNoise:
+class CameraNoise(NamedTuple):
     """What was measured."""
 
     law: MeasuredLevels
     estimates: dict[float | None, NoiseEstimate]
+
+    def plot(self, path: str | Path) -> None:
+        """Draw the points and lines of each ISO, see :func:`noise_figures`."""
+        for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
+            plot_noise(estimate, file, title=self.law.camera if iso is None else f"{self.law.camera}, ISO {iso:g}")
 
 
 def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) -> CameraNoise:
@@ -86,12 +81,9 @@ def _measured(
     except ValueError as error:
         raise ValueError(f"noise{where}: {error}") from None
     if estimate.shot_var <= 0.0 or estimate.r2 < WORST_FIT:
-        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {_advice(iso)}")
+        advice = "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
+        raise ValueError(f"noise{where}: the frames do not fit one noise law (R^2 {estimate.r2:.2f}); {advice}")
     return estimate
-
-
-def _advice(iso: float | None) -> str:
-    return "use one camera at one ISO" if iso is None else "use unprocessed RAW files with flat areas"
 
 
 def _by_iso(frames: Sequence[MeasuredFrame]) -> dict[float | None, list[MeasuredFrame]]:
@@ -189,8 +181,10 @@ def fit(
     pairs = _pairs(source, camera_jpeg, mosaics)
     watch = None
     if held_out is not None:
-        own = mosaics if str(held_out).startswith("pairs:") else {}
-        watch = _Watch(_unseen(_pairs(held_out, camera_jpeg, own), pairs))
+        others = _pairs(held_out, camera_jpeg, mosaics if str(held_out).startswith("pairs:") else {})
+        if (seen := shared_frame(others, pairs)) is not None:
+            raise ValueError(f"held-out: {seen} is also fitted; hold out other frames")
+        watch = _Watch(others)
     frames = Readable(pairs)
     estimate = _measured_noise(frames, noise, dark)  # before the fit: what fails here fails early
     isp = fit_isp(frames, FitConfig(**settings), progress, state, watch)
@@ -204,7 +198,7 @@ def fit(
     elif estimate is not None:
         isp.info["noise"] = estimate.law.spec()
         if noise_figure is not None:
-            _plot(estimate, noise_figure)
+            estimate.plot(noise_figure)
     isp.info["rendering"] = rendering_of(pairs, len(isp.info["frames"]), isp.info["registered"])
     isp.info["seconds"] = round(time.perf_counter() - start, 2)
     return isp
@@ -216,11 +210,6 @@ def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:
     if len(law.levels) == 1:
         return [path]
     return [path.with_name(f"{path.stem}-iso{level.iso:g}{path.suffix}") for level in law.levels]
-
-
-def _plot(noise: CameraNoise, path: str | Path) -> None:
-    for file, (iso, estimate) in zip(noise_figures(path, noise.law), noise.estimates.items(), strict=True):
-        plot_noise(estimate, file, title=noise.law.camera if iso is None else f"{noise.law.camera}, ISO {iso:g}")
 
 
 def _measured_noise(pairs: Sequence[Pair], noise: str, dark: str | Path | None) -> CameraNoise | str | None:
@@ -254,13 +243,6 @@ class _Watch:
         blind, given = (fmean(of_frames) for of_frames in zip(*scores, strict=True))
         self.scores.append({"blind": round(blind, 2), "as_shot": round(given, 2)})
         return f"held out {blind:.2f} dB, {given:.2f} dB with as-shot gains"
-
-
-def _unseen(held_out: Sequence[Pair], fitted: Sequence[Pair]) -> Sequence[Pair]:
-    """``held_out``, unless a frame of it is also fitted."""
-    if (seen := shared_frame(held_out, fitted)) is not None:
-        raise ValueError(f"held-out: {seen} is also fitted; hold out other frames")
-    return held_out
 
 
 def _pairs(

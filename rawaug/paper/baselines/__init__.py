@@ -14,7 +14,7 @@ invgrey     Xia et al., TOG 2018, as InvISP compares it  0.74 M       descent   
 Parameters are those of the reverse pass at the default, published size.
 """
 
-from rawaug.paper.baselines.base import BaselineISP, fit_baseline
+from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline
 from rawaug.paper.baselines.cycleisp import CycleISP
 from rawaug.paper.baselines.invisp import InvISP
 from rawaug.paper.baselines.networks import InvertibleGrey, UNetISP
@@ -28,6 +28,7 @@ __all__ = [
     "CycleISP",
     "InvISP",
     "InvertibleGrey",
+    "Training",
     "TunedUPI",
     "UNetISP",
     "fit_baseline",

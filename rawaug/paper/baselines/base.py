@@ -5,10 +5,9 @@ which the mosaic keeps one channel a site. Whatever a method predicts, RAW and s
 sees the values as they are.
 
 One loop fits all that learn by descent, each with its own loss, on random crops of the pairs. A step draws ``batch``
-frames and as many crops from a generator keyed by the seed and the step's number. The crops start where the frame's CFA
-is that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
-budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same
-weights.
+crops from a generator keyed by the seed and the step's number. They start where the frame's CFA is that of the model,
+so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the budget, whichever of
+the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same weights.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from __future__ import annotations
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -33,11 +32,38 @@ from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
 
-class BaselineISP(ReverseISP):
-    """A method that the dictionary ISP is compared with; ``cfa`` is the pattern of the RAW that it makes and takes."""
+@dataclass(frozen=True)
+class Training:
+    """How a method that learns by descent is trained.
 
-    trainable: ClassVar[bool]
-    """Whether :func:`fit_baseline` changes anything in it."""
+    Args:
+        seconds: stop after these, reading not counted; the step under way is finished.
+        steps: stop after these. At least one of the two is given, and one step is done in any case.
+        crop: side of the crops, even.
+        batch: crops a step.
+        seed: of the crops.
+        progress: show a progress bar.
+    """
+
+    seconds: float | None = None
+    steps: int | None = None
+    crop: int = 128
+    batch: int = 4
+    seed: int = 0
+    progress: bool = True
+
+    def spent(self, seconds: float, steps: int) -> float:
+        """The part of the budget that is used up, of that limit which is nearer."""
+        by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
+        by_steps = 0.0 if self.steps is None else steps / self.steps
+        return max(by_time, by_steps)
+
+
+class BaselineISP(ReverseISP):
+    """A method that the dictionary ISP is compared with; ``cfa`` is the pattern of the RAW that it makes and takes.
+
+    The ``setting`` of a pass is what the method may be told of the shot, such as its gains; without, it takes its own.
+    """
 
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
@@ -56,56 +82,37 @@ class BaselineISP(ReverseISP):
     def reverse_parameters(self) -> int:
         return sum(parameter.numel() for parameter in self.reverse_network.parameters())
 
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+        """Fit to the pairs; the number of steps and the last loss. A method as published has nothing to fit."""
+        return 0, math.nan
+
+    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
+        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
+        return None
+
     @abstractmethod
-    def unprocess(self, srgb: Tensor) -> Tensor:
+    def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """Float sRGB ``(B, 3, H, W)`` to linear camera colour ``(B, 3, H, W)``, not clipped."""
 
-    def render(self, raw: Tensor) -> Tensor:
+    def render(self, raw: Tensor, setting: Any = None) -> Tensor:
         """Mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)``, not clipped; overridden where the method has it."""
         raise ValueError(
             f"{self.name} only converts sRGB to RAW; rawaug.paper.baselines lists the methods that also render RAW"
         )
 
-    def reverse(self, srgb: Tensor) -> Tensor:
+    def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
-        return self.to_mosaic(self.unprocess(checked_srgb(srgb)))
+        return bayer.mosaic(self.unprocess(checked_srgb(srgb), setting).clamp(0.0, 1.0), self.cfa)
 
     def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
-        return self.reverse(srgb)
+        return self.reverse(srgb, setting)
 
-    def forward(self, raw: Tensor) -> Tensor:
+    def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
         """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
-        return self.render(checked_raw(raw)).clamp(0.0, 1.0)
+        return self.render(checked_raw(raw), setting).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
         return self.forward(self.reverse(srgb))
-
-    def to_mosaic(self, linear: Tensor) -> Tensor:
-        """Linear colour ``(B, 3, H, W)`` to the mosaic ``(B, 1, H, W)``, clipped to [0, 1]."""
-        return bayer.mosaic(linear.clamp(0.0, 1.0), self.cfa)
-
-
-class Crops(NamedTuple):
-    """A training batch, in the CFA of the model that is trained."""
-
-    srgb: Tensor
-    raw: Tensor
-    white_balance: Tensor
-
-
-class CropTrainedISP(BaselineISP):
-    """A network that learns by gradient descent on random crops."""
-
-    trainable = True
-    learning_rate: ClassVar[float]
-    """For Adam, at the start."""
-
-    def prepare(self, pairs: Sequence[FramePair]) -> None:
-        """Set from the pairs what descent does not learn; called once, before training."""
-
-    @abstractmethod
-    def loss(self, crops: Crops, both: bool) -> Tensor:
-        """The method's own loss, a scalar; ``both``: of the two directions where it has them, else of the reverse."""
 
 
 def checked_srgb(srgb: Tensor) -> Tensor:
@@ -132,25 +139,88 @@ def checked_raw(raw: Tensor) -> Tensor:
     return raw
 
 
-Model = TypeVar("Model", bound=BaselineISP)
+class Crops(NamedTuple):
+    """A training batch, in the CFA of the model that is trained."""
+
+    srgb: Tensor
+    raw: Tensor
+    white_balance: Tensor
+
 
 CLIP_NORM = 1.0
 """The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
 
 
-def fit_baseline(
-    model: Model,
-    pairs: Sequence[FramePair],
-    seconds: float | None = None,
-    steps: int | None = None,
-    *,
-    crop: int = 128,
-    batch: int = 4,
-    learning_rate: float | None = None,
-    both: bool = True,
-    seed: int = 0,
-    progress: bool = True,
-) -> Model:
+class CropTrainedISP(BaselineISP):
+    """A network that learns by gradient descent on random crops."""
+
+    learning_rate: ClassVar[float]
+    """For Adam, at the start."""
+
+    def prepare(self, pairs: Sequence[FramePair]) -> None:
+        """Set from the pairs what descent does not learn; called once, before training."""
+
+    @abstractmethod
+    def loss(self, crops: Crops) -> Tensor:
+        """The method's own loss, a scalar, of the two directions where it has them."""
+
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+        """Adam on random crops until the budget is spent; seconds begin with the first step."""
+        given = [limit for limit in (training.seconds, training.steps) if limit is not None]
+        if not given or min(given) <= 0:
+            raise ValueError(f"give seconds or steps above 0, got {training.seconds} and {training.steps}")
+        require_crops(pairs, training.crop)
+        self.prepare(pairs)
+        self.train()
+        parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        start, done, value = time.perf_counter(), 0, math.nan
+        descent = adam(
+            parameters,
+            self.learning_rate,
+            lambda step: self.loss(random_crops(pairs, self.cfa, training, step, parameters[0].device)),
+            lambda step: training.spent(time.perf_counter() - start, step),
+            clip_norm=CLIP_NORM,
+        )
+        bar = progress_bar(
+            descent, label=f"fit {self.name}", unit="step", total=training.steps, shown=training.progress
+        )
+        for _, loss in bar:
+            done, value = done + 1, loss.item()
+            bar.set_postfix_str(f"loss {value:.2e}, {time.perf_counter() - start:.0f} s", refresh=False)
+        return done, value
+
+
+def require_crops(pairs: Sequence[FramePair], side: int) -> None:
+    """Raise ValueError unless every pair is registered, and has room for a crop wherever its pattern begins."""
+    for pair in pairs:
+        if not pair.registered:
+            raise ValueError(f"{pair.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
+        if min(pair.raw.shape[-2:]) < side + 2:
+            height, width = pair.raw.shape[-2:]
+            raise ValueError(f"{pair.name}: {height} x {width} is smaller than {side + 2}; use a smaller crop")
+
+
+def random_crops(
+    pairs: Sequence[FramePair], cfa: CFA, training: Training, step: int, device: torch.device | str = "cpu"
+) -> Crops:
+    """The batch of a step: crops of random pairs, in one CFA."""
+    generator = keyed_generator(training.seed, "baseline crops", step)
+    crop = bayer.RandomCrop(training.crop)
+
+    def drawn() -> Iterator[Crops]:
+        for k in torch.randint(len(pairs), (training.batch,), generator=generator).tolist():
+            pair = pairs[k]
+            srgb, raw = (bayer.aligned(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
+            place = crop.sample(raw.shape[-2], raw.shape[-1], generator)
+            yield Crops(as_float(crop.apply(srgb, place)), crop.apply(raw, place), torch.tensor(pair.white_balance))
+
+    return Crops(*(torch.stack(values).to(device) for values in zip(*drawn(), strict=True)))
+
+
+Model = TypeVar("Model", bound=BaselineISP)
+
+
+def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -> Model:
     """Fit a baseline in place; ``model.info`` records the steps, the seconds and the last loss.
 
     UPI as published has nothing to fit: it comes back as it is, after 0 steps. Tuned UPI is solved in closed form, in
@@ -159,14 +229,7 @@ def fit_baseline(
     Args:
         model: one of :data:`rawaug.paper.baselines.BASELINES`, on any device.
         pairs: frames; read once and kept in memory.
-        seconds: stop after these, reading not counted; the step under way is finished.
-        steps: stop after these. At least one of the two is given, and one step is done in any case.
-        crop: side of the crops, even.
-        batch: crops a step.
-        learning_rate: at the start; the model's own by default.
-        both: also train the forward pass where the method has one.
-        seed: of the crops.
-        progress: show a progress bar.
+        training: of methods that learn by descent.
 
     Raises:
         ValueError: if there is no budget or no pair, or a frame is smaller than a crop or not registered.
@@ -175,107 +238,9 @@ def fit_baseline(
     if not frames:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
     start = time.perf_counter()
-    steps_done, loss = 0, math.nan
-    if isinstance(model, SolvedISP):
-        model.tune(frames, seed)
-        steps_done = 1
-    elif isinstance(model, CropTrainedISP):
-        budget, draw = _Budget(seconds, steps), _CropDrawer(frames, model.cfa, crop, batch, seed)
-        model.prepare(frames)
-        steps_done, loss = _descend(model, draw, budget, learning_rate, both, progress)
-    model.info = {"frames": [frame.name for frame in frames], "seed": seed, "steps": steps_done}
+    done, loss = model.learn(frames, training)
+    model.info = {"frames": [frame.name for frame in frames], "seed": training.seed, "steps": done}
     model.info["seconds"] = round(time.perf_counter() - start, 2)
     if not math.isnan(loss):
         model.info["loss"] = loss
     return model.eval()
-
-
-@runtime_checkable
-class SolvedISP(Protocol):
-    """A method that is solved in closed form."""
-
-    def tune(self, pairs: Sequence[FramePair], seed: int = 0) -> Any:
-        """Solve for what it learns from the pairs."""
-
-
-@dataclass(frozen=True)
-class _Budget:
-    """Seconds, steps, or both."""
-
-    seconds: float | None
-    steps: int | None
-
-    def __post_init__(self) -> None:
-        given = [limit for limit in (self.seconds, self.steps) if limit is not None]
-        if not given or min(given) <= 0:
-            raise ValueError(f"give seconds or steps above 0, got seconds={self.seconds}, steps={self.steps}")
-
-    def spent(self, seconds: float, steps: int) -> float:
-        """The part of the budget that is used up, of that limit which is nearer."""
-        by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
-        by_steps = 0.0 if self.steps is None else steps / self.steps
-        return max(by_time, by_steps)
-
-
-@dataclass(frozen=True)
-class _CropDrawer:
-    """Random crops of frames, keyed by the step, in one CFA."""
-
-    frames: Sequence[FramePair]
-    cfa: CFA
-    side: int
-    batch: int
-    seed: int
-
-    def __post_init__(self) -> None:
-        if self.side < 2 or self.side % 2 or self.batch < 1:
-            raise ValueError(f"crop must be even and batch at least 1, got crop {self.side}, batch {self.batch}")
-        for frame in self.frames:
-            height, width = frame.raw.shape[-2:]
-            if not frame.registered:
-                raise ValueError(f"{frame.name}: RAW and sRGB are not registered pixel by pixel, which crops need")
-            if min(height, width) < self.side + 2:
-                needed = self.side + 2
-                raise ValueError(f"{frame.name}: {height} x {width} is smaller than {needed}; use a smaller crop")
-
-    def __call__(self, step: int, device: torch.device) -> Crops:
-        generator = keyed_generator(self.seed, "baseline crops", step)
-        chosen = torch.randint(len(self.frames), (self.batch,), generator=generator).tolist()
-        places = torch.rand(self.batch, 2, generator=generator).tolist()
-        cuts = [self._cut(self.frames[k], *place) for k, place in zip(chosen, places, strict=True)]
-        return Crops(*(torch.stack(values).to(device) for values in zip(*cuts, strict=True)))
-
-    def _cut(self, frame: FramePair, *place: float) -> Crops:
-        """One crop of a frame at ``place`` in [0, 1)^2 of where it can be, without the leading dimension."""
-        shift = CFA(frame.cfa).shift_to(self.cfa)
-        free = ((size - self.side) // 2 for size in frame.raw.shape[-2:])
-        top, left = (first + 2 * int(part * room) for first, part, room in zip(shift, place, free, strict=True))
-        window = (..., slice(top, top + self.side), slice(left, left + self.side))
-        return Crops(as_float(frame.srgb[window]), frame.raw[window], torch.tensor(frame.white_balance))
-
-
-def _descend(
-    model: CropTrainedISP,
-    draw: _CropDrawer,
-    budget: _Budget,
-    learning_rate: float | None,
-    both: bool,
-    progress: bool,
-) -> tuple[int, float]:
-    """Adam until the budget is spent; the number of steps and the last loss."""
-    model.train()
-    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    rate = model.learning_rate if learning_rate is None else learning_rate
-    start, done, value = time.perf_counter(), 0, math.nan
-    descent = adam(
-        parameters,
-        rate,
-        lambda step: model.loss(draw(step, parameters[0].device), both),
-        lambda step: budget.spent(time.perf_counter() - start, step),
-        clip_norm=CLIP_NORM,
-    )
-    bar = progress_bar(descent, label=f"fit {model.name}", unit="step", total=budget.steps, shown=progress)
-    for _, loss in bar:
-        done, value = done + 1, loss.item()
-        bar.set_postfix_str(f"loss {value:.2e}, {time.perf_counter() - start:.0f} s", refresh=False)
-    return done, value

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from denoisers.cycleisp import Trunk, conv, load_published
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.paper.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
+from rawaug.paper.baselines.base import Crops, CropTrainedISP, checked_srgb
 from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
@@ -32,7 +32,7 @@ LOG_FLOOR = 1e-3
 class RGB2RAW(Trunk):
     """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
 
-    def __init__(self, features: int = 96, groups: int = 3, blocks: int = 5, reduction: int = 8) -> None:
+    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
         super().__init__(3, features, groups, blocks, reduction)
         self.tail = nn.Sequential(conv(features, 3))
 
@@ -43,8 +43,8 @@ class RGB2RAW(Trunk):
 class ColourBranch(Trunk):
     """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
 
-    def __init__(self, features: int = 96, groups: int = 2, blocks: int = 2, reduction: int = 8) -> None:
-        super().__init__(3, features, groups, blocks, reduction)
+    def __init__(self, features: int, reduction: int) -> None:
+        super().__init__(3, features, groups=2, blocks=2, reduction=reduction)
         self.tail = nn.Sequential(conv(features, features), nn.Sigmoid())
 
     def forward(self, srgb: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ class ColourBranch(Trunk):
 class RAW2RGB(Trunk):
     """Packed RAW ``(B, 4, H/2, W/2)`` and the colour branch's weights to sRGB ``(B, 3, H, W)``."""
 
-    def __init__(self, features: int = 96, groups: int = 3, blocks: int = 5, reduction: int = 8) -> None:
+    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
         super().__init__(4, features, groups, blocks, reduction)
         self.tail = nn.Sequential(conv(features, features), self.body[-1])
         self.tail_rgb = nn.Sequential(nn.Conv2d(features, 12, 1))
@@ -73,7 +73,7 @@ class RAW2RGB(Trunk):
 
 @BASELINES.register("cycleisp")
 class CycleISP(CropTrainedISP):
-    """CycleISP. To render RAW it needs a picture whose colours it takes: ``model(raw, reference=srgb)``.
+    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``.
 
     Args:
         cfa: pattern of the RAW; that of the published weights is RGGB.
@@ -102,37 +102,33 @@ class CycleISP(CropTrainedISP):
         with initialised_from(derived_seed(seed, "baseline")):
             self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
             self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
-            self.ccm = ColourBranch(features, reduction=reduction)
+            self.ccm = ColourBranch(features, reduction)
 
     @property
     def reverse_network(self) -> nn.Module:
         return self.rgb2raw
 
-    def unprocess(self, srgb: Tensor) -> Tensor:
+    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
         return self.rgb2raw(srgb)
 
-    def forward(self, raw: Tensor, reference: Tensor | None = None) -> Tensor:
-        """As in the base class; ``reference``: an sRGB picture ``(B, 3, H, W)`` of the same scene, as published.
-
-        Raises:
-            ValueError: also if there is no reference, or its size is not that of ``raw``.
-        """
-        if reference is None:
-            raise ValueError("cycleisp renders RAW in the colours of a picture: pass reference=srgb of the same scene")
-        raw, srgb = checked_raw(raw), checked_srgb(reference)
+    def render(self, raw: Tensor, setting: Tensor | None = None) -> Tensor:
+        """As in the base class; the setting is an sRGB picture ``(B, 3, H, W)`` of the same scene, as published."""
+        if setting is None:
+            raise ValueError("cycleisp renders RAW in the colours of a picture: pass the sRGB of the same scene")
+        srgb = checked_srgb(setting)
         if raw.shape[2:] != srgb.shape[2:]:
-            raise ValueError(f"reference {tuple(srgb.shape)} must have the sides of the mosaic {tuple(raw.shape)}")
-        return self._render(raw, srgb).clamp(0.0, 1.0)
+            raise ValueError(f"the picture {tuple(srgb.shape)} must have the sides of the mosaic {tuple(raw.shape)}")
+        return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(srgb))
 
     def cycle(self, srgb: Tensor) -> Tensor:
-        return self.forward(self.reverse(srgb), reference=srgb)
+        return self.forward(self.reverse(srgb), srgb)
 
-    def loss(self, crops: Crops, both: bool) -> Tensor:
+    def loss(self, crops: Crops) -> Tensor:
         """l1 and l1 of logarithms on the mosaic; l1 on sRGB made from the true RAW."""
         predicted = bayer.mosaic(self.unprocess(crops.srgb), self.cfa)
         log_predicted, log_raw = (image.clamp_min(LOG_FLOOR).log() for image in (predicted, crops.raw))
         reverse = F.l1_loss(predicted, crops.raw) + F.l1_loss(log_predicted, log_raw)
-        return reverse + F.l1_loss(self._render(crops.raw, crops.srgb), crops.srgb) if both else reverse
+        return reverse + F.l1_loss(self.render(crops.raw, crops.srgb), crops.srgb)
 
     def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
         """Take the weights of a published checkpoint; nothing in it is run as code.
@@ -149,6 +145,3 @@ class CycleISP(CropTrainedISP):
         if part not in parts:
             raise ValueError(f"part {part!r} is unknown; use one of {', '.join(parts)}")
         load_published(getattr(self, part), path, part)
-
-    def _render(self, raw: Tensor, reference: Tensor) -> Tensor:
-        return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(reference))

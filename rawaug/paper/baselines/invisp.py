@@ -21,13 +21,14 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.isp import stages
 from rawaug.isp.fit.samples import FramePair
-from rawaug.paper.baselines.base import Crops, CropTrainedISP, checked_raw, checked_srgb
+from rawaug.paper.baselines.base import Crops, CropTrainedISP
 from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
 SCALE_CLAMP = 0.8
 GAMMA = 2.2
 """RAW is compressed before the network, as published, for its dynamic range."""
+Balance = Tensor | tuple[float, ...] | None
 
 
 class DenseBlock(nn.Module):
@@ -94,7 +95,9 @@ class Flow(nn.Module):
 
 @BASELINES.register("invisp")
 class InvISP(CropTrainedISP):
-    """InvISP; both passes take the shot's white balance, or use the geometric mean of the training pairs'.
+    """InvISP; the setting of a pass is the shot's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``.
+
+    Without, both passes take the geometric mean of the training pairs'.
 
     Args:
         cfa: pattern of the RAW.
@@ -105,7 +108,7 @@ class InvISP(CropTrainedISP):
 
     Example:
         >>> model, srgb = InvISP(blocks=2, growth=4), torch.rand(1, 3, 8, 8)
-        >>> model.reverse(srgb, white_balance=(2.0, 1.0, 1.5)).shape
+        >>> model.reverse(srgb, (2.0, 1.0, 1.5)).shape
         torch.Size([1, 1, 8, 8])
     """
 
@@ -132,30 +135,24 @@ class InvISP(CropTrainedISP):
     def prepare(self, pairs: Sequence[FramePair]) -> None:
         self.balance.copy_(torch.tensor([pair.white_balance for pair in pairs]).log().mean(0, keepdim=True).exp())
 
-    def make(self, srgb: Tensor, setting: tuple[float, ...] | None = None, place: Tensor | None = None) -> Tensor:
-        return self.reverse(srgb, setting)
+    def balanced(self, white_balance: tuple[float, float, float]) -> Balance:
+        return white_balance
 
-    def reverse(self, srgb: Tensor, white_balance: Tensor | tuple[float, ...] | None = None) -> Tensor:
-        """As in the base class; ``white_balance``: as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``."""
-        return self.to_mosaic(self._unbalance(self.flow.inverse(checked_srgb(srgb)), white_balance))
+    def unprocess(self, srgb: Tensor, setting: Balance = None) -> Tensor:
+        balanced = stages.gamma_expand(self.flow.inverse(srgb), GAMMA)
+        return stages.apply_gains(balanced, 1.0 / self._gains(setting, len(srgb)))
 
-    def forward(self, raw: Tensor, white_balance: Tensor | tuple[float, ...] | None = None) -> Tensor:
-        """As in the base class; ``white_balance`` as in :meth:`reverse`."""
-        return self.flow(self.compressed(checked_raw(raw), white_balance)).clamp(0.0, 1.0)
+    def render(self, raw: Tensor, setting: Balance = None) -> Tensor:
+        return self.flow(self.compressed(raw, setting))
 
-    def unprocess(self, srgb: Tensor) -> Tensor:
-        return self._unbalance(self.flow.inverse(srgb), None)
-
-    def compressed(self, raw: Tensor, white_balance: Tensor | tuple[float, ...] | None = None) -> Tensor:
+    def compressed(self, raw: Tensor, setting: Balance) -> Tensor:
         """What the flow takes ``(B, 3, H, W)`` of a mosaic ``(B, 1, H, W)``."""
-        balanced = stages.apply_gains(bayer.demosaic(raw, self.cfa), self._gains(white_balance, len(raw)))
+        balanced = stages.apply_gains(bayer.demosaic(raw, self.cfa), self._gains(setting, len(raw)))
         return stages.gamma_compress(balanced, GAMMA)
 
-    def loss(self, crops: Crops, both: bool) -> Tensor:
+    def loss(self, crops: Crops) -> Tensor:
         """l1 in both directions; with JPEG between, the way back starts from the network's own rendering."""
         raw = self.compressed(crops.raw, crops.white_balance)
-        if self.jpeg_quality is None and not both:
-            return F.l1_loss(self.flow.inverse(crops.srgb), raw)
         rendered = self.flow(raw)
         picture = crops.srgb if self.jpeg_quality is None else self._jpeg(rendered.clamp(0.0, 1.0))
         return F.l1_loss(rendered, crops.srgb) + F.l1_loss(self.flow.inverse(picture), raw)
@@ -165,11 +162,7 @@ class InvISP(CropTrainedISP):
 
         return jpeg_codec_differentiable(srgb, srgb.new_tensor([float(self.jpeg_quality or 100)]))
 
-    def _unbalance(self, compressed: Tensor, white_balance: Tensor | tuple[float, ...] | None) -> Tensor:
-        balanced = stages.gamma_expand(compressed, GAMMA)
-        return stages.apply_gains(balanced, 1.0 / self._gains(white_balance, len(compressed)))
-
-    def _gains(self, white_balance: Tensor | tuple[float, ...] | None, batch: int) -> Tensor:
-        given = self.balance if white_balance is None else white_balance
+    def _gains(self, setting: Balance, batch: int) -> Tensor:
+        given = self.balance if setting is None else setting
         gains = torch.as_tensor(given, dtype=self.balance.dtype, device=self.balance.device).expand(batch, 3)
         return gains / gains.amax(dim=1, keepdim=True)

@@ -32,12 +32,7 @@ from rawaug.seeding import derived_seed, initialised_from
 
 @BASELINES.register("unet")
 class UNetISP(CropTrainedISP):
-    """The U-Net baseline; it has no forward pass.
-
-    Args:
-        cfa: pattern of the RAW.
-        width: features of the first scale.
-        seed: of the initial weights.
+    """The U-Net baseline, ``width`` features in its first scale; it has no forward pass.
 
     Example:
         >>> import torch
@@ -53,10 +48,10 @@ class UNetISP(CropTrainedISP):
         super().__init__(cfa)
         self.network = UNet(width, channels=3, variance_map=False, seed=seed)
 
-    def unprocess(self, srgb: Tensor) -> Tensor:
+    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
         return self.network(srgb)
 
-    def loss(self, crops: Crops, both: bool) -> Tensor:
+    def loss(self, crops: Crops) -> Tensor:
         """l1 on the mosaic; there is no other direction."""
         return F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
 
@@ -114,14 +109,7 @@ def decoder(features: int, blocks: int) -> nn.Sequential:
 
 @BASELINES.register("invgrey")
 class InvertibleGrey(CropTrainedISP):
-    """The invertible-greyscale network, one network a direction.
-
-    Args:
-        cfa: pattern of the RAW.
-        features: of the finest scale.
-        blocks: residual blocks of the way back.
-        seed: of the initial weights.
-    """
+    """The invertible-greyscale network, one network a direction; ``blocks`` are the residual ones of the way back."""
 
     name = "invgrey"
     learning_rate = 1e-3
@@ -136,13 +124,13 @@ class InvertibleGrey(CropTrainedISP):
     def reverse_network(self) -> nn.Module:
         return self.decoder
 
-    def unprocess(self, srgb: Tensor) -> Tensor:
+    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
         return self.decoder(srgb)
 
-    def render(self, raw: Tensor) -> Tensor:
+    def render(self, raw: Tensor, setting: None = None) -> Tensor:
         return self.encoder(bayer.demosaic(raw, self.cfa))
 
-    def loss(self, crops: Crops, both: bool) -> Tensor:
+    def loss(self, crops: Crops) -> Tensor:
         """l1 on the mosaic, and on sRGB."""
         reverse = F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
-        return reverse + F.l1_loss(self.render(crops.raw), crops.srgb) if both else reverse
+        return reverse + F.l1_loss(self.render(crops.raw), crops.srgb)

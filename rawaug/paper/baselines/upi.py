@@ -11,17 +11,18 @@ fitted to pairs: ``y = M s^-1(x)^2.2`` below the highlights, with ``M = diag(1 /
 of a frame's mean squared error is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``, so a fit is
 a few 3 x 3 systems: the whole is exact and takes well under a second.
 
-The frames differ in gains that cannot be guessed. ``mse`` minimises the sum of their errors and follows the brightest;
-``mean`` takes the mean of the frames' own gains and matrices; ``log`` minimises ``sum_f log(MSE_f + eps)``, since the
-score averages decibels, by weighted least squares with weights ``1 / (MSE_f + eps)``: each round minimises the tangent
-of the concave logarithm, which lies above it, so the loss never rises.
+The frames differ in gains that cannot be guessed. The sum of their errors would follow the brightest; what is minimised
+is ``sum_f log(MSE_f + eps)``, since the score averages decibels, by weighted least squares with weights
+``1 / (MSE_f + eps)``: each round minimises the tangent of the concave logarithm, which lies above it, so the loss never
+rises.
 """
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from collections.abc import Iterable
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +33,8 @@ from rawaug.isp import stages
 from rawaug.isp.cameras import SRGB_TO_XYZ
 from rawaug.isp.config import HIGHLIGHT_KNEE
 from rawaug.isp.fit.samples import FramePair, PixelSamples, sample_pixels
-from rawaug.paper.baselines.base import BaselineISP, checked_raw, checked_srgb
+from rawaug.isp.tone import inverse_smoothstep
+from rawaug.paper.baselines.base import BaselineISP, Training
 from rawaug.registry import BASELINES
 
 GAMMA = 2.2
@@ -61,11 +63,6 @@ def smoothstep(x: Tensor) -> Tensor:
     return x * x * (3.0 - 2.0 * x)
 
 
-def inverse_smoothstep(x: Tensor) -> Tensor:
-    """``1/2 - sin(asin(1 - 2x) / 3)`` on [0, 1]."""
-    return 0.5 - torch.sin(torch.asin(1.0 - 2.0 * x.clamp(0.0, 1.0)) / 3.0)
-
-
 def camera_matrix(weights: Tensor) -> Tensor:
     """Weights ``(B, 4)`` of the cameras, of any positive sum, to linear sRGB-to-camera ``(B, 3, 3)``, rows of sum 1."""
     cameras = torch.tensor(XYZ_TO_CAMERA).to(weights) @ SRGB_TO_XYZ.to(weights)
@@ -74,20 +71,11 @@ def camera_matrix(weights: Tensor) -> Tensor:
 
 
 class SmoothstepISP(BaselineISP):
-    """UPI's stages with a matrix and gains from wherever; both passes are pure functions of picture and parameters."""
+    """UPI's stages with a matrix and gains from wherever: the setting of a pass is :class:`UPIParams`."""
 
     @abstractmethod
     def default_params(self, batch: int) -> UPIParams:
         """The defaults of a pass."""
-
-    def apply(self, srgb: Any, params: UPIParams | None = None) -> Any:
-        """sRGB ``(B, 3, H, W)``, uint8 or float, to the mosaic ``(B, 1, H, W)`` with the given parameters.
-
-        With a function alone it is ``nn.Module.apply``, which a surrounding module may call.
-        """
-        if params is None:
-            return super().apply(srgb)
-        return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), params))
 
     def balanced(self, white_balance: tuple[float, float, float]) -> UPIParams:
         """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
@@ -95,18 +83,11 @@ class SmoothstepISP(BaselineISP):
         balance = torch.tensor(white_balance) / white_balance[1]
         return params._replace(gains=params.gains[:, 1:2].cpu() * balance)
 
-    def make(self, srgb: Tensor, setting: UPIParams | None = None, place: Tensor | None = None) -> Tensor:
-        return self.to_mosaic(unprocess_pixels(checked_srgb(srgb), setting or self.default_params(len(srgb))))
+    def unprocess(self, srgb: Tensor, setting: UPIParams | None = None) -> Tensor:
+        return unprocess_pixels(srgb, setting or self.default_params(len(srgb)))
 
-    def unprocess(self, srgb: Tensor) -> Tensor:
-        return unprocess_pixels(srgb, self.default_params(len(srgb)))
-
-    def render(self, raw: Tensor) -> Tensor:
-        return self.render_with(raw, self.default_params(len(raw)))
-
-    def render_with(self, raw: Tensor, params: UPIParams) -> Tensor:
-        """The mosaic ``(B, 1, H, W)`` to sRGB ``(B, 3, H, W)`` in [0, 1] with the given parameters."""
-        return render_pixels(bayer.demosaic(checked_raw(raw), self.cfa), params)
+    def render(self, raw: Tensor, setting: UPIParams | None = None) -> Tensor:
+        return render_pixels(bayer.demosaic(raw, self.cfa), setting or self.default_params(len(raw)))
 
 
 def unprocess_pixels(x: Tensor, params: UPIParams) -> Tensor:
@@ -129,18 +110,16 @@ class UPI(SmoothstepISP):
     Example:
         >>> upi, srgb = UPI("GRBG"), torch.rand(2, 3, 8, 10)
         >>> params = upi.sample(2, torch.Generator().manual_seed(0))
-        >>> torch.equal(upi.apply(srgb, params), upi.apply(srgb, params))
+        >>> torch.equal(upi.reverse(srgb, params), upi.reverse(srgb, params))
         True
         >>> upi.reverse(srgb).shape
         torch.Size([2, 1, 8, 10])
     """
 
     name = "upi"
-    trainable = False
 
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        mosaic: Tensor = self.apply(srgb, self.sample(len(srgb), generator))
-        return mosaic
+        return self.reverse(srgb, self.sample(len(srgb), generator))
 
     def default_params(self, batch: int) -> UPIParams:
         """The published distributions' means: the four cameras alike, digital gain 1 / 0.8, red 2.15, blue 1.7."""
@@ -158,8 +137,6 @@ class UPI(SmoothstepISP):
         return UPIParams(camera_matrix(weights), torch.stack([digital * red, digital, digital * blue], dim=1))
 
 
-Criterion = Literal["log", "mse", "mean"]
-
 LOG_MSE_EPS = 1e-5
 """Added to a frame's MSE under the logarithm: frames beyond 50 dB count no more."""
 ROUNDS = 100
@@ -169,26 +146,21 @@ PIXELS = 32768
 
 @BASELINES.register("upi-tuned")
 class TunedUPI(SmoothstepISP):
-    """UPI's stages with a fitted camera's matrix and gains; identity until tuned.
-
-    Args:
-        cfa: pattern of the RAW.
-        criterion: "log", "mse" or "mean", see the module's head.
-    """
+    """UPI's stages with a fitted camera's matrix and gains; identity until tuned."""
 
     name = "upi-tuned"
-    trainable = True
 
-    def __init__(self, cfa: CFA | str = "RGGB", criterion: Criterion = "log") -> None:
+    def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__(cfa)
-        if criterion not in get_args(Criterion):
-            raise ValueError(f"criterion {criterion!r} is unknown; use one of {', '.join(get_args(Criterion))}")
-        self.criterion = criterion
         self.matrix = nn.Parameter(torch.eye(3), requires_grad=False)
         self.gains = nn.Parameter(torch.ones(3), requires_grad=False)
 
     def default_params(self, batch: int) -> UPIParams:
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
+
+    def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
+        self.tune(pairs, training.seed)
+        return 1, math.nan
 
     def tune(self, pairs: Iterable[FramePair], seed: int = 0) -> TunedUPI:
         """Fit matrix and gains; pairs of any CFA, registered or not.
@@ -197,15 +169,10 @@ class TunedUPI(SmoothstepISP):
             ValueError: if there is no pair, a frame has too few pixels below the highlights, or what fits best turns
                 white black.
         """
-        moments = Moments.of(sample_pixels(pairs, PIXELS, seed)[0])
-        if self.criterion == "mean":
-            own = moments.solve_each()
-            scale = own.sum(2)
-            product = (own / scale[:, :, None]).mean(0) / (1.0 / scale).mean(0)[:, None]
-        else:
-            product = moments.solve(torch.ones(len(moments.energy)).double())
-            for _ in range(ROUNDS if self.criterion == "log" else 0):
-                product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
+        moments = Moments.of(sample_pixels(pairs, PIXELS, seed).pixels)
+        product = moments.solve(torch.ones(len(moments.energy)).double())
+        for _ in range(ROUNDS):
+            product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
         sums = product.sum(1)
         if (sums <= 0.0).any():
             raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
@@ -234,20 +201,13 @@ class Moments(NamedTuple):
         a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))
 
-    def solve_each(self) -> Tensor:
-        """Each frame's own matrix ``(F, 3, 3)``."""
-        return torch.linalg.solve(self._ridge(self.a), self.b)
-
     def solve(self, weights: Tensor) -> Tensor:
         """The matrix ``(3, 3)`` of least weighted error, weights ``(F,)``."""
         a, b = torch.einsum("f,fcij->cij", weights, self.a), torch.einsum("f,fci->ci", weights, self.b)
-        return torch.linalg.solve(self._ridge(a), b)
+        ridge = 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)
+        return torch.linalg.solve(a + ridge, b)
 
     def error(self, product: Tensor) -> Tensor:
         """The frames' mean squared errors ``(F,)``."""
         square = torch.einsum("ci,fcij,cj->f", product, self.a, product)
         return (square - 2.0 * (product * self.b).sum((1, 2)) + self.energy).clamp_min(0.0)
-
-    @staticmethod
-    def _ridge(a: Tensor) -> Tensor:
-        return a + 1e-9 * a.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(3).to(a)

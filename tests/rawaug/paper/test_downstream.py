@@ -53,7 +53,7 @@ def test_crops_keep_the_pattern_in_every_turn(cfa: CFA) -> None:
 def test_a_crop_is_replayed_from_its_generator_alone() -> None:
     pictures = [torch.randint(0, 256, (3, 40, 48), generator=seeded(k), dtype=torch.uint8) for k in range(3)]
     upi, noise = UPI("GRBG"), noise_model("cycleisp_sidd")
-    crops = MadeCrops(pictures, lambda x, g: upi.apply(x, upi.sample(1, g)), upi.cfa, noise, 16)
+    crops = MadeCrops(pictures, lambda x, g: upi.reverse(x, upi.sample(1, g)), upi.cfa, noise, 16)
     torch.manual_seed(0)
     before, once = torch.get_rng_state(), crops.draw(seeded(5))
     assert torch.equal(torch.get_rng_state(), before)

@@ -12,8 +12,7 @@ from rawaug.data.pairs import Pair
 from rawaug.experiment.kinds import dry_run
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import ablation, reconstruction
-from rawaug.paper.ablation import Ablation
-from rawaug.paper.component_ablation import ComponentAblation
+from rawaug.paper.ablation import Ablation, ComponentAblation
 from rawaug.paper.reconstruction import Comparison
 
 

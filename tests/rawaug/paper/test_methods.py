@@ -21,7 +21,7 @@ from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.metrics import PATCH
 from rawaug.paper import methods
-from rawaug.paper.baselines import BASELINES, UPI, InvISP, TunedUPI
+from rawaug.paper.baselines import BASELINES, UPI, InvISP, Training, TunedUPI
 from rawaug.paper.baselines.networks import UNetISP
 from rawaug.paper.methods import (
     FAMILIES,
@@ -40,6 +40,7 @@ from rawaug.paper.methods import (
 from rawaug.seeding import keyed_generator
 
 FrameOf = Callable[..., Pair]
+TRAINING = Training(7.0, crop=32, batch=3)
 DAYLIGHT, LAMPS = (2.0, 1.0, 1.5), (1.2, 1.0, 2.6)
 
 
@@ -56,7 +57,7 @@ def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path
     universal.save(tmp_path / "own.safetensors")
     for name in ("universal-small", str(tmp_path / "own.safetensors")):
         assert is_method(name)
-        fitted = fit_family(name, [replace(frame, cfa=CFA.RGGB)], FitConfig(), (1.0, 64, 2), 0)
+        fitted = fit_family(name, [replace(frame, cfa=CFA.RGGB)], FitConfig(), TRAINING)
         assert isinstance(fitted.model, DictionaryISP) and fitted.seconds == 0.0
         assert torch.equal(fitted.model.colour.atoms(), universal.colour.atoms())
     assert not is_method("universal-tiny")
@@ -64,7 +65,7 @@ def test_a_shipped_isp_is_a_method_and_is_not_fitted(frame_of: FrameOf, tmp_path
     assert rows["oracle"] > rows["blind"], "the oracle weighs tone curves as well"
     assert rows["oracle"] == max(rows.values())
     with pytest.raises(ValueError, match="makes RGGB RAW, but the frames are GRBG"):
-        fit_family("universal-small", [frame], FitConfig(), (1.0, 64, 2), 0)
+        fit_family("universal-small", [frame], FitConfig(), TRAINING)
 
 
 def rows_of(model: Any, pair: Pair, patches: int | None = None) -> dict[str, float]:
@@ -157,8 +158,8 @@ def unfitted(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Fits do nothing but record their arguments."""
     asked: dict[str, Any] = {}
 
-    def baseline(model: Any, pairs: Sequence[Pair], *budget: float, **settings: int) -> Any:
-        asked.update(pairs=pairs, budget=budget, settings=settings)
+    def baseline(model: Any, pairs: Sequence[Pair], training: Training) -> Any:
+        asked.update(pairs=pairs, training=training)
         return model
 
     def dictionary(pairs: Sequence[Pair], config: FitConfig) -> DictionaryISP:
@@ -174,12 +175,12 @@ def test_every_seed_starts_from_weights_of_its_own(frame_of: FrameOf, unfitted: 
     pairs, before = [frame_of("a")], torch.get_rng_state()
 
     def start(seed: int) -> torch.Tensor:
-        fitted = fit_family("invgrey", pairs, FitConfig(), (7.0, 32, 3), seed)
+        fitted = fit_family("invgrey", pairs, FitConfig(), replace(TRAINING, seed=seed))
         assert fitted.parameters == 741_123
         return torch.cat([p.detach().flatten() for p in fitted.model.parameters()])
 
     assert torch.equal(start(1), start(1)) and not torch.equal(start(1), start(2))
-    assert unfitted["budget"] == (7.0,) and unfitted["settings"] == {"crop": 32, "batch": 3, "seed": 2}
+    assert unfitted["training"] == Training(7.0, crop=32, batch=3, seed=2)
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -187,7 +188,7 @@ def test_every_seed_starts_from_weights_of_its_own(frame_of: FrameOf, unfitted: 
 def test_a_method_without_parameters_takes_the_pattern_of_the_frames(
     family: str, frame_of: FrameOf, unfitted: dict[str, Any]
 ) -> None:
-    fitted = fit_family(family, [frame_of("a")], FitConfig(), (7.0, 32, 3), 0)
+    fitted = fit_family(family, [frame_of("a")], FitConfig(), TRAINING)
     assert type(fitted.model) is BASELINES[family] and fitted.model.cfa == bayer.CFA.GRBG
     assert fitted.parameters == sum(p.numel() for p in fitted.model.parameters())
 
@@ -195,7 +196,7 @@ def test_a_method_without_parameters_takes_the_pattern_of_the_frames(
 def test_encoders_are_on_in_one_family_and_count_only_there(frame_of: FrameOf, unfitted: dict[str, Any]) -> None:
     counts = {}
     for family, encoders in (("dictionary", "off"), ("dictionary-encoders", "on")):
-        fitted = fit_family(family, [frame_of("a")], FitConfig(steps=3), (7.0, 32, 3), 5)
+        fitted = fit_family(family, [frame_of("a")], FitConfig(steps=3), replace(TRAINING, seed=5))
         assert unfitted["config"] == FitConfig(steps=3, seed=5, encoders=encoders)  # type: ignore[arg-type]
         counts[family] = fitted.parameters
         named = dict(fitted.model.named_parameters())

@@ -16,7 +16,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig
 from rawaug.paper import methods, reconstruction
-from rawaug.paper.baselines import BASELINES
+from rawaug.paper.baselines import BASELINES, Training
 from rawaug.paper.baselines.base import CropTrainedISP
 from rawaug.paper.downstream import DownstreamConfig
 from rawaug.paper.reconstruction import Comparison, compare
@@ -50,9 +50,8 @@ class Laboratory:
         self.min_side = min_side
         return [torch.arange(192, dtype=torch.uint8).reshape(3, 8, 8)]
 
-    def fit_family(
-        self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
-    ) -> Any:
+    def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
+        seconds, seed = training.seconds or 0.0, training.seed
         names = [pair.name for pair in pairs]
         left_out = [f"f{k}" for k in range(self.frames) if f"f{k}" not in names]
         if not left_out:
@@ -60,10 +59,10 @@ class Laboratory:
         else:
             if len(self.folds) == self.stop_after:
                 raise KeyboardInterrupt
-            self.folds.append((family, left_out[0], budget, seed))
+            self.folds.append((family, left_out[0], (seconds, training.crop, training.batch), seed))
         self.cameras += 1
         model = SimpleNamespace(info={"frames": names}, cfa=CFA.RGGB, number=self.cameras)
-        return SimpleNamespace(model=model, seconds=budget[0] + len(self.folds) % 2, parameters=1234, seed=seed)
+        return SimpleNamespace(model=model, seconds=seconds + len(self.folds) % 2, parameters=1234, seed=seed)
 
     def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
         value = 10.0 * (int(pair.name[1:]) + 1) + fitted.seed
@@ -273,11 +272,9 @@ def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
     scored: list[Pair] = []
 
     class Watching(Laboratory):
-        def fit_family(
-            self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
-        ) -> Any:
+        def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
             seen.extend((pair, fit.noisy) for pair in pairs)
-            return super().fit_family(family, pairs, fit, budget, seed)
+            return super().fit_family(family, pairs, fit, training)
 
         def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
             scored.append(pair)
@@ -313,13 +310,11 @@ class Fitting(Laboratory):
         super().__init__(monkeypatch)
         self.found: dict[str, dict[str, torch.Tensor]] = {}
 
-    def fit_family(
-        self, family: str, pairs: Sequence[Pair], fit: FitConfig, budget: tuple[float, int, int], seed: int
-    ) -> Any:
+    def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
         left_out = {"a", "b", "c"} - {pair.name for pair in pairs}
         if not left_out:
             return SimpleNamespace(model=None)
-        fitted = methods.fit_family(family, pairs, fit, budget, seed)
+        fitted = methods.fit_family(family, pairs, fit, training)
         self.found[left_out.pop()] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
         return fitted
 

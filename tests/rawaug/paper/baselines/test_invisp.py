@@ -31,7 +31,7 @@ def test_it_is_exactly_invertible() -> None:
 @pytest.mark.parametrize("blocks", [1, 2, 3, 8])
 def test_untrained_it_is_a_plain_gamma_camera(blocks: int) -> None:
     srgb = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(2))
-    raw = InvISP("GRBG", blocks=blocks, growth=4).reverse(srgb, white_balance=(2.0, 1.0, 1.6))
+    raw = InvISP("GRBG", blocks=blocks, growth=4).reverse(srgb, (2.0, 1.0, 1.6))
     linear = srgb**2.2
     torch.testing.assert_close(raw[:, 0, 0::2, 1::2], linear[:, 0, 0::2, 1::2], atol=1e-6, rtol=1e-4)
     assert raw.max() <= 1.0  # w is (1, 0.5, 0.8): green and blue are divided by it
@@ -63,7 +63,7 @@ def test_with_jpeg_between_the_way_back_sees_the_compressed_rendering() -> None:
     losses = {}
     for quality in (10, 90):
         model = InvISP(blocks=2, growth=4, jpeg_quality=quality)
-        loss = model.loss(crops, both=True)
+        loss = model.loss(crops)
         loss.backward()
         gradients = [p.grad for p in model.parameters() if p.grad is not None]
         assert all(g.isfinite().all() for g in gradients) and any(g.abs().max() > 0 for g in gradients)
