@@ -13,13 +13,16 @@ LOCKED := \# Exact versions by Python version and platform, written by make lock
 
 BENCHMARKS := augment denoise explore faults folder fuzz loader networks noise synth
 
-.PHONY: demo test lint docs bench dist lock resolve clean
+.PHONY: demo test pytest lint docs bench dist lock resolve clean
 
 demo: $(VENV)/.demo  ## train a RAW denoiser on a simulated camera, with and without augmentation, and test it on real frames
 	$(BIN)/rawaug run recipes/fewshot.yaml
 	$(BIN)/rawaug benchmark runs/fewshot/seed0/*/denoiser.safetensors --noise cycleisp_sidd  # on real frames
 
-test: lint  ## style, types and all tests
+test: $(VENV)/.test  ## style, types and all tests, at once
+	$(MAKE) --jobs 2 lint pytest
+
+pytest: $(VENV)/.test
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses 2 --dist worksteal  # processes share bytecode
 
 lint: $(VENV)/.test

@@ -12,8 +12,10 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import multiprocessing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 import pytest
 import torch
@@ -22,9 +24,12 @@ from hypothesis import HealthCheck, settings
 from rawaug import registry
 from rawaug.data import demo_pairs, demo_pictures
 from rawaug.data.pairs import Pair
+from rawaug.files import digest
+from rawaug.isp.fast import BakedISP
+from rawaug.isp.model import DictionaryISP
 
 torch.set_num_threads(1)
-settings.register_profile("rawaug", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("rawaug", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("rawaug")
 multiprocessing.set_forkserver_preload(
     ["rawaug.experiment.kinds", "rawaug.training.camera", "rawaug.plugin.dataset", "lightning_fabric"]
@@ -54,10 +59,29 @@ def no_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def baked_once() -> Iterator[None]:
+    """Augmentations of equal ISPs share their tables, which take 0.3 s: hundreds of tests make one."""
+    known: dict[str, BakedISP] = {}
+
+    def baked(isp: DictionaryISP) -> BakedISP:
+        tensors = [tensor.detach().cpu().reshape(-1) for tensor in (*isp.parameters(), *isp.buffers())]
+        key = digest(repr(isp.config).encode(), *(tensor.view(torch.uint8).numpy().tobytes() for tensor in tensors))
+        if key not in known:
+            if len(known) == 4:
+                known.clear()
+            known[key] = BakedISP(isp)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rawaug.plugin.augment.BakedISP", baked)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def empty_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """The current folder is an empty one."""
-    monkeypatch.chdir(tmp_path_factory.mktemp("here"))
+    monkeypatch.chdir(mkdtemp(dir=tmp_path_factory.getbasetemp()))
 
 
 @pytest.fixture(scope="session")
@@ -79,17 +103,37 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> list[registry.Registry]:
     return kinds
 
 
+@cache
+def _middles(split: str) -> list[Pair]:
+    return [pair.middle(96) for pair in demo_pairs(split, count=2)]
+
+
 @pytest.fixture
 def tiny(registries: list[registry.Registry]) -> None:
     """``tiny:SPLIT``: the middle of two shots by the demo camera; ``tiny:``: four of its pictures."""
 
     @registry.DATASETS.register("tiny")
     def pairs(path: str = "", split: str = "test") -> list[Pair]:
-        return [pair.middle(96) for pair in demo_pairs(path or split, count=2)]
+        return list(_middles(path or split))
 
     @registry.PICTURES.register("tiny")
     def pictures(path: str = "", min_side: int = 2) -> list[torch.Tensor]:
         return demo_pictures(4)
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """The one line on stderr with which a command line is refused: ``refused("fit", path, "--out", out)``."""
+
+    def line(*arguments: object, status: int = 2) -> str:
+        from rawaug.cli import main
+
+        capsys.readouterr()
+        assert main([str(argument) for argument in arguments]) == status
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        return str(line)
+
+    return line
 
 
 @pytest.fixture

@@ -42,18 +42,8 @@ def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch:
         return network
 
     monkeypatch.setattr(torch, "compile", compiled)
-    args = argparse.Namespace(
-        device=CPU,
-        threads=1,
-        minutes=0.0,
-        width=4,
-        side=16,
-        batch=2,
-        crop=32,
-        repeats=1,
-        workers=0,
-        compile=["default"],
-    )
+    tiny = {"minutes": 0.0, "width": 4, "side": 16, "batch": 2, "crop": 32, "repeats": 1, "workers": 0}
+    args = argparse.Namespace(device=CPU, threads=1, compile=["default"], **tiny)
     figures = networks.measure("DnCNN", args, {"depth": 3})
     assert modes == ["default"] and all(f"images/s, augmented{label}" in figures for label in ("", ", default"))
     assert figures["share of augmentation"] == pytest.approx(1 - figures["images/s, augmented"] / figures["images/s"])
@@ -87,16 +77,9 @@ def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filte
     monkeypatch.setattr(equal_minutes, "PROBE", 2)
     monkeypatch.setattr(equal_minutes, "MIDDLE", 64)
     args = argparse.Namespace(
-        pictures="demo:",
-        validation="demo:validation",
-        bin=1,
-        batch=2,
-        crop=32,
-        minutes=0.0,
-        device=CPU,
-        precision="32-true",
-        pmrid=None,
-    )
+        pictures="demo:", validation="demo:validation", bin=1, batch=2, crop=32, minutes=0.0, device=CPU,
+        precision="32-true", pmrid=None,
+    )  # fmt: skip
     row = equal_minutes.trained("DnCNN", {"width": 4, "depth": 3}, args)
     assert row["steps"] == 2, "no fewer than the probe's"
     references = equal_minutes.references(args)

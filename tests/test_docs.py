@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 
 OPTIONAL = {
     "datasets": "pip install rawaug[test]",
@@ -51,9 +52,6 @@ def test_snippet_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.
 def test_optional_libraries_are_those_of_some_snippet() -> None:
     shown = set().union(*(imported(code) for _, code in snippets()))
     assert OPTIONAL.keys() <= shown
-
-
-README = Path(__file__).parents[1] / "README.md"
 
 
 def lines_of_the_diff() -> list[tuple[str, str]]:

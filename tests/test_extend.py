@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -115,9 +115,8 @@ def test_weights_of_its_network_are_saved_and_loaded(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_wrong_with_it_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], message: str
+    tmp_path: Path, refused: Callable[..., str], change: tuple[str, str], message: str
 ) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE.replace(*change))
-    assert main(["run", str(tmp_path / "mine.yaml"), "--out", str(tmp_path)]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    line = refused("run", tmp_path / "mine.yaml", "--out", tmp_path)
     assert re.search(message, line), line

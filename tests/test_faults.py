@@ -9,7 +9,7 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +20,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 import denoisers
+from benchmarks import faults
+from benchmarks.small_mounts import small_shared_memory
 from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands import pair_files, pair_maker
@@ -31,24 +33,13 @@ from rawaug.io import RawFrame, read_picture, write_dng, write_picture
 from rawaug.training.config import TrainConfig
 from rawaug.training.state import TrainingState
 
-ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs forks, signals and limits of Linux")
 
 
 @pytest.fixture(scope="module")
-def harness() -> Iterator[Any]:
-    """The benchmark, whose kills these are in short form; ``run`` takes too long for a test."""
-    sys.path.insert(0, str(ROOT))
-    from benchmarks import faults
-
-    yield faults
-    sys.path.remove(str(ROOT))
-
-
-@pytest.fixture(scope="module")
-def inputs(harness: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
-    harness.make_inputs(folder)
+    faults.make_inputs(folder)
     return folder
 
 
@@ -62,16 +53,17 @@ def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("name", "number"), [("fit", "SIGINT"), ("synth", "SIGTERM"), ("denoise", "SIGKILL")])
-def test_a_killed_command_goes_on_bit_for_bit(harness: Any, inputs: Path, name: str, number: str) -> None:
-    whole, seconds = harness.uninterrupted(inputs, name)
+def test_a_killed_command_goes_on_bit_for_bit(inputs: Path, name: str, number: str) -> None:
+    """As benchmarks.faults has it; ``run`` takes too long for a test."""
+    whole, seconds = faults.uninterrupted(inputs, name)
     assert whole
-    assert harness.killed(inputs, name, getattr(signal, number), 0.7 * seconds, whole) is None
+    assert faults.killed(inputs, name, getattr(signal, number), 0.7 * seconds, whole) is None
 
 
-def test_a_different_result_is_noticed(harness: Any, inputs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, _ = harness.uninterrupted(inputs, "denoise")
+def test_a_different_result_is_noticed(inputs: Path) -> None:
+    whole, _ = faults.uninterrupted(inputs, "denoise")
     whole["0.dng"] = whole["0.dng"][:-1] + b"?"
-    assert "0.dng differ" in harness.killed(inputs, "denoise", signal.SIGKILL, 0.0, whole)
+    assert "0.dng differ" in str(faults.killed(inputs, "denoise", signal.SIGKILL, 0.0, whole))
 
 
 # -- one run at a time ------------------------------------------------------------------------------------------------
@@ -124,24 +116,16 @@ def test_a_folder_that_was_only_made_for_the_lock_is_taken_away(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("command", ["synth", "denoise", "fit", "run"])
-def test_two_at_once(command: str, inputs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_at_once(command: str, inputs: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     fitted = tmp_path / "camera.safetensors"
     arguments = {
-        "fit": ["fit", str(inputs / "shots"), "--out", str(fitted)],
-        "run": ["run", str(inputs / "recipe.yaml"), "--out", str(tmp_path.parent), "--name", tmp_path.name],
-        "synth": ["synth", str(inputs / "pictures"), str(tmp_path), "--workers", "0"],
-        "denoise": [
-            "denoise",
-            str(inputs / "shots"),
-            str(tmp_path),
-            "--denoiser",
-            str(inputs / "denoiser.safetensors"),
-        ],
+        "fit": (inputs / "shots", "--out", fitted),
+        "run": (inputs / "recipe.yaml", "--out", tmp_path.parent, "--name", tmp_path.name),
+        "synth": (inputs / "pictures", tmp_path, "--workers", 0),
+        "denoise": (inputs / "shots", tmp_path, "--denoiser", inputs / "denoiser.safetensors"),
     }
     with locked(Path(f"{fitted}.lock") if command == "fit" else tmp_path / LOCK):
-        assert main(arguments[command]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "in use by" in error
+        assert "in use by" in refused(command, *arguments[command])
 
 
 # -- disks and folders ------------------------------------------------------------------------------------------------
@@ -225,8 +209,9 @@ def test_a_folder_without_the_right_to_write_is_named(tmp_path: Path) -> None:
 def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
     fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "in").mkdir()
     for k in range(3):
-        write_picture(_made(tmp_path / "in") / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
+        write_picture(tmp_path / "in" / f"{k}.png", torch.full((3, 16, 16), 0.2 * k))
 
     def unlucky(path: Path, *rest: Any) -> Any:
         picture = read_picture(path, *rest)
@@ -237,18 +222,6 @@ def test_a_picture_that_vanishes_or_changes_is_named_and_the_rest_is_made(
     monkeypatch.setattr(pair_maker, "read_picture", unlucky)
     result = synth(tmp_path / "in", tmp_path / "out", workers=0)
     assert result.made == 2 and list(result.broken) == ["1.png"] and "1.png" in result.broken["1.png"]
-
-
-def test_a_picture_that_vanishes_during_an_epoch_is_replaced_and_reported(tmp_path: Path) -> None:
-    for k in range(8):
-        write_picture(tmp_path / f"{k}.png", torch.full((3, 16, 16), k / 10))
-    folder = PictureFolder(tmp_path, allowed_share=0.3)
-    assert folder[0].shape == (3, 16, 16)
-    (tmp_path / "1.png").unlink()
-    (tmp_path / "5.png").write_bytes(b"something else")
-    assert [int(folder[k][0, 0, 0]) for k in (1, 2, 5)] == [int(folder[k][0, 0, 0]) for k in (2, 2, 6)]
-    assert sorted(file.name for file in folder.skipped) == ["1.png", "5.png"]
-    assert "2 of 8 pictures skipped" in folder.report()
 
 
 # -- workers, descriptors, shared memory, clocks ----------------------------------------------------------------------
@@ -327,13 +300,13 @@ assert sum(len(batch["noisy"]) for batch in loader) == 24
     assert process.exitcode == 0
 
 
-def test_a_small_dev_shm_is_said_in_one_line(harness: Any) -> None:
+def test_a_small_dev_shm_is_said_in_one_line() -> None:
     """Batches of two workers that do not fit into a /dev/shm of 64 KiB, mounted for a child of this process alone."""
-    if in_child(lambda: harness.small_shared_memory(64)):
+    if in_child(lambda: small_shared_memory(64)):
         pytest.skip("needs the right to mount a file system")
 
     def load() -> None:
-        harness.small_shared_memory(64)
+        small_shared_memory(64)
         pictures: Any = [torch.rand(3, 100, 100) for _ in range(8)]
         loader: DataLoader[Any] = DataLoader(pictures, batch_size=4, num_workers=2)
         with pytest.raises(RuntimeError) as error:
@@ -343,24 +316,17 @@ def test_a_small_dev_shm_is_said_in_one_line(harness: Any) -> None:
     assert in_child(load) == 0
 
 
-def test_a_wall_clock_that_jumps_changes_nothing(
-    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Any
-) -> None:
+def test_a_wall_clock_that_jumps_changes_nothing(inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = synth(inputs / "pictures", tmp_path / "a", workers=0)
     jumps = iter(range(4 * 10**9, 0, -(10**6)))
     monkeypatch.setattr(time, "time", lambda: float(next(jumps)))
     second = synth(inputs / "pictures", tmp_path / "b", workers=0)
     assert first.made == second.made == 4 and 0 <= second.seconds < 600
-    assert harness.contents(tmp_path / "a") == harness.contents(tmp_path / "b")
+    assert faults.contents(tmp_path / "a") == faults.contents(tmp_path / "b")
 
 
-def _made(folder: Path) -> Path:
-    folder.mkdir(exist_ok=True)
-    return folder
-
-
-def test_the_figures_are_written(harness: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_figures_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark's exit status and file follow what it found."""
-    monkeypatch.setattr(harness, "kills", lambda folder, names, count, seed: iter([("synth", ["0.dng differ"], 1.0)]))
-    assert harness.main(["--commands", "synth", "--faults", "--json", str(tmp_path / "figures.json")]) == 1
+    monkeypatch.setattr(faults, "kills", lambda folder, names, count, seed: iter([("synth", ["0.dng differ"], 1.0)]))
+    assert faults.main(["--commands", "synth", "--faults", "--json", str(tmp_path / "figures.json")]) == 1
     assert json.loads((tmp_path / "figures.json").read_text())["synth"]["wrong"] == ["0.dng differ"]

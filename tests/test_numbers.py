@@ -108,7 +108,7 @@ WRONG_PICTURES = {
     "one column": (SRGB[..., :1], "at least 2 x 2"),
     "batch of 0": (SRGB[:0], "must not be empty"),
     "no pixels": (SRGB[..., :0, :0], "at least 2 x 2"),
-    "NaN": (SRGB * torch.nan, "NaN in 2304 of 2304"),
+    "NaN": (torch.where(SRGB.max() == SRGB, torch.nan, SRGB), "got NaN in 1 of 2304 values"),
     "infinite": (SRGB * torch.inf, "got inf to inf"),
     "negative": (-SRGB, r"must be in \[0, 1\]"),
     "8 bits as float": (SRGB * 255, r"must be in \[0, 1\]"),
@@ -228,7 +228,7 @@ def test_a_fork_after_threads_does_not_hang(restored: None) -> None:
     queue = context.SimpleQueue()
     child = context.Process(target=_in_child, args=(queue, picture, expected))
     child.start()
-    child.join(20)
+    child.join(120)
     hung = child.is_alive()
     child.kill()
     assert not hung and queue.get() is True
@@ -268,7 +268,7 @@ class Endless:
         return SRGB[0]
 
 
-def test_indices_beyond_the_dataset(restored: None) -> None:
+def test_indices_beyond_the_dataset() -> None:
     pairs = RawPairs(list(SRGB), AUGMENT, crop=8)
     for index in (2, 2**63, 2**200, -(2**63) - 1):
         refused(lambda index=index: pairs[index], "there is no picture -?[0-9]+: the dataset has 2", IndexError)  # type: ignore[misc]
@@ -396,7 +396,7 @@ def test_metrics_refuse_what_has_no_score() -> None:
         refused(lambda m=metric: m(picture, picture[..., :8]), "differ in shape")  # type: ignore[misc]
         assert metric(picture[:0], picture[:0]).shape == (0,)
         assert metric(picture * torch.nan, picture).isnan().all(), "NaN is not hidden"
-    refused(lambda: ssim(picture[..., :1, :], picture[..., :1, :]), "sides of at least 11")
+    refused(lambda: ssim(picture[..., :10, :], picture[..., :10, :]), "sides of at least 11")
 
 
 def test_a_pair_is_what_a_network_is_trained_on() -> None:

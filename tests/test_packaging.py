@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import configparser
-import importlib.util
 import json
 import os
 import re
+import runpy
 import shutil
 import socket
 import subprocess
@@ -16,7 +15,7 @@ import zipfile
 from configparser import ConfigParser
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -31,17 +30,9 @@ LOCKED = ("raw", "train", "data", "test", "docs", "export", "explore")
 
 def environment(python: str, platform: str) -> dict[str, str]:
     system, machine = PLATFORMS[platform]
-    return {
-        "python_version": python,
-        "python_full_version": f"{python}.1",
-        "sys_platform": platform,
-        "platform_system": system,
-        "platform_machine": machine,
-        "implementation_name": "cpython",
-        "platform_python_implementation": "CPython",
-        "os_name": "nt" if platform == "win32" else "posix",
-        "extra": "",
-    }
+    where = {"sys_platform": platform, "platform_system": system, "platform_machine": machine, "extra": ""}
+    where |= {"python_version": python, "python_full_version": f"{python}.1"}
+    return {**where, "implementation_name": "cpython", "os_name": "nt" if platform == "win32" else "posix"}
 
 
 def applying(lines: list[str], where: dict[str, str]) -> list[Requirement]:
@@ -52,7 +43,7 @@ def applying(lines: list[str], where: dict[str, str]) -> list[Requirement]:
 @pytest.mark.parametrize("python", PYTHONS)
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_every_requirement_has_one_pin_that_fits(python: str, platform: str) -> None:
-    setup = configparser.ConfigParser()
+    setup = ConfigParser()
     setup.read(ROOT / "setup.cfg")
     asked = setup["options"]["install_requires"].split("\n")
     extras = {extra: setup.get("options.extras_require", extra, raw=True) for extra in LOCKED}
@@ -86,20 +77,16 @@ def test_workflows_run_targets_of_the_makefile_on_the_locked_versions() -> None:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"make {target} is no target"
 
 
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def script(name: str) -> Any:
+    return SimpleNamespace(**runpy.run_path(str(ROOT / ".ci" / f"{name}.py")))
 
 
 @pytest.fixture
-def check() -> ModuleType:
+def check() -> Any:
     return script("advisories")
 
 
-def test_an_advisory_fails_the_check(check: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_advisory_fails_the_check(check: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked: list[Any] = []
 
     class Database(BaseHTTPRequestHandler):
@@ -123,7 +110,7 @@ def test_an_advisory_fails_the_check(check: ModuleType, tmp_path: Path, capsys: 
     assert capsys.readouterr().out.startswith("contourpy 1.3.3: GHSA-1\n")
 
 
-def test_without_a_network_it_says_so_in_one_line(check: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_network_it_says_so_in_one_line(check: Any, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as nobody:  # bound, and not listened on
         nobody.bind(("127.0.0.1", 0))
         assert check.main([str(ROOT / "constraints.txt")], f"http://127.0.0.1:{nobody.getsockname()[1]}") == 0
@@ -162,7 +149,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_recipe_runs_by_its_name_from_any_folder(site: Path, tmp_path: Path) -> None:
     script = "import rawaug, sys; from rawaug.cli import main; print(rawaug.__file__); sys.exit(main())"
-    command = [sys.executable, "-c", script, "run", "denoisers", "--count", "1", "--crop", "64", "--denoisers", "[]"]
+    small = ["--count", "1", "--crop", "64", "--isos", "[400]", "--denoisers", "[]", "--classical", "[Wavelet]"]
+    command = [sys.executable, "-c", script, "run", "denoisers", *small]
     # compiled loops are kept beside their source, so that here they would be compiled anew
     environment = {**os.environ, "PYTHONPATH": str(site), "PYTHONWARNINGS": "ignore", "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

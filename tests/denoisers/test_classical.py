@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from denoisers import BM3D, NonLocalMeans, Stabilised, TotalVariation, Wavelet
-from denoisers.classical import _HADAMARD, Classical
+from denoisers.classical import Classical
 
 SIGMA = 0.03
 OWN = [NonLocalMeans, Wavelet, TotalVariation]
@@ -58,13 +58,13 @@ def test_strength_smooths_more(method: type[Classical]) -> None:
     variance = torch.full_like(noisy, SIGMA**2)
     weak, strong = (mse(method(strength)(noisy, variance), noisy) for strength in (0.3, 1.0))
     assert weak < strong
-    with pytest.raises(ValueError, match="strength must be positive"):
-        method(0)
 
 
 @pytest.mark.parametrize("method", [*OWN, BM3D])
 def test_small_and_wrong_inputs(method: type[Classical]) -> None:
     least = method.smallest
+    with pytest.raises(ValueError, match="strength must be positive"):
+        method(0)
     if method is not BM3D:
         noisy = torch.rand(1, 4, least, least + 1, generator=torch.Generator().manual_seed(0))
         assert method()(noisy, torch.full_like(noisy, 1e-3)).isfinite().all()
@@ -85,10 +85,6 @@ def test_bm3d_where_installed() -> None:
     clean, noisy = scene()
     denoised = BM3D()(noisy[:1], torch.full_like(noisy[:1], SIGMA**2))
     assert mse(denoised, clean[:1]) < 0.2 * mse(noisy[:1], clean[:1])
-
-
-def test_the_luminance_rotation_is_its_own_inverse() -> None:
-    assert torch.equal(torch.from_numpy(_HADAMARD @ _HADAMARD), torch.eye(4))
 
 
 class Root:

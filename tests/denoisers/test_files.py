@@ -43,22 +43,6 @@ def test_round_trip(name: str, config: dict[str, Any], tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
 
 
-def test_a_failed_save_leaves_the_older_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.safetensors"
-    save(UNet(width=4, scales=2), path, {"steps": 1})
-
-    def fail(file: Path, content: bytes) -> None:
-        with file.open("wb") as stream:
-            stream.write(content[:100])
-        raise OSError("disk full")
-
-    monkeypatch.setattr(Path, "write_bytes", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save(UNet(width=4, scales=2), path, {"steps": 2})
-    assert load(path)[1] == {"steps": 1}
-    assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
-
-
 def test_what_cannot_be_loaded_again_is_not_saved(tmp_path: Path) -> None:
     class Mine(UNet):
         pass
@@ -144,24 +128,8 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
         save(UNet(width=4), tmp_path / "b.safetensors", {"noise": [float("inf"), 0.0]})
 
 
-def test_the_file_has_the_rights_of_its_neighbours(tmp_path: Path) -> None:
-    (tmp_path / "neighbour").write_text("")
-    save(UNet(width=4, scales=1), tmp_path / "a.safetensors", {})
-    assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "neighbour").stat().st_mode
-
-
-FIELDS = (
-    "Licence",
-    "Architecture",
-    "Training data",
-    "Command",
-    "Commit",
-    "Seed",
-    "SHA-256",
-    "Noise",
-    "Measured",
-    "Not good for",
-)
+FIELDS = ["Licence", "Architecture", "Training data", "Command", "Commit", "Seed", "SHA-256", "Noise", "Measured"]
+FIELDS += ["Not good for"]
 """Rows of the card, as the template in docs/model_card.md has them."""
 
 ROOT = Path(__file__).parents[2]
@@ -180,15 +148,11 @@ def test_a_name_or_a_path_gives_the_network(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("name", pretrained.shipped())
-def test_every_shipped_denoiser_has_its_card(name: str) -> None:
+def test_every_shipped_denoiser_has_its_card_and_the_template_its_fields(name: str) -> None:
     weights = pretrained.FOLDER / f"{name}.safetensors"
     card = weights.with_suffix(".md").read_text(encoding="utf-8")
-    assert [field for field in FIELDS if f"| {field} |" not in card] == []
+    for text in (card, (ROOT / "docs/model_card.md").read_text(encoding="utf-8")):
+        assert [field for field in FIELDS if f"| {field} |" not in text] == []
     assert hashlib.sha256(weights.read_bytes()).hexdigest() in card
     assert weights.stat().st_size < 6e6 or name != pretrained.DEFAULT
     assert "TODO" not in card
-
-
-def test_the_template_has_every_field() -> None:
-    template = (ROOT / "docs/model_card.md").read_text(encoding="utf-8")
-    assert [field for field in FIELDS if f"| {field} |" not in template] == []

@@ -372,14 +372,13 @@ def test_other_checkpoints_are_refused(tmp_path: Path) -> None:
         CycleISPDenoiser(groups=0)
 
 
-@pytest.mark.parametrize("size", [(32, 48), (30, 45)], ids=["multiples of the stride", "padded inside"])
 @pytest.mark.parametrize("name", ["UNet", "DHDN", "DnCNN"])
-def test_onnx_gives_the_same_numbers(name: str, size: tuple[int, int], tmp_path: Path) -> None:
+def test_onnx_gives_the_same_numbers(name: str, tmp_path: Path) -> None:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library, reason="pip install rawaug[export]")
     from onnxruntime import InferenceSession
 
-    model, (noisy, variance) = awake(SMALL[name]()), pair(1, 4, *size)
+    model, (noisy, variance) = awake(SMALL[name]()), pair(1, 4, 30, 45)  # padded inside
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's own
         torch.onnx.export(model, (noisy, variance), tmp_path / "a.onnx", dynamo=True, input_names=["noisy", "variance"])

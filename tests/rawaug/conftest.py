@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
+import denoisers
+
 XYZ_TO_CAMERA = ((0.80, -0.20, -0.10), (-0.40, 1.20, 0.20), (-0.05, 0.15, 0.60))
 
 
@@ -61,3 +63,11 @@ def write_dng(
 @pytest.fixture(scope="session")
 def bayer_dng() -> Callable[..., Path]:
     return write_dng
+
+
+@pytest.fixture(scope="session")
+def identity(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The weights of a network that changes nothing."""
+    path = tmp_path_factory.mktemp("weights") / "identity.safetensors"
+    denoisers.save(denoisers.UNet(width=4, scales=2), path, {"cfa": "GRBG", "noise": "cycleisp_sidd"})
+    return path

@@ -34,14 +34,6 @@ QUICK_RUN = [
 ]  # fmt: skip
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The one line on stderr with which ``arguments`` are refused."""
-    assert main(arguments) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    return lines[0]
-
-
 @pytest.mark.usefixtures("tiny")
 def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights, scores = str(tmp_path / "isp.safetensors"), tmp_path / "isp.json"
@@ -54,20 +46,20 @@ def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert "colour atoms" in text and "train_00_astronaut" in text
 
 
-def test_preview_draws_two_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_preview_draws_two_figures(tmp_path: Path, refused: Callable[..., str]) -> None:
     picture = tmp_path / "picture.png"
     write_picture(picture, demo_pictures(3)[2][:, 64:160, 64:192])
     command = ["preview", str(picture), "--out", str(tmp_path / "stages.png"), "--count", "2", "--cfa", "XTRANS"]
     assert main(command) == 0
     for name in ("stages.png", "stages-atoms.png"):
         assert (tmp_path / name).stat().st_size > 10_000
-    assert "gone.png" in refused(capsys, "preview", str(tmp_path / "gone.png"), "--out", str(tmp_path / "x.png"))
+    assert "gone.png" in refused("preview", tmp_path / "gone.png", "--out", tmp_path / "x.png")
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("tiny")
 def test_run_is_resumable_and_ends_with_table_and_picture(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arms = {"real": {"augmented": 0.0}, "augmented": {"augmented": 0.5}}
     command = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--arms", json.dumps(arms)]
@@ -78,7 +70,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
 
     with monkeypatch.context() as patch:
         patch.setattr("rawaug.evaluation.scores.denoisers.SelfEnsemble", no_views)
-        assert "killed before" in refused(capsys, *command, "--quiet")
+        assert "killed before" in refused(*command, "--quiet")
     plain = json.loads((place / "evaluation.json").read_text())
     assert plain["plain"]["psnr"] > 20 and "self_ensemble" not in plain  # written as it came
     assert main([*command, "--self-ensemble", "false"]) == 0
@@ -100,7 +92,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     scores = json.loads((place / "evaluation.json").read_text())
     assert scores["plain"] == plain["plain"] and scores["self_ensemble"]["psnr"] > 20
     other = [*command, "--train.learning-rate", "0.002"]
-    said = refused(capsys, *other)  # other settings are another run
+    said = refused(*other)  # other settings are another run
     assert "holds a run with other settings (train.learning_rate 0.0007, now 0.002); give this run another" in said
     assert (place / "denoiser.safetensors").stat().st_mtime_ns == before
     assert main([*other, "--overwrite", "--self-ensemble", "false"]) == 0
@@ -114,10 +106,7 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     [
         ("fit demo:train --out x.safetensors --pix 512", "Unknown option: --pix."),
         ("fit demo:train --out x.safetensors --learning-rat 1", "Did you mean --learning-rate?"),
-        (
-            "fit demo:train --out x.safetensors --pixels many",
-            "Invalid value for --pixels: unable",
-        ),
+        ("fit demo:train --out x.safetensors --pixels many", "Invalid value for --pixels: unable"),
         ("fit demo:train --out x.safetensors --tone curves", 'Invalid value "curves" for --tone'),
         ("fit demo:train", "--out"),
         ("data check x --frist 2", "Did you mean --first?"),
@@ -134,15 +123,11 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be a number from 0.0 to 1.0, got 7"),
         ("run fewshot --data.count few", "data.count: input should be a valid integer"),
         ("run fewshot --isp.tone curves", "isp.tone: input should be 'auto', 'learned' or 'curve', got 'curves'"),
-        ("run fewshot --train.ema null", "train.ema: input should be a valid number, got None"),
         ("run fewshot --device null", "device: input should be a valid string, got None"),
-        ("run fewshot --denoiser.settings null", "denoiser.settings: input should be a valid dictionary, got None"),
     ],
 )
-def test_what_is_misspelt_missing_or_too_much_is_named(
-    words: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert said in refused(capsys, *words.split())
+def test_what_is_misspelt_missing_or_too_much_is_named(words: str, said: str, refused: Callable[..., str]) -> None:
+    assert said in refused(*words.split())
 
 
 def test_the_listing_says_what_the_docstrings_say() -> None:
@@ -154,8 +139,6 @@ def test_keys_of_a_recipe_are_listed_with_its_values(capsys: pytest.CaptureFixtu
     assert main(["run", "fewshot", "--help"]) == 0
     text = capsys.readouterr().out
     assert "--train.learning-rate" in text and "--arms.NAME.augmented" in text and ":class:" not in text
-    assert main(["run"]) == 0
-    assert "sidd/fewshot" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS, "data check"])
@@ -221,56 +204,33 @@ def test_quiet_prints_no_progress(
 
 @pytest.mark.usefixtures("no_gpu")
 def test_evaluate_finds_what_is_wrong_before_it_reads(
-    unread: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    unread: str, tmp_path: Path, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "bm3d", None)
     evaluate = ["evaluate", "rawaug-small", "--data", unread]
-    assert "nearest: cuda" in refused(capsys, *evaluate, "--device", "cudaa")
-    assert "this machine has none" in refused(capsys, *evaluate, "--device", "cuda")
-    assert "bm3d is not installed; licensed for non" in refused(capsys, *evaluate, "--classical", "[BM3D]")
+    assert "nearest: cuda" in refused(*evaluate, "--device", "cudaa")
+    assert "this machine has none" in refused(*evaluate, "--device", "cuda")
+    assert "bm3d is not installed; licensed for non" in refused(*evaluate, "--classical", "[BM3D]")
     for option in ("--json", "--report"):
-        assert "cannot be written: is a folder" in refused(capsys, *evaluate, option, str(tmp_path))
+        assert "cannot be written: is a folder" in refused(*evaluate, option, tmp_path)
 
 
 @pytest.mark.usefixtures("tiny")
-def test_test_frames_must_be_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--data.test", "tiny:train"]
-    assert "train_00_astronaut is also in data.pairs" in refused(capsys, *arguments)
-
-
-@pytest.mark.usefixtures("tiny")
-def test_bad_input_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], bayer_dng: Callable[..., Path]
-) -> None:
+def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], bayer_dng: Callable[..., Path]) -> None:
     out = ["--out", str(tmp_path / "x.safetensors")]
-    assert "nowhere" in refused(capsys, "fit", str(tmp_path / "nowhere"), *out)
+    assert "nowhere" in refused("fit", tmp_path / "nowhere", *out)
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "no RAW file" in refused(capsys, "fit", str(empty), *out)
-    assert "bogus" in refused(capsys, "fit", "demo:train", *out, "--bogus", "1")
-    assert "bogus" in refused(capsys, "fit", "bogus:x", *out)
-    assert ".safetensors" in refused(capsys, "fit", "demo:train", "--out", str(tmp_path / "x.pt"))
-    assert "no such recipe" in refused(capsys, "run", "nothing")
-    assert "atoms" in refused(capsys, "run", "fewshot", "--isp.atoms", "many")
-    assert "no picture" in refused(
-        capsys, "run", "fewshot", *QUICK_RUN, "--out", str(tmp_path), "--data.pictures", str(empty)
-    )
+    assert "no RAW file" in refused("fit", empty, *out)
+    assert "bogus" in refused("fit", "bogus:x", *out)
+    assert ".safetensors" in refused("fit", "demo:train", "--out", tmp_path / "x.pt")
+    assert "no picture" in refused("run", "fewshot", *QUICK_RUN, "--out", tmp_path, "--data.pictures", empty)
     whole = bayer_dng(tmp_path / "cut.dng", np.full((64, 64), 500, np.uint16))
     whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    assert "cut.dng" in refused(capsys, "fit", str(whole), *out)
-
-
-def test_an_unknown_key_in_a_recipe_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = tmp_path / "mine.yaml"
-    recipe.write_text("name: mine\ntrain: {stepz: 3}\narms: {real: {}}\n")
-    assert "mine.yaml: train.stepz: no such key (nearest: train.steps)" in refused(capsys, "run", str(recipe))
-
-
-def test_weights_of_no_use_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bad = tmp_path / "bad.safetensors"
-    bad.write_bytes(b"not weights")
-    assert "bad.safetensors" in refused(capsys, "evaluate", str(bad), "--data", "demo:test")
-    assert "gone.safetensors" in refused(capsys, "info", str(tmp_path / "gone.safetensors"))
+    assert "cut.dng" in refused("fit", whole, *out)
+    (tmp_path / "bad.safetensors").write_bytes(b"not weights")
+    assert "bad.safetensors" in refused("evaluate", tmp_path / "bad.safetensors", "--data", "demo:test")
+    assert "gone.safetensors" in refused("info", tmp_path / "gone.safetensors")
 
 
 def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(
@@ -284,7 +244,7 @@ def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(
         assert os.environ.get("THP_MEM_ALLOC_ENABLE") == expected, command
 
 
-def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, refused: Callable[..., str]) -> None:
     (tmp_path / "own_filter.py").write_text(
         "from denoisers.classical import Classical\n"
         "from rawaug.registry import FILTERS\n"
@@ -294,7 +254,7 @@ def test_what_a_file_of_ones_own_registers_is_used_by_name(tmp_path: Path, capsy
         "        return planes\n"
     )
     evaluate = ["evaluate", "rawaug-small", "--data", str(tmp_path / "gone"), "--classical", "[Nothing]"]
-    assert "rawaug --import FILE.py COMMAND, or an entry point in rawaug.filters" in refused(capsys, *evaluate)
-    assert "no such file" in refused(capsys, "--import", str(tmp_path / "own.py"), *evaluate)
-    assert "gone" in refused(capsys, "--import", str(tmp_path / "own_filter.py"), *evaluate)
+    assert "rawaug --import FILE.py COMMAND, or an entry point in rawaug.filters" in refused(*evaluate)
+    assert "no such file" in refused("--import", tmp_path / "own.py", *evaluate)
+    assert "gone" in refused("--import", tmp_path / "own_filter.py", *evaluate)
     FILTERS._things.pop("Nothing")

@@ -35,11 +35,6 @@ def test_ssim_equals_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> 
         assert ssim(a, b)[k].item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
 
 
-def test_ssim_refuses_pictures_smaller_than_its_window() -> None:
-    with pytest.raises(ValueError, match="at least 11"):
-        ssim(torch.zeros(1, 1, 10, 20), torch.zeros(1, 1, 10, 20))
-
-
 def test_patch_psnr_averages_decibels_not_errors() -> None:
     a = torch.zeros(1, 1, 256, 512)
     b = a.clone()
@@ -54,8 +49,3 @@ def test_quarters() -> None:
     assert worst_and_best_quarter([4.0]) == (4.0, 4.0)
     assert worst_and_best_quarter([6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) == (1.5, 5.5)  # a quarter of 6 is 2
     assert worst_and_best_quarter([7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0]) == (1.5, 6.5)
-
-
-def test_shapes_must_agree() -> None:
-    with pytest.raises(ValueError, match="differ in shape"):
-        psnr(torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 6))

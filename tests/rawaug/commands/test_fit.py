@@ -39,22 +39,14 @@ def shoot(tmp_path: Path, bayer_dng: Shoot) -> Shoot:
     return write
 
 
-def fit(out: Path, *arguments: object, status: int = 0) -> DictionaryISP:
-    assert main(["fit", *map(str, arguments), "--out", str(out), *QUICK]) == status
-    return DictionaryISP.from_pretrained(out) if status == 0 else DictionaryISP()
+def fit(out: Path, *arguments: object) -> DictionaryISP:
+    assert main(["fit", *map(str, arguments), "--out", str(out), *QUICK]) == 0
+    return DictionaryISP.from_pretrained(out)
 
 
 def same(a: DictionaryISP, b: DictionaryISP) -> bool:
     first, second = a.state_dict(), b.state_dict()
     return set(first) == set(second) and all(torch.equal(first[key], second[key]) for key in first)
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one line on stderr with which ``arguments`` are refused."""
-    capsys.readouterr()
-    assert main([str(a) for a in arguments]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    return str(line)
 
 
 def test_files_and_folders_are_fitted_together(
@@ -72,13 +64,11 @@ def test_files_and_folders_are_fitted_together(
     assert not same(isp, fit(out, one, two))
 
 
-def test_what_cannot_be_fitted_together_is_named(
-    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_fitted_together_is_named(tmp_path: Path, shoot: Shoot, refused: Callable[..., str]) -> None:
     one, out = shoot("one.dng"), ["--out", tmp_path / "x.safetensors"]
-    assert "demo:train: a kind:path dataset cannot be combined" in refused(capsys, "fit", one, "demo:train", *out)
-    assert "gone.dng" in refused(capsys, "fit", one, tmp_path / "gone.dng", *out)
-    assert "gone" in refused(capsys, "fit", one, "--held-out", tmp_path / "gone", *out)
+    assert "demo:train: a kind:path dataset cannot be combined" in refused("fit", one, "demo:train", *out)
+    assert "gone.dng" in refused("fit", one, tmp_path / "gone.dng", *out)
+    assert "gone" in refused("fit", one, "--held-out", tmp_path / "gone", *out)
     assert not (tmp_path / "x.safetensors").exists() and not list(tmp_path.glob("*.state"))
 
 
@@ -108,7 +98,7 @@ def test_the_last_score_is_that_of_the_file(tmp_path: Path, shoot: Shoot) -> Non
 
 
 def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
-    tmp_path: Path, shoot: Shoot, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, shoot: Shoot, monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
 ) -> None:
     frames, out = [shoot("a.dng"), shoot("b.dng")], tmp_path / "x.safetensors"
     state = tmp_path / "x.safetensors.state"
@@ -126,9 +116,8 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
         return steps[stage], state
 
     monkeypatch.setattr(Descent, "_keep", stop)
-    fit(out, *frames, status=INTERRUPTED)
-    assert state.is_file() and not out.exists()
-    assert "run the same command again to resume" in capsys.readouterr().err
+    said = refused("fit", *frames, "--out", out, *QUICK, "--quiet", status=INTERRUPTED)
+    assert "run the same command again to resume" in said and state.is_file() and not out.exists()
     stopped = state.read_bytes()
     monkeypatch.setattr(Descent, "_keep", kept)
     monkeypatch.setattr(Descent, "_restored", noted)
@@ -140,7 +129,7 @@ def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
     fit(out, frames[0])
     assert set(steps.values()) == {0} and not state.exists()
     state.write_bytes(b"cut off")
-    assert "x.safetensors.state" in refused(capsys, "fit", *frames, "--out", out, *QUICK)
+    assert "x.safetensors.state" in refused("fit", *frames, "--out", out, *QUICK)
 
 
 def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: Shoot) -> None:
@@ -166,15 +155,15 @@ def test_pairs_are_fitted_as_they_are() -> None:
 
 
 def test_held_out_frames_that_are_also_fitted_are_refused(
-    tmp_path: Path, shoot: Shoot, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, shoot: Shoot, refused: Callable[..., str]
 ) -> None:
     one, two = shoot("shots/one.dng"), shoot("shots/two.dng")
     (tmp_path / "link.dng").symlink_to(one)
     out = ["--out", tmp_path / "x.safetensors", *QUICK]
     for held_out in (one, tmp_path / "shots", tmp_path / "link.dng"):
-        assert "one.dng is also fitted" in refused(capsys, "fit", one, "--held-out", held_out, *out)
-    assert "two.dng is also fitted" in refused(capsys, "fit", tmp_path / "shots", "--held-out", two, *out)
-    assert "train_00_astronaut is also fitted" in refused(capsys, "fit", "demo:train", "--held-out", "demo:train", *out)
+        assert "one.dng is also fitted" in refused("fit", one, "--held-out", held_out, *out)
+    assert "two.dng is also fitted" in refused("fit", tmp_path / "shots", "--held-out", two, *out)
+    assert "train_00_astronaut is also fitted" in refused("fit", "demo:train", "--held-out", "demo:train", *out)
     assert not (tmp_path / "x.safetensors").exists()
 
 
@@ -185,7 +174,7 @@ def test_a_frame_of_unknown_colour_is_refused() -> None:
 
 
 def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
 ) -> None:
     folders, rng = [tmp_path / "fitted", tmp_path / "held"], np.random.default_rng(0)
     for folder in folders:
@@ -197,8 +186,8 @@ def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(
     out, (fitted, held) = tmp_path / "mine.safetensors", (f"pairs:{folder}" for folder in folders)
     isp = fit(out, fitted, "--held-out", held, *given)
     assert isp.cfa == "GRBG" and isp.info["frames"] == ["fitted"] and "held out:" in capsys.readouterr().out
-    assert "does not state its CFA" in refused(capsys, "fit", fitted, "--out", out, *QUICK, *given[2:])
-    line = refused(capsys, "fit", "demo:train", "--out", out, *QUICK, "--cfa", "GRBG")
+    assert "does not state its CFA" in refused("fit", fitted, "--out", out, *QUICK, *given[2:])
+    line = refused("fit", "demo:train", "--out", out, *QUICK, "--cfa", "GRBG")
     assert "cfa" in line and "demo:" in line
     with pytest.raises(ValueError, match="cfa can only be given for pairs:PATH; each Pair has its own"):
         rawaug.fit(rawaug.data.demo_pairs("train", count=1), cfa="GRBG")

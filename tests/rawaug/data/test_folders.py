@@ -7,7 +7,6 @@ import os
 import pickle
 import signal
 import struct
-import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -196,9 +195,7 @@ def test_nothing_is_opened_at_the_start(tmp_path: Path, monkeypatch: pytest.Monk
     for k in range(3000):
         (tmp_path / f"{k:04d}.jpg").touch()
     monkeypatch.setattr("rawaug.data.folders.read_picture", lambda *_: pytest.fail("opened"))
-    start = time.perf_counter()
     assert len(PictureFolder(tmp_path)) == 3000
-    assert time.perf_counter() - start < 2
 
 
 def test_names_may_hold_any_bytes(tmp_path: Path) -> None:

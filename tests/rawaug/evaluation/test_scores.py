@@ -39,14 +39,6 @@ from rawaug.noise import noise_model
 
 
 @pytest.fixture
-def identity(tmp_path: Path) -> Path:
-    path = tmp_path / "identity.safetensors"
-    network = denoisers.build("UNet", width=4, scales=2)
-    denoisers.save(network, path, {"cfa": "GRBG", "noise": "cycleisp_sidd"})
-    return path
-
-
-@pytest.fixture
 def middles(given: list[Pair]) -> list[Pair]:
     """The middle of each validation pair of the demo, as ``given:``."""
     given.extend(pair.middle(128) for pair in demo_pairs("validation"))
@@ -107,8 +99,7 @@ def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path, middles: li
 
 def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
     pair = demo_pairs("test", count=1)[0]
-    bare = type(pair)(**{**vars(pair), "noisy": None, "shot_var": None, "read_var": None})
-    noise = noise_model("cycleisp_sidd")
+    bare, noise = replace(pair, noisy=None, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
     first = frozen_sample(bare, noise, pair.cfa, seed=0)
     assert torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=0).noisy)
     assert not torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=1).noisy)
@@ -146,7 +137,7 @@ def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
     assert scored[0].psnr > (scored[0].psnr_noisy or 99.0) + 3.0
 
 
-def test_the_development_is_the_same_for_both(identity: Path) -> None:
+def test_the_development_is_the_same_for_both() -> None:
     """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
     pair = demo_pairs("test", count=1)[0]
     sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
@@ -162,7 +153,7 @@ def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
     result = evaluate(identity, "given:", self_ensemble=True, report=tmp_path / "new" / "page.html")
     assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
     page = (tmp_path / "new" / "page.html").read_text()
-    assert page.count("<h3>") == 2 and "self-ensemble" in page and f"{result['psnr']:.2f}" in page
+    assert page.count("<h3>") == 2 and "Self-ensemble" in page and f"{result['psnr']:.2f}" in page
 
 
 def test_what_is_for_denoisers_is_refused_for_an_isp(middles: list[Pair]) -> None:

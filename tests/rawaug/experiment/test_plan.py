@@ -202,22 +202,12 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
         assert shown in capsys.readouterr().out
 
 
-def test_an_arm_takes_at_most_its_own_steps() -> None:
-    recipe = Recipe(
-        camera="universal",
-        train=TrainConfig(steps=40),
-        arms={"scratch": ArmConfig(), "tuned": ArmConfig(steps=10), "more": ArmConfig(steps=90)},
-    )
-    assert [recipe.loop_of(arm).steps for arm in recipe.arms] == [40, 10, 40]
+def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps() -> None:
+    tuned = ArmConfig(learning_rate=3e-4, weigh="stabilised", steps=10)
+    train = TrainConfig(steps=40, learning_rate=7e-4, weigh="mixed")
+    recipe = Recipe(camera="universal", train=train, arms={"a": ArmConfig(), "b": tuned, "c": ArmConfig(steps=90)})
+    a, b, c = (recipe.loop_of(arm) for arm in recipe.arms)
+    assert (a.steps, a.learning_rate, a.weigh) == (c.steps, c.learning_rate, c.weigh) == (40, 7e-4, "mixed")
+    assert (b.steps, b.learning_rate, b.weigh) == (10, 3e-4, "stabilised")
     with pytest.raises(ValueError, match="steps must be a whole number from 1"):
         ArmConfig(steps=0)
-
-
-def test_an_arm_has_a_rate_and_a_weighing_of_its_own() -> None:
-    recipe = Recipe(
-        camera="universal",
-        train=TrainConfig(learning_rate=7e-4, weigh="mixed"),
-        arms={"scratch": ArmConfig(), "tuned": ArmConfig(learning_rate=3e-4, weigh="stabilised")},
-    )
-    loops = [recipe.loop_of(arm) for arm in recipe.arms]
-    assert [(loop.learning_rate, loop.weigh) for loop in loops] == [(7e-4, "mixed"), (3e-4, "stabilised")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,10 @@ def test_the_commands_of_a_header_can_be_given(name: str, monkeypatch: pytest.Mo
     run.__annotations__ = {"settings": settings_of(kind)}
     monkeypatch.setitem(EXPERIMENTS._things, kind, run)
     monkeypatch.setattr(kinds, "dry_run", lambda kind, settings, overwrite: given.append(settings))
-    commands = re.findall(r"^#   rawaug (run [^\n]+?)(?:  +\S.*)?$", header(name), re.MULTILINE)
+    head = header(name)
+    commands = re.findall(r"^#   rawaug (run [^\n]+?)(?:  +\S.*)?$", head, re.MULTILINE)
     assert len(commands) >= 3 and any("--dry-run" in command for command in commands)
+    assert kind != "training" or ("--seeds 3" in head and re.search(r"about \d+ (minutes|hours)", head)), "the cost"
     for command in commands:
         assert shlex.split(command)[1] == name
         assert main(shlex.split(command)) == 0
@@ -142,12 +145,11 @@ def test_a_recipe_that_names_no_kind_trains(content: str, tmp_path: Path) -> Non
     ],
 )
 def test_null_or_a_setting_that_nobody_means_is_named(
-    line: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    line: str, named: str, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     head = "".join(kept for kept in HEAD.splitlines(True) if kept.partition(":")[0] != line.partition(":")[0])
     (tmp_path / "a.yaml").write_text(f"{line}\n" if "experiment" in line else f"{head}{line}\n")
-    assert main(["run", str(tmp_path / "a.yaml"), "--out", str(tmp_path)]) == 2
-    (text,) = capsys.readouterr().err.strip().splitlines()
+    text = refused("run", tmp_path / "a.yaml", "--out", tmp_path)
     assert re.search(named, text)
 
 

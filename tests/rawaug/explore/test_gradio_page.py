@@ -127,8 +127,7 @@ def uploaded(browser: Any, file: Path) -> None:
 
 def code(browser: Any, language: str = "command") -> str:
     """What the tab Code shows."""
-    text: str = browser.locator(f"#{language} .cm-content").inner_text()
-    return text
+    return str(browser.locator(f"#{language} .cm-content").inner_text())
 
 
 def images(browser: Any, view: str) -> list[np.ndarray]:
@@ -150,8 +149,7 @@ def changed(browser: Any, view: str, before: str) -> str:
 
 
 def first(browser: Any, view: str) -> str:
-    source: str = browser.locator(f"#view-{view} img").first.get_attribute("src")
-    return source
+    return str(browser.locator(f"#view-{view} img").first.get_attribute("src"))
 
 
 def test_the_first_view_is_the_pair_that_the_code_makes(browser: Any, pictures: Path) -> None:

@@ -67,7 +67,7 @@ class Augmented(Dataset[torch.Tensor]):
 def test_forked_workers_go_on_where_the_parent_used_threads(two_threads: None) -> None:
     pairs = Augmented(RawAugment(DictionaryISP()))
     own = pairs[0]
-    loader = DataLoader(pairs, batch_size=2, num_workers=2, multiprocessing_context="fork", timeout=60)
+    loader = DataLoader(pairs, batch_size=2, num_workers=2, multiprocessing_context="fork", timeout=300)
     for batch in loader:
         assert all(torch.equal(noisy, own) for noisy in batch)
 

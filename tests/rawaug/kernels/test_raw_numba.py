@@ -67,14 +67,7 @@ def test_a_curve_has_every_code_of_a_byte() -> None:
     codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16)
     torch.testing.assert_close(through_curves(curve[:, ::4], codes).flatten(), curve[0, ::4], atol=0, rtol=0)
     torch.testing.assert_close(through_curves(curve, codes).flatten(), curve[0, ::4])
-    between = through_curves(
-        curve,
-        torch.tensor(
-            [
-                [[[0.0, 100.25 / 1020]]],
-            ]
-        ),
-    )
+    between = through_curves(curve, torch.tensor([[[[0.0, 100.25 / 1020]]]]))
     torch.testing.assert_close(between.flatten()[1], curve[0, 100] + 0.25 * (curve[0, 101] - curve[0, 100]))
 
 

@@ -1,4 +1,4 @@
-"""A process of a distributed run, without the others."""
+"""Augmentations that tests share, and a process of a distributed run without the others."""
 
 from __future__ import annotations
 
@@ -6,6 +6,25 @@ from collections.abc import Callable
 
 import pytest
 import torch
+
+from rawaug.isp.config import ISPConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.plugin.augment import RawAugment
+
+
+@pytest.fixture(scope="session")
+def isp() -> DictionaryISP:
+    return DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3))
+
+
+@pytest.fixture(scope="session")
+def augment(isp: DictionaryISP) -> RawAugment:
+    return RawAugment(isp, noise="cycleisp_sidd")
+
+
+@pytest.fixture(scope="session")
+def universal() -> DictionaryISP:
+    return DictionaryISP.from_pretrained("universal")
 
 
 @pytest.fixture

@@ -27,11 +27,6 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 @pytest.fixture(scope="module")
-def universal() -> DictionaryISP:
-    return DictionaryISP.from_pretrained("universal")
-
-
-@pytest.fixture(scope="module")
 def srgb() -> Tensor:
     coarse = torch.rand(2, 3, 12, 16, generator=seeded())
     return (F.interpolate(coarse, size=(96, 128), mode="bicubic").clamp(0, 1) * 255).to(torch.uint8)

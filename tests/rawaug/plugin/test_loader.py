@@ -16,16 +16,10 @@ from lightning_fabric import Fabric
 from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
-from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
-
-
-@pytest.fixture(scope="module")
-def augment() -> RawAugment:
-    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
 
 
 @pytest.fixture

@@ -9,18 +9,17 @@ import torch
 from safetensors.torch import save_file
 from torch.utils.data import default_collate
 
-from rawaug.isp.config import ISPConfig, ISPParams
-from rawaug.isp.model import DictionaryISP
+from rawaug.isp.config import ISPParams
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.plugin.params import AugmentParams, load_params, save_params
 
 
 @pytest.fixture(scope="module")
-def pairs() -> RawPairs:
+def pairs(augment: RawAugment) -> RawPairs:
     generator = torch.Generator().manual_seed(0)
     pictures = [torch.randint(256, (3, 20 + 2 * i, 26), generator=generator, dtype=torch.uint8) for i in range(4)]
-    return RawPairs(pictures, RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3))), crop=16, seed=3)
+    return RawPairs(pictures, augment, crop=16, seed=3)
 
 
 def test_saved_with_a_batch_they_replay_every_pair(pairs: RawPairs, tmp_path: Path) -> None:

@@ -45,10 +45,10 @@ def test_pil_modes_are_read_as_what_they_show(mode: str) -> None:
     assert torch.equal(to_rgb_tensor(picture), torch.from_numpy(np.array(picture.convert("RGB"))).permute(2, 0, 1))
 
 
-@pytest.mark.parametrize("mode", ["CMYK", "HSV", "LAB", "I"])
-def test_pil_modes_that_are_not_srgb_are_refused(mode: str) -> None:
-    with pytest.raises(ValueError, match=f"mode '{mode}'"):
-        to_rgb_tensor(Image.new(mode, (4, 4)))
+def test_pil_modes_that_are_not_srgb_are_refused() -> None:
+    for mode in ("CMYK", "HSV", "LAB", "I"):
+        with pytest.raises(ValueError, match=f"mode '{mode}'"):
+            to_rgb_tensor(Image.new(mode, (4, 4)))
 
 
 def test_grey_is_repeated() -> None:
@@ -69,19 +69,6 @@ def test_a_float_picture_keeps_its_values(dtype: Any) -> None:
     array = np.array([[[0.25, 0.5, 1.0]]], dtype=dtype)
     out = to_rgb_tensor(array)
     assert out.dtype == torch.float32 and out.flatten().tolist() == [0.25, 0.5, 1.0]
-
-
-@pytest.mark.parametrize("value", [255.0, -0.5])
-def test_floats_outside_the_display_range_are_refused(value: float) -> None:
-    with pytest.raises(ValueError, match=r"in \[0, 1\], got"):
-        to_rgb_tensor(torch.full((3, 4, 4), value))
-
-
-def test_nan_is_called_nan() -> None:
-    picture = torch.zeros(3, 4, 4)
-    picture[0, 1:3, 2] = float("nan")
-    with pytest.raises(ValueError, match="got NaN in 2 of 48 values"):
-        to_rgb_tensor(picture)
 
 
 def test_a_narrow_tensor_is_read_channels_first() -> None:

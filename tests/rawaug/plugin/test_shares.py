@@ -27,8 +27,8 @@ LEVELS = range(0, 200, 25)
 
 
 @pytest.fixture(scope="module")
-def augment() -> RawAugment:
-    return RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)), noise=(0.0, 0.0), sampling="chosen")
+def augment(isp: DictionaryISP) -> RawAugment:
+    return RawAugment(isp, noise=(0.0, 0.0), sampling="chosen")
 
 
 def pictures() -> list[Tensor]:

@@ -38,11 +38,6 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.fixture(scope="module")
-def universal() -> DictionaryISP:
-    return DictionaryISP.from_pretrained("universal")
-
-
 def test_linear_rgb_is_what_the_mosaic_was_taken_from(universal: DictionaryISP) -> None:
     srgb = smooth()
     raw = RawAugment(universal)(srgb, seeded())

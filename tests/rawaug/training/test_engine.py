@@ -78,7 +78,7 @@ def rows_as_they_come(folder: Path, process: ForkServerProcess) -> Iterator[int]
         time.sleep(0.001)
 
 
-STEPS = 60
+STEPS = 30
 
 
 @pytest.fixture(scope="module")

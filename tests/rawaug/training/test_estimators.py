@@ -39,6 +39,11 @@ def crop_of(shots: Tensor, signal: Tensor, shot_var: float = SHOT_VAR, read_var:
     return NoisyCrop(shots, signal.expand_as(shots[0]), shot_var, read_var)
 
 
+def sampled(estimator: SelfSupervised, crop: NoisyCrop, seed: int) -> Any:
+    """The training sample that ``estimator`` makes of ``crop``."""
+    return estimator.apply(crop, estimator.sample(crop.shots.shape[1:], torch.Generator().manual_seed(seed)))
+
+
 def slope(target: Tensor, given: Tensor) -> float:
     """Of the best linear estimate of ``target``: its covariance with ``given`` over the variance of ``given``."""
     given = given - given.mean()
@@ -48,8 +53,7 @@ def slope(target: Tensor, given: Tensor) -> float:
 def trained_slope(estimator: SelfSupervised) -> tuple[float, float]:
     """Slope that l2 training converges to, and the one that clean targets would give."""
     clean, shots = scene_and_shots(estimator.shots)
-    drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(7))
-    sample = estimator.apply(crop_of(shots, clean), drawn)
+    sample = sampled(estimator, crop_of(shots, clean), 7)
     return slope(sample.clean, sample.noisy), slope(clean, sample.noisy)
 
 
@@ -68,9 +72,7 @@ def test_the_mean_of_r2rs_target_is_the_signal_whatever_its_input_is(alpha: floa
     clean = torch.full((4, 512, 512), signal)
     deviation = (shot_var * signal + read_var) ** 0.5
     shots = clean + deviation * torch.randn(1, *clean.shape, generator=torch.Generator().manual_seed(0))
-    estimator = R2R(alpha)
-    drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(7))
-    sample = estimator.apply(crop_of(shots, clean, shot_var, read_var), drawn)
+    sample = sampled(R2R(alpha), crop_of(shots, clean, shot_var, read_var), 7)
     offset = (sample.noisy - clean) / (deviation * (1 + alpha**2) ** 0.5)
     for low, high in ((-9.0, -1.5), (-1.5, -0.5), (-0.5, 0.5), (0.5, 1.5), (1.5, 9.0)):
         error = ((sample.clean - clean) / deviation)[(offset > low) & (offset < high)]
@@ -80,9 +82,7 @@ def test_the_mean_of_r2rs_target_is_the_signal_whatever_its_input_is(alpha: floa
 def test_in_the_dark_noisier_adds_the_noise_that_is_there() -> None:
     shot_var, read_var = 5e-3, 1e-4
     dark = read_var**0.5 * torch.randn(1, 4, 400, 400, generator=torch.Generator().manual_seed(0))
-    estimator = Noisier(1.0)
-    drawn = estimator.sample(dark.shape[1:], torch.Generator().manual_seed(7))
-    added = estimator.apply(crop_of(dark, torch.zeros(1), shot_var, read_var), drawn).noisy - dark[0]
+    added = sampled(Noisier(1.0), crop_of(dark, torch.zeros(1), shot_var, read_var), 7).noisy - dark[0]
     assert float(added.var()) == pytest.approx(read_var, rel=0.02)
 
 
@@ -99,8 +99,7 @@ def test_targets_keep_the_mean_in_the_shadows() -> None:
     clean, shots = scene_and_shots(2, torch.full((4, 256, 256), 2e-3))
     tolerance = 4 * (5 * READ_VAR / clean.numel()) ** 0.5
     for estimator in (Noisier(), Noise2Noise(), R2R(0.5)):
-        drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(3))
-        target = estimator.apply(crop_of(shots, clean), drawn).clean
+        target = sampled(estimator, crop_of(shots, clean), 3).clean
         assert float((target - clean).mean()) == pytest.approx(0.0, abs=tolerance)
 
 
@@ -108,16 +107,14 @@ def test_targets_keep_the_mean_in_the_shadows() -> None:
 def test_the_variance_map_is_that_of_the_input(alpha: float) -> None:
     clean, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
     for estimator in (Noisier(alpha), R2R(alpha)):
-        drawn = estimator.sample(clean.shape, torch.Generator().manual_seed(5))
-        sample = estimator.apply(crop_of(shots, clean), drawn)
+        sample = sampled(estimator, crop_of(shots, clean), 5)
         assert float(sample.variance.mean()) == pytest.approx(float((sample.noisy - clean).var()), rel=0.02)
 
 
 def test_inputs_are_clipped_at_white_and_targets_are_not() -> None:
     shots = torch.ones(1, 4, 32, 32)
     for estimator in (Noisier(), R2R()):
-        drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-        sample = estimator.apply(crop_of(shots, shots[0]), drawn)
+        sample = sampled(estimator, crop_of(shots, shots[0]), 0)
         assert sample.noisy.max() == 1.0 and sample.noisy.min() < 1.0
     assert sample.clean.max() > 1.0  # r2r's
 
@@ -171,8 +168,7 @@ def test_the_neighbours_loss_of_the_identity() -> None:
     """f = identity on a flat field: the second term's differences cancel, the first is twice the noise's variance."""
     clean, shots = scene_and_shots(1, torch.full((4, 256, 256), 0.4))
     estimator = Neighbor2Neighbor(gamma=5.0)
-    drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-    sample = estimator.apply(crop_of(shots, clean), drawn)
+    sample = sampled(estimator, crop_of(shots, clean), 0)
     batch = type(sample)(*(x[None] for x in sample))
     identity: Any = lambda noisy, variance: noisy  # noqa: E731
     loss = estimator.loss(identity, batch, torch.nn.functional.mse_loss)
@@ -183,8 +179,7 @@ def test_no_gradient_passes_through_the_neighbours_of_the_denoised_frame() -> No
     """f = w y, whose loss and gradient can be written down; with a gradient through f(y) it would be another."""
     clean, shots = scene_and_shots(1)
     estimator = Neighbor2Neighbor(gamma=3.0)
-    drawn = estimator.sample(shots.shape[1:], torch.Generator().manual_seed(0))
-    sample = estimator.apply(crop_of(shots, clean), drawn)
+    sample = sampled(estimator, crop_of(shots, clean), 0)
     batch = type(sample)(*(x[None] for x in sample))
     first, second = neighbours(batch.noisy, batch.choice)
     w = torch.tensor(0.7, requires_grad=True)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.bayer import CFA, aligned
+from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.isp.model import DictionaryISP
@@ -51,11 +51,6 @@ def test_a_captures_noise_is_never_renewed(levels: bool) -> None:
 def test_frames_smaller_than_the_crop_are_named() -> None:
     with pytest.raises(ValueError, match="colours: a frame of 40 x 48"):
         RealCrops([colour_pair(CFA.RGGB)], noise_model((0.0, 0.0)), crop=64, cfa=CFA.RGGB)
-
-
-def test_alignment_starts_at_the_target_pattern() -> None:
-    mosaic = colour_pair(CFA.GRBG).raw
-    assert torch.equal(aligned(mosaic, CFA.GRBG, CFA.RGGB)[0, :2, :2], torch.tensor([[0.2, 0.5], [0.5, 0.8]]))
 
 
 def test_samples_depend_on_seed_and_index_alone() -> None:
