@@ -48,12 +48,6 @@ def test_wrapping_a_loader_is_one_line(augment: RawAugment, srgb: Tensor) -> Non
     assert pair.noisy.shape == (4, 4, 8, 10) and labels.tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_workers_do_not_change_the_pairs(augment: RawAugment, srgb: Tensor, workers: int) -> None:
-    expected = noisy(wrap(batches_of(srgb, 4), augment))
-    assert torch.equal(noisy(wrap(batches_of(srgb, 4, num_workers=workers), augment)), expected)
-
-
 def test_each_pass_is_another_epoch_that_can_be_had_again(augment: RawAugment, srgb: Tensor) -> None:
     wrapped = wrap(batches_of(srgb, 2), augment)
     first, second = noisy(wrapped), noisy(wrapped)

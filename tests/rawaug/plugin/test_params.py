@@ -35,14 +35,6 @@ def test_saved_with_a_batch_they_replay_every_pair(pairs: RawPairs, tmp_path: Pa
             assert torch.equal(getattr(again, name), getattr(batch, name)[i])
 
 
-def test_a_batch_replays_from_its_file(pairs: RawPairs, tmp_path: Path) -> None:
-    augment, srgb = pairs.augment, torch.rand(3, 3, 8, 12)
-    pair = augment(srgb)
-    save_params(pair.params, tmp_path / "p.safetensors")
-    again = augment.apply(srgb, load_params(tmp_path / "p.safetensors"))
-    assert torch.equal(again.noisy, pair.noisy) and torch.equal(again.variance, pair.variance)
-
-
 def test_a_flat_dict_is_the_same(pairs: RawPairs) -> None:
     pair = pairs[1]
     again = AugmentParams.from_tensors(pair.params.tensors())
