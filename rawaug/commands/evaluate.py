@@ -169,6 +169,8 @@ class _Scoring:
         self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: torch.device
     ) -> None:
         model, info = denoisers.load(weights)
+        if model.upscale > 1:
+            raise ValueError(f"{weights}: demosaics, too; rawaug run demosaic --denoiser.start {weights} scores it")
         self.name = weights.stem
         self.model, self.pairs, self.seed = model.to(device), pairs, seed
         self.named = noise or info.get("noise", "cycleisp_sidd")

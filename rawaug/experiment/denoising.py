@@ -110,7 +110,11 @@ class TrainingRun:
         if recipe.noise != "camera":
             noise_model(recipe.noise)
         for arm in recipe.arms:
-            first_network(recipe.network_of(arm), seed=0)
+            network = first_network(recipe.network_of(arm), seed=0)
+            if (network.upscale > 1) != (recipe.target == "rgb"):
+                named = recipe.network_of(arm).start or type(network).__name__
+                gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
+                raise ValueError(f"denoiser: {named} gives {gives}; take another network")
         self.estimators = {label: estimator_of(arm) for label, arm in recipe.arms.items()}
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}

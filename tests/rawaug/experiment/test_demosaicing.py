@@ -15,7 +15,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.experiment.demosaicing import JointRecipe, Scene, demosaiced, frozen_mosaic, full_colour, run
-from rawaug.experiment.recipe import ArmConfig, DataConfig
+from rawaug.experiment.denoising import run as train_denoiser
+from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
@@ -85,6 +86,12 @@ def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
         small(tmp_path, demosaicing=["AMAZE"])
     with pytest.raises(ValueError, match=r"classical and untouched: .* are named in rivals"):
         small(tmp_path, classical=["Wavelet"])
+    with pytest.raises(ValueError, match="denoiser: UNet gives no full colour; take another network"):
+        run(replace(small(tmp_path), denoiser=DenoiserConfig("UNet")), test=[a_pair()], validation=[])
+    with pytest.raises(ValueError, match="denoiser: JointDRUNet gives full colour: rawaug run demosaic trains it"):
+        train_denoiser(
+            Recipe(arms={"a": ArmConfig(1.0)}, camera="universal", denoiser=small(tmp_path).denoiser, out=str(tmp_path))
+        )
     with pytest.raises(ValueError, match="rgb targets are made from pictures"):
         replace(small(tmp_path), arms={"joint": ArmConfig(0.5)}, data=DataConfig())
 
