@@ -178,7 +178,8 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
     gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
     gain = statistics.fmean(gains)
     better = gain >= MATTERS
-    said = [f"{gain:+.2f} dB over {other}" if better else f"{arm}, the best arm, is at {gain:+.2f} dB from it"]
+    not_enough = f"{arm}, the best arm, scores {abs(gain):.2f} dB {'more' if gain >= 0 else 'less'}"
+    said = [f"{gain:+.2f} dB over {other}" if better else not_enough]
     if len(gains) > 1:
         spread = statistics.stdev(gains)
         said += [f"{'within' if abs(gain) <= spread else 'more than'} the noise of the seeds (± {spread:.2f} dB)"]

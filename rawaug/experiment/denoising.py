@@ -293,7 +293,8 @@ class TrainingRun:
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
         methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
         facts = {"Noise": recipe.noise, "To use the best run": self.usage(results)[-1].partition(": ")[2]}
-        page = Page.of_scores(title, results, classical, facts, methods_of(recipe))
+        about = {name: text for name, text in methods_of(recipe).items() if name in methods}
+        page = Page.of_scores(title, results, classical, facts, about)
         picture = self.pictured(page, methods, noise, cfa)
         print_table(results, title, classical)
         _say(*filter(None, [verdict(results, classical)]))

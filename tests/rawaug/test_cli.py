@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import os
 import subprocess
 import sys
@@ -85,6 +86,8 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     *listed, last = text.strip().splitlines()
     assert last == f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {weights}"
     assert f"denoiser, real: {place / 'denoiser.safetensors'}" in listed
+    assert any(re.match(r"time: fit \d+ s, training \d+ s, scores of the arms \d+ s", line) for line in listed)
+    assert any(line.startswith("Use ") for line in listed)
     before = (place / "denoiser.safetensors").stat().st_mtime_ns
     assert main(command) == 0
     text = capsys.readouterr().out

@@ -57,8 +57,8 @@ def test_one_seed_has_no_spread() -> None:
     [
         ((40.0, 40.2), 39.0, r"Use real: \+1.10 dB over NLM, more than the noise of the seeds \(± 0.14 dB\)"),
         ((40.0, 40.2), 40.03, r"Use real: \+0.07 dB over NLM, within the noise of the seeds"),
-        ((40.0, 40.2), 41.0, r"Use NLM: real, the best arm, is at -0.90 dB from it, more than the noise"),
-        ((40.0, 40.2), 40.08, r"Use NLM: real, the best arm, is at \+0.02 dB from it, within the noise"),
+        ((40.0, 40.2), 41.0, r"Use NLM: real, the best arm, scores 0.90 dB less, more than the noise"),
+        ((40.0, 40.2), 40.08, r"Use NLM: real, the best arm, scores 0.02 dB more, within the noise"),
         ((40.0,), 39.0, r"Use real: \+1.00 dB over NLM, higher on 1 of 2 frames, one seed"),
     ],
 )
