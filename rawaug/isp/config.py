@@ -147,6 +147,10 @@ class ReverseISP(nn.Module, ABC):
     def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to the mosaic ``(B, 1, H, W)``."""
 
+    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
+        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
+        return None
+
     def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
         """The mosaic under a setting drawn at random; the one of :meth:`make` where the method has no other."""
         return self.make(srgb)

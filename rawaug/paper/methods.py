@@ -51,7 +51,7 @@ from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame, placed
 from rawaug.metrics import PATCH, psnr
-from rawaug.paper.baselines import BASELINES, BaselineISP, Training, fit_baseline
+from rawaug.paper.baselines import BASELINES, Training, fit_baseline
 from rawaug.paper.baselines.base import CropTrainedISP
 from rawaug.seeding import keyed_generator
 
@@ -102,8 +102,8 @@ def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, training: 
             raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
         return Fitted(isp, 0.0, isp.reverse_parameters)
     if family.startswith("dictionary"):
-        encoders = "on" if family == "dictionary-encoders" else "off"
-        isp = fit_isp(pairs, replace(config, seed=training.seed, encoders=encoders))
+        config = replace(config, seed=training.seed, encoders="on" if family == "dictionary-encoders" else "off")
+        isp = fit_isp(pairs, config)
         return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
     method = BASELINES[family]
     start_of: dict[str, Any] = {"seed": training.seed} if issubclass(method, CropTrainedISP) else {}
@@ -145,7 +145,7 @@ def _made(model: ReverseISP, setting: Any, patch: Tensor, place: Tensor) -> Tens
 
 
 @singledispatch
-def settings(model: BaselineISP, pair: Pair) -> dict[str, Any]:
+def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
     """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
     balanced = model.balanced(pair.white_balance) if pair.balance_known else None
     return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})

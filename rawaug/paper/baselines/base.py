@@ -86,10 +86,6 @@ class BaselineISP(ReverseISP):
         """Fit to the pairs; the number of steps and the last loss. A method as published has nothing to fit."""
         return 0, math.nan
 
-    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
-        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
-        return None
-
     @abstractmethod
     def unprocess(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """Float sRGB ``(B, 3, H, W)`` to linear camera colour ``(B, 3, H, W)``, not clipped."""

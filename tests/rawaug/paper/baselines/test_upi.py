@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
+from rawaug.isp.tone import inverse_smoothstep
 from rawaug.paper.baselines.upi import (
     LOG_MSE_EPS,
     UPI,
@@ -21,7 +22,6 @@ from rawaug.paper.baselines.upi import (
     TunedUPI,
     UPIParams,
     camera_matrix,
-    inverse_smoothstep,
     render_pixels,
     smoothstep,
 )
