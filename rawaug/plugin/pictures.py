@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
         if batched and key is None and is_picture(sample[0]):
             return None
         if key is None and len(sample) > 1 and _likely_pair(*sample[:2]):
-            warnings.warn(_PAIR, stacklevel=2)
+            warn_of_pairs()
         where = key or 0
         if not isinstance(where, int) or not -len(sample) <= where < len(sample):
             raise ValueError(f"key={key!r}: samples are tuples of {len(sample)}; give the index of the picture")
@@ -110,6 +111,12 @@ def find_picture(sample: Any, key: str | int | None, batched: bool = False) -> W
     if key is not None:
         raise ValueError(f"key={key!r}: samples are neither mappings nor tuples but {_described(sample)}; omit key")
     return None
+
+
+@cache
+def warn_of_pairs() -> None:
+    """Once a process: filters of warnings that are set anew would let it through at every sample."""
+    warnings.warn(_PAIR, stacklevel=3)
 
 
 def _likely_pair(first: Any, second: Any) -> bool:

@@ -12,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, to_rgb_batch, to_rgb_tensor
+from rawaug.plugin.pictures import (
+    even_sided,
+    find_picture,
+    picked,
+    replaced,
+    to_rgb_batch,
+    to_rgb_tensor,
+    warn_of_pairs,
+)
 
 ARRAY = np.random.default_rng(0).integers(256, size=(6, 8, 3), dtype=np.uint8)
 RGB = torch.from_numpy(ARRAY).permute(2, 0, 1)
@@ -163,7 +171,10 @@ def test_noisy_and_clean_of_one_shape_are_warned_of() -> None:
     noisy, clean = torch.rand(2, 3, 20, 24)
     arrays, images = [x.numpy().transpose(1, 2, 0) for x in (noisy, clean)], [Image.new("RGB", (24, 20))] * 2
     for pair in ((noisy, clean), arrays, images, (noisy[None], clean[None])):
+        warn_of_pairs.cache_clear()
         with pytest.warns(UserWarning, match="give key=1"):
             assert find_picture(pair, None) == 0
+        assert find_picture(pair, None) == 0  # once is enough
+    warn_of_pairs.cache_clear()
     for sample in ((noisy, clean), (noisy, clean[:, 2:]), (noisy, noisy[0]), (noisy, torch.tensor(1)), (noisy,)):
         assert find_picture(sample, 0 if sample[-1] is clean else None) == 0  # warnings are errors here
