@@ -58,6 +58,8 @@ def test_gaussian_noise_is_mixed_as_its_matrix_says() -> None:
     assert same.float().mean().item() == pytest.approx(0.4, abs=0.03)
     assert independent.float().mean().item() == pytest.approx(0.4, abs=0.03)
     assert covariance.diagonal(dim1=1, dim2=2).max().sqrt() <= 25 / 255 + 1e-6
+    correlated = covariance[~same & ~independent] * (255 / 25) ** 2
+    assert torch.einsum("bii->b", correlated).mean().item() == pytest.approx(1.5, rel=0.1), "three scales in [0, 1]"
     found = bsrgan(mixing=drawn[~same & ~independent][:6])[0]
     torch.testing.assert_close(torch.cov(found.flatten(1)), covariance[~same & ~independent][0], rtol=0.1, atol=3e-5)
 
