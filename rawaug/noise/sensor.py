@@ -168,7 +168,8 @@ class BlackOffset(_FixedPattern):
         return {self.stream: self.sd * normal(generator, batch, *self.colours)}
 
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        return torch.add(clean, params[self.stream].to(clean).reshape(len(clean), -1, 1, 1), out=out)
+        offsets = params[self.stream].to(clean).reshape(len(clean), math.prod(self.colours), 1, 1)
+        return torch.add(clean, offsets, out=out)
 
 
 class ColourBias(BlackOffset):
