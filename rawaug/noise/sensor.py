@@ -118,7 +118,8 @@ class _Banding(NoiseModel):
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        lines = drawn_normals(clean[:, :2].narrow(self.across, 0, 1), self.generators(params, clean.device))
+        one = clean[:, :2].narrow(self.across, 0, min(1, clean.shape[self.across]))
+        lines = drawn_normals(one, self.generators(params, clean.device))
         lines *= per_picture(params[self.key], clean).sqrt()
         return torch.add(clean, lines[:, self.line_of_plane], out=out)
 
