@@ -42,6 +42,7 @@ from rawaug.data.folders import RAW_EXTENSIONS, files_in
 from rawaug.errors import escape
 from rawaug.files import one_at_a_time, require_writable
 from rawaug.io import RawFrame, read_raw, write_dng, write_picture
+from rawaug.io.dng import LINEAR_WHITE
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import develop
 from rawaug.progress import progress
@@ -208,15 +209,15 @@ def _denoise_file(
     image = method(frame, (shot_var, read_var))
     out.parent.mkdir(parents=True, exist_ok=True)
     if method.linear:
-        below = (image < -max(frame.black) / (frame.white - max(frame.black))).float().mean().item()
+        below = (image < -0.5 / LINEAR_WHITE).float().mean().item()
         write_dng(out, frame, source, rgb=image)
-        return Denoised(source, out, shot_var, read_var, noise_source, below, time.perf_counter() - start)
-    mosaic = frame.mosaic.lerp(image, strength)
-    below = _clip_below_zero(mosaic, frame)
-    known = (shot_var, read_var) if method.reads_levels else frame.noise_profile
-    rest = (1 - strength) ** 2
-    left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
-    write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
+    else:
+        mosaic = frame.mosaic.lerp(image, strength)
+        below = _clip_below_zero(mosaic, frame)
+        known = (shot_var, read_var) if method.reads_levels else frame.noise_profile
+        rest = (1 - strength) ** 2
+        left = None if rest == 0 or known is None else (rest * known[0], rest * known[1])
+        write_dng(out, replace(frame, mosaic=mosaic, noise_profile=left), source)
     seconds = time.perf_counter() - start
     return Denoised(source, out, shot_var, read_var, noise_source, below, seconds, frame.camera, frame.iso)
 

@@ -47,6 +47,8 @@ from rawaug.io.tiff import (
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 7, 10, 12
 _BEYOND_16_BITS = 65535.5
+LINEAR_WHITE = 65535
+"""Digital number of white in a linear DNG, whose black is 0."""
 _LARGEST = 2.0**31 - 2
 _LARGEST_ISO = 65535
 _UNIQUE_CAMERA_MODEL = 50708
@@ -161,24 +163,12 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     return numbers
 
 
-def finer(frame: RawFrame) -> int:
-    """The power of two that a linear DNG's levels are those of its source times: means have finer steps than sites."""
-    return 2 ** int(math.log2(_BEYOND_16_BITS / frame.white))
-
-
-def _black_of_colours(frame: RawFrame) -> tuple[float, ...]:
-    red, *greens, blue = (level * finer(frame) for level in frame.black)
-    return red, sum(greens) / 2, blue
-
-
 def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
-    """Linear RGB as uint16 ``(H, W, 3)``; clipped where 16 bits, or the white level, end."""
+    """Linear RGB as uint16 ``(H, W, 3)``, black at 0 and white at 65535, clipped at both."""
     size = frame.mosaic.shape[-2:]
     if rgb.shape != (3, *size):
         raise ValueError(f"{path}: full colour of this frame is (3, {size[0]}, {size[1]}), got {tuple(rgb.shape)}")
-    black, white = torch.tensor(_black_of_colours(frame)), frame.white * finer(frame)
-    numbers = rgb.permute(1, 2, 0) * (white - black) + black
-    return np.asarray(numbers.clamp(0, white).round().numpy().astype(np.uint16))
+    return (rgb.permute(1, 2, 0).clamp(0, 1) * LINEAR_WHITE).round().numpy().astype(np.uint16)
 
 
 def _camera(frame: RawFrame) -> dict[int, Tag]:
@@ -234,11 +224,11 @@ _OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, 51009)
 
 def _tags_of_full_colour(frame: RawFrame) -> dict[int, Tag]:
     """Levels by colour; shading maps of the mosaic's sites become maps of the planes."""
-    white = round(frame.white) * finer(frame)
+    # LibRaw takes a black level of three colours for that of four, the last one 0, and develops 3 % too dark
     tags: list[Tag] = [
         (50713, SHORT, 2, (1, 1), True),
-        (50714, RATIONAL, 3, _rationals(_black_of_colours(frame), 2**14), True),
-        (50717, LONG, 3, (white, white, white), True),
+        (50714, RATIONAL, 3, _rationals((0, 0, 0)), True),
+        (50717, LONG, 3, (LINEAR_WHITE,) * 3, True),
     ]
     maps = [m for found in frame.gain_maps if found.on_mosaic for m in of_planes(found, frame.cfa)]
     if maps:
