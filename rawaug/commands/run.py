@@ -17,9 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from rawaug.commands import value_of
-from rawaug.experiment import kinds
-from rawaug.experiment.kinds import settings_of
-from rawaug.experiment.plan import with_own_pairs
+from rawaug.experiment import plan
+from rawaug.experiment.plan import settings_of, with_own_pairs
 from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
 from rawaug.registry import EXPERIMENTS, nearest
 
@@ -62,7 +61,7 @@ def run(
     if isinstance(settings, Recipe):
         settings = with_own_pairs(settings, content, {key.replace("-", "_") for key, _ in given})
     if dry_run:
-        kinds.dry_run(kind, settings, overwrite)
+        plan.dry_run(kind, settings, overwrite)
     else:
         EXPERIMENTS[kind](settings, overwrite)
 

@@ -1,11 +1,14 @@
-"""What a run uses of what: its frames, opened and divided but not yet read, and the lines that say so at its start."""
+"""What a run will use: its frames, opened and divided but not yet read, the lines that say so, and the dry run."""
 
 from __future__ import annotations
 
+import io
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, get_type_hints
 
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Cached, Readable, left_out
@@ -21,9 +24,10 @@ from rawaug.data.pairs import (
     shared_frame,
 )
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
+from rawaug.experiment.run_folder import require_free
 from rawaug.files import find_weights
 from rawaug.isp.model import DictionaryISP
-from rawaug.registry import ESTIMATORS
+from rawaug.registry import ESTIMATORS, EXPERIMENTS
 from rawaug.training.noisy_frames import noise_of
 
 MOST_HELD_OUT = 16
@@ -188,3 +192,19 @@ def require_usable(recipe: Recipe, pairs: Sequence[Pair], validation: Sequence[P
         levels = None if isp is None else isp.info.get("noise")
         for pair in [*(pairs if real else []), *validation]:
             noise_of(pair, levels)
+
+
+def settings_of(kind: str) -> type[Any]:
+    """The dataclass of the keys of a kind of experiment: the type of its function's first argument."""
+    settings: type[Any] = next(iter(get_type_hints(EXPERIMENTS[kind]).values()))
+    return settings
+
+
+def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
+    """Print what data a training would use, and do the run in its shortest form in a temporary folder."""
+    folder = require_free(settings, overwrite)
+    if isinstance(settings, Recipe):
+        print("\n".join(planned(settings, {}).lines(settings)))
+    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()):
+        EXPERIMENTS[kind](replace(settings.shortest(), out=elsewhere))
+    print(f"Dry run: no problems found, nothing written to {folder}")

@@ -18,7 +18,7 @@ import pytest
 from rawaug.cli import COMMANDS, app, main
 from rawaug.commands.run import keys_of
 from rawaug.data import demo_pictures
-from rawaug.experiment.kinds import settings_of
+from rawaug.experiment.plan import settings_of
 from rawaug.io import write_picture
 from rawaug.registry import EXPERIMENTS, FILTERS
 

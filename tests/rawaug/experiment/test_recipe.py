@@ -12,8 +12,8 @@ import pytest
 
 from rawaug.cli import main
 from rawaug.commands.run import with_values
-from rawaug.experiment import kinds
-from rawaug.experiment.kinds import settings_of
+from rawaug.experiment import plan
+from rawaug.experiment.plan import settings_of
 from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
@@ -54,7 +54,7 @@ def test_the_commands_of_a_header_can_be_given(name: str, monkeypatch: pytest.Mo
 
     run.__annotations__ = {"settings": settings_of(kind)}
     monkeypatch.setitem(EXPERIMENTS._things, kind, run)
-    monkeypatch.setattr(kinds, "dry_run", lambda kind, settings, overwrite: given.append(settings))
+    monkeypatch.setattr(plan, "dry_run", lambda kind, settings, overwrite: given.append(settings))
     head = header(name)
     commands = re.findall(r"^#   rawaug (run [^\n]+?)(?:  +\S.*)?$", head, re.MULTILINE)
     assert len(commands) >= 3 and any("--dry-run" in command for command in commands)
