@@ -131,7 +131,8 @@ def test_two_at_once(command: str, inputs: Path, tmp_path: Path, refused: Callab
 # -- disks and folders ------------------------------------------------------------------------------------------------
 
 FRAME = RawFrame(
-    torch.full((1, 128, 128), 0.5), CFA.RGGB, (0.0,) * 4, 4095.0, (2.0, 1.0, 1.5), (2.0, 1.0, 1.5), torch.eye(3),
+    torch.rand((1, 128, 128), generator=torch.Generator().manual_seed(0)),
+    CFA.RGGB, (0.0,) * 4, 4095.0, (2.0, 1.0, 1.5), (2.0, 1.0, 1.5), torch.eye(3),
     "Maker Model", None, None, 0, "a",
 )  # fmt: skip
 
@@ -327,6 +328,7 @@ def test_a_wall_clock_that_jumps_changes_nothing(inputs: Path, tmp_path: Path, m
 
 def test_the_figures_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark's exit status and file follow what it found."""
-    monkeypatch.setattr(faults, "kills", lambda folder, names, count, seed: iter([("synth", ["0.dng differ"], 1.0)]))
+    monkeypatch.setattr(faults, "uninterrupted", lambda *given: ({}, 1.0))
+    monkeypatch.setattr(faults, "kills", lambda *given: ["0.dng differ"])
     assert faults.main(["--commands", "synth", "--faults", "--json", str(tmp_path / "figures.json")]) == 1
     assert json.loads((tmp_path / "figures.json").read_text())["synth"]["wrong"] == ["0.dng differ"]

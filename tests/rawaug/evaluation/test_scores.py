@@ -167,7 +167,7 @@ def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     packed = torch.rand(1, 4, 4, 2000, generator=torch.Generator().manual_seed(0))
     model = denoisers.build("UNet", width=4, scales=2)
     assert torch.equal(denoise(model, Sample(packed, packed, packed), CFA.GRBG, 1), packed)
-    assert capsys.readouterr().err.startswith("frame: 1/2 tiles, 00:00 elapsed")
+    assert "frame: 1/2 tiles, 00:00 elapsed" in capsys.readouterr().err
     denoise(model, Sample(*(packed[..., :8] for _ in range(3))), CFA.GRBG, 8)
     assert "view groups, " in capsys.readouterr().err
 
