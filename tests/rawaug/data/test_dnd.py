@@ -81,6 +81,7 @@ class Halved:
     """Halves a mosaic, and notes what it was given."""
 
     reads_levels = True
+    linear = False
 
     def __init__(self) -> None:
         self.settings: dict[str, Any] = {}

@@ -244,6 +244,7 @@ class Noted:
     """Leaves a mosaic as it is, and notes the levels that it was given."""
 
     reads_levels = True
+    linear = False
 
     def __init__(self) -> None:
         self.settings: dict[str, Any] = {}
