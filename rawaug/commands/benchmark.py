@@ -6,11 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from denoisers.files import shipped
 from rawaug.commands import YAML
 from rawaug.data import open_pairs
 from rawaug.evaluation.benchmark import TOLD, benchmark, crops, shown_of, strengths_of, tables
-from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.evaluation.contestants import Contestant, contestant, shipped_of_mosaics
 from rawaug.evaluation.own_noise import own_noise_note
 from rawaug.evaluation.page import Page, Part
 from rawaug.evaluation.tables import print_rows
@@ -36,7 +35,7 @@ def run(
 ) -> None:
     """Compare denoisers on the same frozen noise over clean references.
 
-    The noisy input, NonLocalMeans and the shipped denoisers are always in the table.
+    The noisy input, NonLocalMeans and the shipped denoisers of mosaics are always in the table.
 
     Args:
         denoisers: names of shipped denoisers or filters, .safetensors files (also the published weights of PMRID and
@@ -59,7 +58,7 @@ def run(
         require_writable(path)
     where, strengths = find_device(device), strengths_of(noise, iso)
     contestants: dict[str, Contestant] = {}
-    for spec in dict.fromkeys(("NonLocalMeans", *shipped(), *denoisers)):
+    for spec in dict.fromkeys(("NonLocalMeans", *shipped_of_mosaics(), *denoisers)):
         one = contestant(spec, where)
         name = one.name if one.name not in contestants else spec
         contestants[name] = one._replace(name=name)

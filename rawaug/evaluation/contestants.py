@@ -26,9 +26,9 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Sample
 from rawaug.errors import extra
 from rawaug.evaluation.scores import denoise
-from rawaug.files import parse_object, read_tensors
+from rawaug.files import parse_object, read_header, read_tensors
 from rawaug.noise import anscombe
-from rawaug.registry import FILTERS, nearest
+from rawaug.registry import DENOISERS, FILTERS, nearest
 
 _AGAIN = "download or convert it again"
 _STRIDE = 32
@@ -40,6 +40,11 @@ class Contestant(NamedTuple):
 
     name: str
     run: Callable[[Tensor, Tensor, CFA], Tensor]
+
+
+def shipped_of_mosaics() -> list[str]:
+    """The shipped networks that denoise the mosaic and leave demosaicing to others."""
+    return [name for name in shipped() if DENOISERS[read_header(find(name))["model"]].upscale == 1]
 
 
 def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
@@ -122,6 +127,8 @@ def _of_weights(path: Path, device: torch.device) -> Contestant:
 
 
 def _of_network(name: str, model: denoisers.Denoiser, own: CFA, device: torch.device) -> Contestant:
+    if model.upscale > 1:
+        raise ValueError(f"{name}: demosaics, too; rawaug run demosaic --denoiser.start {name} scores it")
     model = model.to(device)
     return Contestant(name, lambda noisy, variance, cfa: denoise(model, Sample(noisy, noisy, variance), cfa, own=own))
 
