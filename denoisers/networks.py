@@ -345,9 +345,10 @@ class DRUNet(Denoiser):
 
     A block is ``x + conv(ReLU(conv(x)))``; convolutions 2 x 2 of stride 2 go down, a pointwise convolution and a pixel
     shuffle up (the source has transposed convolutions), skips are added. Without biases a network that is trained at
-    some noise levels denoises at others too (Mohan et al., ICLR 2020). Here it sees the signal less its mean over
-    8 x 8 pixels, interpolated: light and shade are then the same problem, and bfloat16 has digits for the noise, not
-    for the brightness.
+    some noise levels denoises at others too (Mohan et al., ICLR 2020). Here the first scale sees the signal less its
+    mean over a cell of the last scale (8 x 8 pixels), interpolated, and the last scale sees that mean less its own over
+    4 x 4 cells: light and shade are then the same problem, bfloat16 has digits for the noise, not for the brightness,
+    and noise wider than a cell is seen, too.
 
     Args:
         width: features of the first scale, doubled at each further one; 64 is published.
