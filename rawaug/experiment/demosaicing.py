@@ -110,20 +110,9 @@ def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
 
     gains = torch.tensor(pair.white_balance).reshape(3, 1, 1) / min(pair.white_balance)
     room = gains.max()  # LibRaw clips at white what the gains lift beyond it
-    frame = RawFrame(
-        mosaic=(mosaic[0] / room).clamp(-BLACK / (WHITE - BLACK), 1.0),
-        cfa=CFA.RGGB,
-        black=(BLACK,) * 4,
-        white=WHITE,
-        white_balance=pair.white_balance,
-        daylight=pair.white_balance,
-        color_matrix=pair.color_matrix,
-        camera=pair.camera,
-        iso=None,
-        noise_profile=None,
-        orientation=0,
-        name=pair.name,
-    )
+    mosaic = (mosaic[0] / room).clamp(-BLACK / (WHITE - BLACK), 1.0)
+    colour = pair.white_balance, pair.white_balance, pair.color_matrix
+    frame = RawFrame(mosaic, CFA.RGGB, (BLACK,) * 4, WHITE, *colour, pair.camera, name=pair.name)
     settings = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
     settings |= {"adjust_maximum_thr": 0, "user_flip": 0, "user_wb": [*gains.flatten().tolist(), gains[1].item()]}
     with TemporaryDirectory() as folder:

@@ -195,11 +195,9 @@ def shots_of(pairs: Sequence[Pair], levels: Sequence[Levels], label: str) -> dic
 
 def developed(mosaic: Tensor, pair: Pair) -> Tensor:
     """What LibRaw makes of a mosaic ``(1, H, W)`` in the colours of its pair: sRGB ``(1, 3, H, W)`` of 8 bits."""
-    gains, black = pair.white_balance, (BLACK,) * 4
     mosaic = mosaic.clamp(-BLACK / (WHITE - BLACK), 1.0)
-    frame = RawFrame(
-        mosaic, pair.cfa, black, WHITE, gains, gains, pair.color_matrix, "rawaug", None, None, 0, pair.name
-    )
+    colour = pair.white_balance, pair.white_balance, pair.color_matrix
+    frame = RawFrame(mosaic, pair.cfa, (BLACK,) * 4, WHITE, *colour, "rawaug", name=pair.name)
     with TemporaryDirectory() as folder:
         write_dng(path := Path(folder) / "frame.dng", frame)
         return develop(path)[None] / 255.0
