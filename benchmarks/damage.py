@@ -152,7 +152,7 @@ def _make_npy(folder: Path) -> list[Path]:
 def _make_recipes(folder: Path) -> list[Path]:
     """Those that travel with the package, without what would be read when they are set up."""
     shipped = Path(__file__).parents[1] / "recipes"
-    for name in ("fewshot", "unsupervised", "reconstruction", "denoisers"):
+    for name in ("fewshot", "unsupervised", "reconstruction"):
         (folder / f"{name}.yaml").write_bytes((shipped / f"{name}.yaml").read_bytes())
     return sorted(folder.glob("*.yaml"))
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from rawaug.experiment.denoiser_sweep import DenoiserSweep, sweep
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.experiment.run_folder import STAMP, claim, require_free
+from rawaug.paper.ablation import Ablation, ablate
 from rawaug.training.config import TrainConfig
 
 
@@ -58,7 +58,7 @@ def test_a_name_stays_within_out(recipe: Recipe, name: str) -> None:
 
 
 def test_every_kind_of_experiment_claims_its_folder(tmp_path: Path) -> None:
-    settings = DenoiserSweep(data=["demo:test"], count=1, crop=32, isos=[400], denoisers=[], out=str(tmp_path))
+    settings = Ablation(data="demo:train", out=str(tmp_path))
     claim(settings)
-    with pytest.raises(ValueError, match=r"denoisers: holds a run with other settings \(isos"):
-        sweep(replace(settings, isos=[400, 800]))
+    with pytest.raises(ValueError, match=r"ablation: holds a run with other settings \(count"):
+        ablate(replace(settings, count=3))
