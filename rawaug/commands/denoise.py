@@ -28,13 +28,13 @@ from rawaug import bayer
 from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import (
     FrameDenoiser,
-    NetworkDenoiser,
     Noise,
     Shots,
     UnknownNoise,
     as_json,
     frame_denoiser,
     levels_of,
+    network_denoiser,
     stored_noise,
 )
 from rawaug.commands.pair_maker import require_same_settings
@@ -184,7 +184,7 @@ def denoise_file(
 
 
 def _made(method: FrameDenoiser | str | Path) -> FrameDenoiser:
-    return NetworkDenoiser(method) if isinstance(method, (str, Path)) else method
+    return network_denoiser(method) if isinstance(method, (str, Path)) else method
 
 
 def _checked(strength: float, method: FrameDenoiser) -> float:

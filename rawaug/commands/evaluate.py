@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +19,7 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned, Pair
+from rawaug.evaluation.contestants import require_mosaic
 from rawaug.evaluation.own_noise import own_noise_note, own_variances, with_own_noise
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.psnr_r import psnr_r
@@ -30,7 +32,6 @@ from rawaug.evaluation.scores import (
     require_classical,
     require_numbers,
     row_of,
-    score_classical,
     score_method,
     summary,
 )
@@ -58,7 +59,7 @@ def run(
     report: str | None = None,
     json: str | None = None,
     settings: Annotated[PairSettings, OPTIONS] | None = None,
-) -> None:
+) -> dict[str, Any]:
     """Measure PSNR and SSIM of a denoiser or an ISP.
 
     Args:
@@ -76,132 +77,104 @@ def run(
         json: write the result as JSON to this file.
         settings: of pairs:PATH.
 
+    Returns:
+        What ``--json`` writes.
+
     Raises:
         FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
             is for denoisers and the file is an ISP's, no frame can be read, or a result is not finite.
     """
+    for path in filter(None, (json, report)):
+        require_writable(path)
+    require_classical(classical or ())
+    where, file = find_device(device), find_weights(weights, FOLDER)
+    kind = read_header(file)["kind"]
+    if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
+        options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
+        raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
+    frames = open_pairs(data, split="test", **vars(settings or PairSettings()))
+    pairs = Readable(frames if bin == 1 else Binned(frames, bin))
+    about = {"kind": kind, "data": data, "weights_sha256": sha256(file), "version": __version__}
+    about |= {} if bin == 1 else {"bin": bin}
 
-    def written(result: dict[str, Any]) -> None:
+    def written(found: dict[str, Any]) -> dict[str, Any]:
+        result = about | found | ({"broken": pairs.reasons()} if pairs.broken else {})
         print_scores(result)
         if json:
             write_json(result, json)
+        return result
 
-    if json:
-        require_writable(json)
-    more = {"first": written, "bin": bin, **vars(settings or PairSettings())}
-    result = evaluate(weights, data, self_ensemble, noise, seed, classical or (), device, report, views, **more)
-    written(result)
-    if note := own_noise_note({"the denoiser": result, **result.get("classical", {})}):
-        print(note)
-    if report:
-        print(f"page: {report}")
-    require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
-
-
-def evaluate(
-    weights: str | Path,
-    data: str | Sequence[Pair],
-    self_ensemble: bool = False,
-    noise: NoiseSpec | None = None,
-    seed: int = 0,
-    classical: Sequence[Spec] = (),
-    device: str = "cpu",
-    report: str | Path | None = None,
-    views: Literal[4, 8] | None = None,
-    first: Callable[[dict[str, Any]], None] | None = None,
-    bin: int = 1,
-    **settings: Any,
-) -> dict[str, Any]:
-    """The JSON object that ``rawaug evaluate --json`` writes; arguments as in :func:`run`.
-
-    Args:
-        data: as in the command, or pairs.
-        first: called with the result without self-ensemble and classical denoisers where these are still to come.
-        bin: of the frames, by colour site, see :func:`rawaug.data.open_pairs`; for denoisers.
-        settings: of ``pairs:PATH``, see :class:`rawaug.data.PairFolder`.
-    """
-    require_classical(classical)
-    where = find_device(device)
-    if report is not None:
-        require_writable(report)
-    weights = find_weights(weights, FOLDER)
-    kind = read_header(weights)["kind"]
-    frames = open_pairs(data, split="test", **settings)
-    pairs = Readable(frames if bin == 1 else Binned(frames, bin))
-    data = data if isinstance(data, str) else f"{len(pairs)} pairs"
-    about = {"kind": kind, "data": data}, {"weights_sha256": sha256(weights), "version": __version__}
     if kind == "isp":
-        if self_ensemble or views or noise is not None or classical or report is not None or bin != 1:
-            options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
-            raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
-        isp = DictionaryISP.from_pretrained(weights)
-        frames = progress(pairs, label="evaluate", unit="image")
-        result = summary([_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames])
+        result = written(_reconstruction(DictionaryISP.from_pretrained(file), pairs))
     else:
-        scoring = _Scoring(weights, pairs, noise, seed, where)
-        result = scoring.plain() | ({} if bin == 1 else {"bin": bin})
-        own = own_variances(frames, pairs.kept(), scoring.levels, seed, bin)
-        result = with_own_noise(result, own)
-        ensemble = views or (8 if self_ensemble else 1)
-        if first is not None and (ensemble > 1 or classical):
-            first({**about[0], **result, **about[1]})
-        if ensemble > 1:
-            result = with_own_noise(scoring.with_views(ensemble, result), own)
-        if classical:
-            found = score_classical(classical, pairs, scoring.levels, scoring.cfa, seed)
-            result["classical"] = {name: with_own_noise(scores, own) for name, scores in found.items()}
-        if report is not None:
-            runs = {"plain": result.get("plain", result), **({"self_ensemble": result} if ensemble > 1 else {})}
-            facts = {"Noise": scoring.named, "Seed": str(seed)}
-            results = {weights.stem: [runs]}
-            page = Page.of_scores(f"{weights.stem} on {data}", results, result.get("classical", {}), facts)
-            scoring.add_frames(page, classical)
-            page.write(Path(report), {"weights": str(weights), "data": data, "noise": noise, "seed": seed})
-    if pairs.broken:
-        result["broken"] = pairs.reasons()
-    return {**about[0], **result, **about[1]}
+        test = _Test(file, pairs, noise, seed, where, classical or ())
+        result = written(test.result(frames, bin, views or (8 if self_ensemble else 1), written))
+        if note := own_noise_note({"the denoiser": result, **result.get("classical", {})}):
+            print(note)
+        if report:
+            about_page = {"weights": weights, "data": data, "noise": noise, "seed": seed}
+            print(f"page: {test.page(data, result).write(Path(report), about_page)}")
+    require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
+    return result
 
 
-class _Scoring:
-    """A denoiser on the frames, as it is tested."""
+def _reconstruction(isp: DictionaryISP, pairs: Readable) -> dict[str, Any]:
+    """The summary of an ISP."""
+    frames = progress(pairs, label="evaluate", unit="image")
+    return summary([_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames])
+
+
+class _Test:
+    """A denoiser on frames, beside classical filters."""
 
     def __init__(
-        self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: torch.device
+        self,
+        weights: Path,
+        pairs: Readable,
+        noise: NoiseSpec | None,
+        seed: int,
+        device: torch.device,
+        classical: Sequence[Spec],
     ) -> None:
         model, info = denoisers.load(weights)
-        if model.upscale > 1:
-            raise ValueError(f"{weights}: demosaics, too; rawaug run demosaic --denoiser.start {weights} scores it")
-        self.name = weights.stem
-        self.model, self.pairs, self.seed = model.to(device), pairs, seed
-        self.named = noise or info.get("noise", "cycleisp_sidd")
-        self.levels = noise_model(self.named)
-        self.cfa = CFA(info.get("cfa", "RGGB"))
-        self.at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+        require_mosaic(weights, model)
+        self.name, self.pairs, self.seed = weights.stem, pairs, seed
+        self.noise = noise or info.get("noise", "cycleisp_sidd")
+        self.levels, self.cfa = noise_model(self.noise), CFA(info.get("cfa", "RGGB"))
+        at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
+        self.network = partial(network_method, model.to(device), self.cfa, at_test=at_test)
+        self.filters = {label_of(spec): classical_method(spec, self.levels, seed) for spec in classical}
 
-    def plain(self) -> dict[str, Any]:
-        """The summary without self-ensemble."""
-        return {"self_ensemble": False, "seed": self.seed, **self._summary(1, "evaluate")}
+    def result(
+        self, frames: Sequence[Pair], factor: int, views: int, first: Callable[[dict[str, Any]], Any]
+    ) -> dict[str, Any]:
+        """The scores; of several views, with those of a single one as ``plain``."""
+        found = self.scores(self.network(), "evaluate")
+        own = own_variances(frames, self.pairs.kept(), self.levels, self.seed, factor)
+        plain = with_own_noise(found, own)
+        result = {"self_ensemble": False, "seed": self.seed, **plain}
+        if views > 1 or self.filters:
+            first(result)
+        if views > 1:
+            found = with_own_noise(self.scores(self.network(views=views), f"evaluate, {views} views"), own)
+            result = {"self_ensemble": True, "seed": self.seed, "views": views, "plain": plain, **found}
+        filters = {name: with_own_noise(self.scores(method, name), own) for name, method in self.filters.items()}
+        return result | ({"classical": filters} if filters else {})
 
-    def with_views(self, views: int, plain: dict[str, Any]) -> dict[str, Any]:
-        """The summary of the average over ``views``; the one without is under ``plain``."""
-        several = {"self_ensemble": True, "seed": self.seed, "views": views}
-        without = {key: value for key, value in plain.items() if key not in several}
-        return {**several, "plain": without, **self._summary(views, f"evaluate, {views} views")}
+    def scores(self, method: Method, label: str) -> dict[str, Any]:
+        """The summary of a method."""
+        scored = score_method(method, self.pairs, self.levels, self.cfa, self.seed, label)
+        return summary([_finite(score) for score, *_ in scored])
 
-    def method(self, views: int = 1) -> Method:
-        """The denoiser, as what scores and pictures call."""
-        return network_method(self.model, self.cfa, views=views, at_test=self.at_test)
-
-    def add_frames(self, page: Page, classical: Sequence[Spec]) -> None:
-        """Pictures of some frames: noisy, denoised by each filter and by the denoiser, clean."""
-        methods = {label_of(spec): classical_method(spec, self.levels, self.seed) for spec in classical}
-        methods[self.name] = self.method()
+    def page(self, data: str, result: Mapping[str, Any]) -> Page:
+        """The scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
+        runs = {"plain": result.get("plain", result)} | ({"self_ensemble": result} if "plain" in result else {})
+        facts = {"Noise": self.noise, "Seed": str(self.seed)}
+        page = Page.of_scores(f"{self.name} on {data}", {self.name: [runs]}, result.get("classical", {}), facts)
+        methods = {**self.filters, self.name: self.network()}
         for pair in shown_on_page(self.pairs.kept()):
             page.add_frame(row_of(methods, pair, self.levels, self.cfa, self.seed), self.cfa)
-
-    def _summary(self, views: int, label: str) -> dict[str, Any]:
-        scored = score_method(self.method(views), self.pairs, self.levels, self.cfa, self.seed, label)
-        return summary([_finite(score) for score, *_ in scored])
+        return page
 
 
 def _finite(score: Score) -> Score:

@@ -7,22 +7,21 @@ packed RAW and its noise map shot_var max(y, 0) + read_var, a filter the same RA
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import Stabilised
 from denoisers.files import DEFAULT, JOINT, find
-from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Sample
+from rawaug.data.pairs import NoisyBlock, Sample
 from rawaug.evaluation.contestants import load_network
 from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
@@ -179,93 +178,53 @@ FILTER_TILE, FILTER_OVERLAP = 512, 32
 """Packed pixels; the filters look 8 pixels around, and BM3D 20."""
 
 
-class Frame(Protocol):
-    """What is denoised: the mosaic ``(1, H, W)`` of a RAW file, or of a block of one."""
+@dataclass(frozen=True)
+class FrameDenoiser:
+    """Denoises the mosaic of a frame, given its noise levels.
 
-    @property
-    def mosaic(self) -> Tensor: ...
+    Args:
+        run: packed RAW ``(1, 4, h, w)``, its levels and its CFA to what is denoised, packed or full colour.
+        settings: what the result depends on besides the frame and its levels, as JSON.
+        reads_levels: whether the levels are used.
+        linear: whether the result is full colour.
+    """
 
-    @property
-    def cfa(self) -> CFA: ...
+    run: Callable[[Tensor, tuple[float, float], CFA], Tensor]
+    settings: dict[str, Any]
+    reads_levels: bool = True
+    linear: bool = False
 
-
-class FrameDenoiser(Protocol):
-    """Denoises the mosaic of a frame, given its noise levels."""
-
-    @property
-    def reads_levels(self) -> bool:
-        """Whether the levels are used."""
-
-    @property
-    def linear(self) -> bool:
-        """Whether the result is full colour."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What the result depends on besides the frame and its levels, as JSON."""
-
-    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: RawFrame | NoisyBlock, levels: tuple[float, float]) -> Tensor:
         """float32 ``(1, H, W)``, of full colour ``(3, H, W)``, on the CPU, at most 1, not clipped at black."""
+        denoised = self.run(bayer.pack(frame.mosaic[None], frame.cfa), levels, frame.cfa)
+        image = denoised if self.linear else bayer.unpack(denoised, frame.cfa)
+        return image[0].clamp(max=1.0)
 
 
-class NetworkDenoiser:
+def network_denoiser(weights: str | Path, self_ensemble: bool = False, device: str = "auto") -> FrameDenoiser:
     """A trained network, by its file or the name of a shipped one."""
+    where, path = find_device(device), find(weights)
+    model, info = load_network(path)
+    model = model.to(where, memory_format=torch.channels_last)
+    own, views = CFA(info.get("cfa", "RGGB")), 8 if self_ensemble else 1
 
-    def __init__(self, weights: str | Path, self_ensemble: bool = False, device: str = "auto") -> None:
-        where, path = find_device(device), find(weights)
-        model, info = load_network(path)
-        self.model = model.to(where, memory_format=torch.channels_last)
-        self.cfa, self.self_ensemble = CFA(info.get("cfa", "RGGB")), self_ensemble
-        self.settings: dict[str, Any] = {"denoiser_sha256": sha256(path), "self_ensemble": self_ensemble}
+    def run(packed: Tensor, levels: tuple[float, float], cfa: CFA) -> Tensor:
+        return denoise(model, Sample(packed, packed, bayer.noise_variance(packed, *levels)), cfa, views, own)
 
-    @property
-    def reads_levels(self) -> bool:
-        """Whether the network has a noise map or a variance-stabilising transform."""
-        return self.model.reads_variance
-
-    @property
-    def linear(self) -> bool:
-        """Whether the network demosaics, too."""
-        return self.model.upscale > 1
-
-    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
-        """See :class:`FrameDenoiser`."""
-        return denoise_mosaic(self.model, self.cfa, frame, levels, self.self_ensemble)
+    settings = {"denoiser_sha256": sha256(path), "self_ensemble": self_ensemble}
+    return FrameDenoiser(run, settings, model.reads_variance, model.upscale > 1)
 
 
-def denoise_mosaic(
-    model: Denoiser, cfa: CFA, frame: Frame, levels: tuple[float, float], self_ensemble: bool = False
-) -> Tensor:
-    """The frame's mosaic, or full colour, by a network trained on mosaics of ``cfa``; see :class:`FrameDenoiser`."""
-    height, width = frame.mosaic.shape[-2:]
-    rows, columns = frame.cfa.shift_to(cfa)
-    packed = bayer.pack(F.pad(frame.mosaic[None], (columns, columns, rows, rows), mode="reflect"), cfa)
-    shot_var, read_var = levels
-    variance = bayer.noise_variance(packed, shot_var, read_var)
-    denoised = denoise(model, Sample(packed, packed, variance), cfa, 8 if self_ensemble else 1)
-    image = denoised[0] if model.upscale > 1 else bayer.unpack(denoised, cfa)[0]
-    return image[..., rows : rows + height, columns : columns + width].clamp(max=1.0)
-
-
-class ClassicalDenoiser:
+def filter_denoiser(spec: Spec) -> FrameDenoiser:
     """A classical filter of :data:`rawaug.registry.FILTERS`, which needs no training."""
+    require_classical([spec])
+    stabilised = Stabilised(FILTERS.make(spec), anscombe)
 
-    reads_levels, linear = True, False
+    def run(packed: Tensor, levels: tuple[float, float], _: CFA) -> Tensor:
+        tile = partial(stabilised, shot_var=levels[0], read_var=levels[1])
+        return denoisers.tiled(tile, packed, None, FILTER_TILE, FILTER_OVERLAP, counted("tile"))
 
-    def __init__(self, spec: Spec) -> None:
-        require_classical([spec])
-        self.filter = FILTERS.make(spec)
-        self.settings: dict[str, Any] = {"classical": spec}
-
-    def __call__(self, frame: Frame, levels: tuple[float, float]) -> Tensor:
-        """See :class:`FrameDenoiser`."""
-        packed = bayer.pack(frame.mosaic[None], frame.cfa)
-        run = partial(self._tile, levels=levels)
-        denoised = denoisers.tiled(run, packed, None, FILTER_TILE, FILTER_OVERLAP, counted("tile"))
-        return bayer.unpack(denoised, frame.cfa)[0].clamp(max=1.0)
-
-    def _tile(self, noisy: Tensor, _: Tensor | None, levels: tuple[float, float]) -> Tensor:
-        return Stabilised(self.filter, anscombe)(noisy, shot_var=levels[0], read_var=levels[1])
+    return FrameDenoiser(run, {"classical": spec})
 
 
 def frame_denoiser(
@@ -276,16 +235,16 @@ def frame_denoiser(
     linear: bool = False,
 ) -> FrameDenoiser:
     """What denoises: the network, the classical filter, or the network that is taken where neither is named."""
-    if classical is None:
-        name = denoiser or (JOINT if linear else DEFAULT)
-        network = NetworkDenoiser(name, self_ensemble, device)
-        if network.linear != linear:
+    if classical is not None:
+        if denoiser is not None or self_ensemble or linear:
             raise ValueError(
-                f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}"
-                if linear
-                else f"--denoiser {name}: demosaics too, to a linear DNG; add --linear"
+                "classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other"
             )
-        return network
-    if denoiser is not None or self_ensemble or linear:
-        raise ValueError("classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other")
-    return ClassicalDenoiser(classical)
+        return filter_denoiser(classical)
+    name = denoiser or (JOINT if linear else DEFAULT)
+    network = network_denoiser(name, self_ensemble, device)
+    if network.linear and not linear:
+        raise ValueError(f"--denoiser {name}: demosaics too, to a linear DNG; add --linear")
+    if linear and not network.linear:
+        raise ValueError(f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}")
+    return network

@@ -16,6 +16,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import pattern
 from rawaug.errors import extra
+from rawaug.explore.views import stage_pictures
 from rawaug.files import require_writable
 from rawaug.io import encode_srgb, read_picture
 from rawaug.io.pictures import MAX_PIXELS
@@ -78,21 +79,17 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
         from matplotlib.figure import Figure
 
     top, left, height, width = _centre(whole)
-    isp = augment.isp
-    srgb, frame = bayer.crop(whole, top, left, height, width)[None], (whole.shape[-2], whole.shape[-1])
-    reverse = isp.reverse(srgb, place=place_in_frame(height, width, (top, left), frame), intermediates=True)
-    panels, titles = {"sRGB x": srgb[0] / 255.0}, {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
-    for name, image in reverse.intermediates.items():
-        shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
-        panels[f"{name}: {titles[name]}"] = shown.clamp(0, 1)
-    sensor = pattern(augment.cfa)
-    raw = sensor.demosaic(sensor.mosaic(image))
-    panels[f"RAW y, {sensor.name}"] = encode_srgb(raw[0].clamp(0, 1))
+    isp, sensor = augment.isp, pattern(augment.cfa)
+    srgb, frame = bayer.crop(whole, top, left, height, width), (whole.shape[-2], whole.shape[-1])
+    place = place_in_frame(height, width, (top, left), frame)
+    setting = isp.reverse(srgb[None], place=place).params
+    panels = stage_pictures(augment, srgb, setting, place)
     generator = keyed_generator(seed, "preview")
     for k in range(count):
-        pair = augment.apply(srgb, augment.sample(srgb, generator, torch.tensor([[top, left, *frame, 0]])))
+        params = augment.sample(srgb[None], generator, torch.tensor([[top, left, *frame, 0]]))
+        pair = augment.apply(srgb[None], params)
         gains = " ".join(f"{gain:.2f}" for gain in pair.params.isp.gains[0].tolist())
-        developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), reverse.params).clamp(0, 1)
+        developed = isp.forward_pixels(sensor.demosaic(augment.mosaic(pair.clean)), setting).clamp(0, 1)
         panels[f"draw {k + 1}: gains {gains}\nmean {pair.clean.mean().item():.3f}"] = developed[0]
     columns = max(len(panels) - count, 4)
     rows = -(-len(panels) // columns)

@@ -25,7 +25,7 @@ from denoisers.files import find, shipped
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Sample
 from rawaug.errors import extra
-from rawaug.evaluation.scores import denoise
+from rawaug.evaluation.scores import denoise, require_classical
 from rawaug.files import parse_object, read_header, read_tensors
 from rawaug.noise import anscombe
 from rawaug.registry import DENOISERS, FILTERS, nearest
@@ -58,7 +58,7 @@ def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
     if ":" in spec:
         return Contestant(spec, _of_function(spec))
     if spec in shipped() or path.suffix:
-        return _of_network(spec, *_loaded(find(spec)), torch.device(device))
+        return _of_network(spec, *denoisers.load(find(spec)), torch.device(device))
     if spec in FILTERS:
         return Contestant(spec, _of_filter(spec))
     known = [*shipped(), *FILTERS]
@@ -107,42 +107,36 @@ def bf_dncnn(weights: Mapping[str, Tensor]) -> Callable[[Tensor, Tensor], Tensor
     return run
 
 
-def _loaded(path: Path) -> tuple[denoisers.Denoiser, CFA]:
-    model, info = denoisers.load(path)
-    return model, CFA(info.get("cfa", "RGGB"))
-
-
 def _of_weights(path: Path, device: torch.device) -> Contestant:
     """Of rawaug, PMRID's authors or BF-DnCNN: the tensors say which."""
     metadata, tensors = read_tensors(path, _AGAIN)
     if metadata.get("format") == "rawaug":
         arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors
-        return _of_network(arm if path.stem == "denoiser" else path.stem, *_loaded(path), device)
+        return _of_network(arm if path.stem == "denoiser" else path.stem, *denoisers.load(path), device)
     if "conv00" in tensors:
         run = bf_dncnn({name: tensor.to(device) for name, tensor in tensors.items()})
         return Contestant("BF-DnCNN", lambda noisy, variance, _: run(noisy.to(device), variance.to(device)).cpu())
     if "conv0.conv.weight" in tensors:
-        return _of_network("PMRID, published weights", published_pmrid(path), CFA.RGGB, device)
+        return _of_network("PMRID, published weights", published_pmrid(path), {}, device)
     raise ValueError(f"{path}: weights of no known denoiser; give its function as package.module:function")
 
 
-def _of_network(name: str, model: denoisers.Denoiser, own: CFA, device: torch.device) -> Contestant:
-    if model.upscale > 1:
-        raise ValueError(f"{name}: demosaics, too; rawaug run demosaic --denoiser.start {name} scores it")
-    model = model.to(device)
+def _of_network(name: str, model: denoisers.Denoiser, info: Mapping[str, Any], device: torch.device) -> Contestant:
+    require_mosaic(name, model)
+    model, own = model.to(device), CFA(info.get("cfa", "RGGB"))
     return Contestant(name, lambda noisy, variance, cfa: denoise(model, Sample(noisy, noisy, variance), cfa, own=own))
 
 
+def require_mosaic(name: object, model: denoisers.Denoiser) -> None:
+    """Refuse a network that gives full colour."""
+    if model.upscale > 1:
+        raise ValueError(f"{name}: demosaics, too; rawaug run demosaic --denoiser.start {name} scores it")
+
+
 def _of_filter(name: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
-    if reason := FILTERS.make(name).missing():
-        raise ValueError(f"{name}: {reason}")
+    require_classical([name])
     stabilised = Stabilised(FILTERS.make(name), anscombe)
-
-    def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
-        shot, read = (level.flatten() for level in levels_of(noisy, variance))
-        return stabilised(noisy, shot_var=shot, read_var=read)
-
-    return run
+    return lambda noisy, variance, _: stabilised(noisy, variance)
 
 
 class OnnxNetwork(nn.Module):

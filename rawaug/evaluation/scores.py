@@ -100,9 +100,9 @@ def denoise(
     """
     if own is not None and own != cfa:
         rows, columns = cfa.shift_to(own)
-        mosaics = (F.pad(bayer.unpack(x, cfa), (columns, columns, rows, rows), mode="reflect") for x in sample)
-        shifted = Sample(*(bayer.pack(mosaic, own) for mosaic in mosaics))
-        denoised = denoise(model, shifted, own, views, at_test=at_test)
+        mosaics = (bayer.unpack(x, cfa) for x in (sample.noisy, sample.variance))
+        noisy, variance = (bayer.pack(F.pad(x, (columns, columns, rows, rows), mode="reflect"), own) for x in mosaics)
+        denoised = denoise(model, Sample(noisy, noisy, variance), own, views, at_test=at_test)
         full_colour = denoised.shape[1] == RGB
         image = denoised if full_colour else bayer.unpack(denoised, own)
         image = image[..., rows : image.shape[-2] - rows, columns : image.shape[-1] - columns]
@@ -211,17 +211,6 @@ def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, floa
         return pair.shot_var, pair.read_var
     params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
     return (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
-
-
-def score_classical(
-    specs: Sequence[Spec], pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int
-) -> dict[str, dict[str, Any]]:
-    """The summary of each classical denoiser, by name, with its settings where it has some."""
-    methods = {label_of(spec): classical_method(spec, noise, seed) for spec in specs}
-    return {
-        name: summary([score for score, *_ in score_method(method, pairs, noise, cfa, seed, name)])
-        for name, method in methods.items()
-    }
 
 
 def label_of(spec: Spec) -> str:

@@ -84,7 +84,9 @@ def noise(drawn: Drawn) -> list[np.ndarray]:
     ramp = torch.logspace(-4, 0, 100)
     params = {name: value[None] for name, value in pair.params.noise.items()}
     law = drawn.augment.noise.variance(ramp.expand(1, 4, 1, -1), params).mean(dim=(0, 1, 2))
-    expected = _from_planes(drawn, drawn.augment.noise.variance(_as_planes(drawn, pair.clean), params))
+    layout = CFA(drawn.augment.cfa) if drawn.augment.pattern is None else CFA.RGGB  # noise models take four planes
+    clean = bayer.pack(drawn.augment.mosaic(pair.clean)[None], layout)
+    expected = bayer.unpack(drawn.augment.noise.variance(clean, params)[0], layout)
     sites = (_by_colour(drawn, raw) for raw in (pair.clean, pair.noisy, expected))
     measured = [variance_by_signal(*values) for values in zip(*sites, strict=True)]
     highest = max([float(variance.max()) for _, variance in measured if len(variance)], default=float(law[-1]))
@@ -121,21 +123,9 @@ def variance_by_signal(clean: Tensor, noisy: Tensor, expected: Tensor) -> tuple[
 
 def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
     """Values of red, green and blue sites, each ``(N,)``; of many, evenly spaced ones."""
-    if drawn.augment.pattern is None:
-        values = [raw[0].flatten(), raw[1:3].flatten(), raw[3].flatten()]
-    else:
-        planes = drawn.augment.pattern.planes(*raw.shape[-2:]) > 0
-        values = [raw[0][plane] for plane in planes]
+    mosaic = raw if len(raw) == 1 else drawn.augment.mosaic(raw)
+    values = [mosaic[0][plane > 0] for plane in bayer.pattern(drawn.augment.cfa).planes(*mosaic.shape[-2:])]
     return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
-
-
-def _as_planes(drawn: Drawn, raw: Tensor) -> Tensor:
-    """RAW as noise models take it, four planes ``(1, 4, h, w)``."""
-    return raw[None] if drawn.augment.pattern is None else bayer.pack(raw[None], CFA.RGGB)
-
-
-def _from_planes(drawn: Drawn, planes: Tensor) -> Tensor:
-    return planes[0] if drawn.augment.pattern is None else bayer.unpack(planes[0], CFA.RGGB)
 
 
 def _shown(linear: Tensor) -> np.ndarray:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment
+from markupsafe import Markup
 
 from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
@@ -53,23 +54,18 @@ _PANELS = """
 </div>
 """
 """Pictures with their titles; numbers such as 2.9e-03 stay on one line."""
-_MESSAGE = """{% if text %}<div class="message" role="alert">{{ text }}</div>{% endif %}"""
 
 
 def as_html(panels: Sequence[Panel]) -> str:
     """A grid of pictures with their titles."""
-    return _rendered(_PANELS, panels=panels)
+    templates = Environment(autoescape=True)
+    templates.filters["data_url"] = data_url
+    return templates.from_string(_PANELS).render(panels=panels)
 
 
 def message(text: str) -> str:
-    """What went wrong, or nothing."""
-    return _rendered(_MESSAGE, text=text)
-
-
-def _rendered(template: str, **values: Any) -> str:
-    templates = Environment(autoescape=True)
-    templates.filters["data_url"] = data_url
-    return templates.from_string(template).render(values)
+    """What went wrong."""
+    return str(Markup('<div class="message" role="alert">{}</div>').format(escape(text)))
 
 
 def data_url(image: np.ndarray) -> str:
@@ -100,17 +96,12 @@ def look_of(values: Mapping[str, Any]) -> Look:
         camera=_given(values["camera"]),
         light=int(light.removesuffix(" K")) if light.endswith(" K") else _given(light),
         tone=_given(values["tone"]),
-        exposure=None if values["draw_exposure"] else _number(values["exposure"]),
+        exposure=None if values["draw_exposure"] else values["exposure"],
         noise=values["noise"],
-        iso=_number(values["iso"]) if values["iso"] else None,
+        iso=values["iso"] or None,
         cfa=None if values["cfa"] == OWN else values["cfa"],
     )
     return Look(str(picture), possible(drawing), int(values["seed"] or 0))
-
-
-def _number(value: float) -> float:
-    """Whole ones as int, which are written without a point."""
-    return int(value) if value == int(value) else float(value)
 
 
 def _given(choice: str) -> str | None:
@@ -128,7 +119,7 @@ def shown(tab: str, values: Mapping[str, Any]) -> dict[str, Any]:
         return {"message": "", tab: as_html(VIEWS[tab](look)), **_code(look)}
     except (ValueError, OSError, MissingExtra) as error:
         empty: dict[str, Any] = {tab: None, "compared": ""} if tab == DENOISE else {tab: ""}
-        return {"message": message(escape(str(error))), **empty, "python": "", "command": ""}
+        return {"message": message(str(error)), **empty, "python": "", "command": ""}
 
 
 def _code(look: Look) -> dict[str, str]:
@@ -166,27 +157,29 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    isps, usual = shipped_isps(), SamplingConfig()
+    isps, usual, made = shipped_isps(), SamplingConfig(), dict[str, Any]()
     cameras = sorted(set(published_cameras().names), key=str.casefold)
+    whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():
-        picture = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", elem_id="picture")
+        made["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)
         upload = gr.UploadButton("Open your own", size="sm", elem_id="upload")
     with gr.Group():
-        isp = gr.Dropdown(isps, value=usual.isp, label="ISP", elem_id="isp")
-        camera = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", elem_id="camera")
-        light = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", elem_id="light")
-        tone = gr.Dropdown([ANY, *tones_of(usual.isp)], value=ANY, label="Tone curve", elem_id="tone")
-        draw_exposure = gr.Checkbox(True, label="Draw the exposure at random", elem_id="draw_exposure")
-        exposure = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False, elem_id="exposure")
+        made["isp"] = gr.Dropdown(isps, value=usual.isp, label="ISP")
+        made["camera"] = gr.Dropdown([ANY, *cameras], value=ANY, label="Camera", **whole)
+        made["light"] = gr.Dropdown([ANY, *(f"{k} K" for k in KELVINS), *LAMPS], value=ANY, label="Light", **whole)
+        made["tone"] = gr.Dropdown([ANY, *tones_of(usual.isp)], value=ANY, label="Tone curve", **whole)
+        made["draw_exposure"] = gr.Checkbox(True, label="Draw the exposure at random")
+        made["exposure"] = gr.Slider(-4, 1, value=0, step=0.25, label="Exposure (stops)", interactive=False)
     with gr.Group():
-        noise = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", elem_id="noise")
-        iso = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False, elem_id="iso")
-        cfa = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA", elem_id="cfa")
-        seed = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0, elem_id="seed")
-    made = locals()
-    names = ("picture", "isp", "camera", "light", "tone", "draw_exposure", "exposure", "noise", "iso", "cfa", "seed")
-    upload.upload(partial(_added, gr, choices), upload, picture, show_progress="hidden", api_visibility="private")
-    return {name: made[name] for name in names}
+        made["noise"] = gr.Dropdown(noises_of(usual.isp), value=usual.noise, label="Noise", **whole)
+        made["iso"] = gr.Number(0, label="ISO", info=_about_iso(str(usual.noise)), interactive=False)
+        made["cfa"] = gr.Dropdown([OWN, *PATTERNS], value=OWN, label="CFA")
+        made["seed"] = gr.Number(FIRST_SEED, label="Seed", precision=0, minimum=0)
+    for name, control in made.items():
+        control.elem_id = name
+    shown = {"show_progress": "hidden", "api_visibility": "private"}
+    upload.upload(partial(_added, gr, choices), upload, made["picture"], **shown)
+    return made
 
 
 def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
@@ -222,20 +215,15 @@ def _connect(gr: Any, page: Any, controls: dict[str, Any], outputs: dict[str, An
     gr.on(moved, redraw, [opened, *inputs], results, trigger_mode="always_last", **quiet)
     for name, tab in tabs.items():
         tab.select(partial(select, name), inputs, [opened, *results], **quiet)
-    tone, light, camera, iso = (controls[name] for name in ("tone", "light", "camera", "iso"))
-    controls["isp"].change(
-        partial(_fitting, gr),
-        [controls["isp"], tone, controls["noise"]],
-        [camera, light, tone, controls["noise"]],
+    isp, noise, drawn = (controls[name] for name in ("isp", "noise", "draw_exposure"))
+    fitting = [controls[name] for name in ("camera", "light", "tone", "noise")]
+    isp.change(partial(_fitting, gr), [isp, controls["tone"], noise], fitting, **quiet)
+    noise.change(
+        lambda name: gr.update(interactive=iso_range(name) is not None, info=_about_iso(name)),
+        noise,
+        controls["iso"],
         **quiet,
     )
-    controls["noise"].change(
-        lambda noise: gr.update(interactive=iso_range(noise) is not None, info=_about_iso(noise)),
-        controls["noise"],
-        iso,
-        **quiet,
-    )
-    drawn = controls["draw_exposure"]
     drawn.change(lambda on: gr.update(interactive=not on), drawn, controls["exposure"], **quiet)
 
 

@@ -1,10 +1,8 @@
 """What the page shows: pure functions from a :class:`Look` to titled pictures, in :data:`VIEWS` by the tab's name.
 
-Noisy and clean are shown pixel by pixel, of large pictures the central part. The eight draws are developed alike, by
-the setting of the first, so that cameras, lights and exposures can be seen to differ.
-
-RAW is developed quickly, by the setting of a draw backwards, x = T^-1(C^+ diag(g) d(y) / G): bilinear demosaicing d,
-gains g, colour matrix C, shading mask G and tone curve T. Of a learned tone network T is the curve of greys.
+Noisy and clean are shown pixel by pixel, of large pictures the central part. RAW is demosaiced bilinearly and developed
+by the ISP's forward pass with the setting of the draw; the eight draws are developed alike, with that of the first, so
+that cameras, lights and exposures can be seen to differ.
 """
 
 from __future__ import annotations
@@ -22,18 +20,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from denoisers.files import DEFAULT, find, load
-from denoisers.network import Denoiser
+from denoisers.network import PACKED, Denoiser
 from rawaug.bayer import CFA, pattern
 from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import denoise
 from rawaug.explore import figures
-from rawaug.explore.figures import grey_curve
 from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
+from rawaug.isp.stages import place_in_frame
 from rawaug.metrics import psnr
+from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
 from rawaug.plugin.sampling_config import draw_key
 
@@ -45,7 +42,6 @@ _WHOLE_CELLS = 12
 _THUMBNAIL = 384
 _ZOOM = (24, 36)
 _SCALE = 8
-_LEVELS = 2**14
 
 
 class Panel(NamedTuple):
@@ -58,28 +54,35 @@ class Panel(NamedTuple):
 def pair(look: Look) -> list[Panel]:
     """The noisy and the clean RAW made from the picture, developed; PSNR is that of the RAW."""
     made = drawn(look)
-    noisy, clean = _developed(made, made.pair.noisy, made.pair.clean)
-    factor = 2 if made.augment.pattern is None else 1
-    quality = psnr(*(_cropped(raw, factor)[None] for raw in (made.pair.noisy, made.pair.clean))).item()
-    return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", noisy), Panel(f"clean: {_setting(made)}", clean)]
+    noisy, clean = (_crop(raw) for raw in (made.pair.noisy, made.pair.clean))
+    quality = psnr(noisy[None], clean[None]).item()
+    shown = [_developed(made, raw) for raw in (noisy, clean)]
+    return [Panel(f"noisy: {_levels(made)}; {quality:.1f} dB", shown[0]), Panel(f"clean: {_setting(made)}", shown[1])]
 
 
 @torch.no_grad()
 def stages(look: Look) -> list[Panel]:
     """The picture between the stages of the ISP, small; linear images through the sRGB curve."""
     made = drawn(look)
-    isp, small = made.augment.isp, even_sided(_thumbnail(made.srgb))
-    setting = ISPParams(*(value[None] for value in made.pair.params.isp))
-    result = isp.reverse(small[None], setting, intermediates=True)
-    names = {f"x{stage.makes}": stage.name for stage in isp.ordered_stages}
-    panels = [Panel("sRGB x", _to_uint8(small / 255.0))]
-    image = small[None]
+    small = even_sided(_thumbnail(made.srgb))
+    shown = stage_pictures(made.augment, small, _batched(made.pair.params.isp))
+    return [Panel(title, _to_uint8(image)) for title, image in shown.items()]
+
+
+def stage_pictures(
+    augment: RawAugment, srgb: Tensor, setting: ISPParams | None, place: Tensor | None = None
+) -> dict[str, Tensor]:
+    """What the stages make of sRGB uint8 ``(3, H, W)``, by title: ``(3, H, W)`` in [0, 1] for the eye."""
+    result = augment.isp.reverse(srgb[None], setting, place=place, intermediates=True)
+    names = {f"x{stage.makes}": stage.name for stage in augment.isp.ordered_stages}
+    shown = {"sRGB x": srgb / 255.0}
+    image = srgb[None]
     for name, image in result.intermediates.items():
-        shown = image[0] if name == "x1" else encode_srgb(image[0].clamp(0, 1))
-        panels.append(Panel(f"{name}: {names[name]}", _to_uint8(shown)))
-    sensor = pattern(made.augment.cfa)
-    raw = sensor.demosaic(sensor.mosaic(image))[0]
-    return [*panels, Panel(f"RAW y: {sensor.name}, demosaiced", _to_uint8(encode_srgb(raw.clamp(0, 1))))]
+        linear = image[0].clamp(0, 1)
+        shown[f"{name}: {names[name]}"] = linear if name == "x1" else encode_srgb(linear)
+    sensor = pattern(augment.cfa)
+    mosaic = sensor.mosaic(image)
+    return shown | {f"RAW y: {sensor.name}, demosaiced": encode_srgb(sensor.demosaic(mosaic)[0].clamp(0, 1))}
 
 
 def raw(look: Look) -> list[Panel]:
@@ -87,8 +90,7 @@ def raw(look: Look) -> list[Panel]:
     made = drawn(look)
     mosaic = made.augment.mosaic(made.pair.noisy)
     sensor = pattern(made.augment.cfa)
-    top, left, *_ = _centre(mosaic, *_ZOOM)
-    near = mosaic[..., top : top + _ZOOM[0], left : left + _ZOOM[1]]
+    near = _crop(mosaic, _ZOOM)
     values = made.pair.clean.flatten()
     gains = 1.0 / values[:: max(1, len(values) // 2**14)].quantile(0.99).clamp_min(1e-3)
     coloured = sensor.planes(*near.shape[-2:]) * encode_srgb((near * gains).clamp(0, 1))
@@ -97,7 +99,7 @@ def raw(look: Look) -> list[Panel]:
         Panel("histograms", figures.histograms(made)),
     ]
     if made.augment.pattern is None:
-        for name, plane in zip(("R", "Gr", "Gb", "B"), _cropped(made.pair.noisy, 2), strict=True):
+        for name, plane in zip(("R", "Gr", "Gb", "B"), _crop(made.pair.noisy), strict=True):
             panels.append(
                 Panel(f"packed {name}", _to_uint8(encode_srgb((plane * gains).clamp(0, 1)).expand(3, -1, -1)))
             )
@@ -124,17 +126,13 @@ def noise(look: Look) -> list[Panel]:
 def draws(look: Look) -> list[Panel]:
     """Eight draws of camera, light, exposure and noise for the central part, at half size."""
     first = drawn(look)
-    develop = Development(first.augment.isp, first.pair.params.isp)
-    part = _crop(first.srgb, HEIGHT, WIDTH)
-    top, left, *_ = _centre(first.srgb, HEIGHT, WIDTH)
+    augment, part, panels = first.augment, _crop(first.srgb), []
+    top, left, *_ = _centre(first.srgb)
     place = torch.tensor([[top, left, *first.srgb.shape[-2:], 0]])
-    frame = (top // 2, left // 2, first.srgb.shape[-2] // 2, first.srgb.shape[-1] // 2)
-    augment, panels = first.augment, []
     for number in range(DRAWS):
         params = augment.sample(part[None], draw_key(look.seed, Path(look.picture).name, number), place)
-        made = augment.apply(part[None], params).map(lambda tensor: tensor[0])
-        one = Drawn(part, augment, made)
-        panels.append(Panel(f"draw {number}: {_setting(one)}; {_levels(one)}", develop(_half(one), frame)))
+        made = Drawn(part, augment, augment.apply(part[None], params).map(lambda tensor: tensor[0]))
+        panels.append(Panel(f"draw {number}: {_setting(made)}; {_levels(made)}", _developed(first, _half(made), 2)))
     return panels
 
 
@@ -148,18 +146,18 @@ def denoised(look: Look) -> list[Panel]:
     if made.augment.pattern is not None:
         raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
     cfa = CFA(made.augment.cfa)
-    noisy, clean, variance = (_cropped(x, 2)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
+    noisy, clean, variance = (_crop(x)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
     model, own = _network()
     result = denoise(model, Sample(noisy, clean, variance), cfa, own=own).clamp(max=1.0)
     before, after = (psnr(x, clean).item() for x in (noisy, result))
-    shown = [_developed_part(made, x[0]) for x in (noisy, result)]
+    shown = [_developed(made, x[0]) for x in (noisy, result)]
     return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
 
 
 def developed(look: Look) -> list[Panel]:
     """Noisy and clean as sRGB: noise in RAW, demosaiced and developed by the camera that made the RAW."""
     made = drawn(look)
-    noisy, clean = (_crop(image, HEIGHT, WIDTH) for image in (made.pair.noisy, made.pair.clean))
+    noisy, clean = (_crop(image) for image in (made.pair.noisy, made.pair.clean))
     quality = psnr(noisy[None], clean[None]).item()
     method = made.augment.targets.names[int(made.pair.params.extras["demosaicing"])]
     title = f"noisy: {_levels(made)}, demosaicing {method}; {quality:.1f} dB"
@@ -169,10 +167,10 @@ def developed(look: Look) -> list[Panel]:
 def burst(look: Look) -> list[Panel]:
     """Noisy frames of the scene from a hand that moves, each with noise of its own."""
     made = drawn(look)
-    frames, panels = _developed(made, *made.pair.noisy), []
+    panels = []
     for k, (down, right, angle) in enumerate(made.pair.params.extras["motion"].tolist()):
         moved = f"{down:+.1f} pixels down, {right:+.1f} to the right, turned by {math.degrees(angle):+.2f} degrees"
-        panels.append(Panel(f"frame {k}: {moved}", frames[k]))
+        panels.append(Panel(f"frame {k}: {moved}", _developed(made, _crop(made.pair.noisy[k]))))
     return panels
 
 
@@ -194,33 +192,6 @@ FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst
 def seen_in(tab: str, look: Look) -> Look:
     """The look as a tab shows it."""
     return replace(look, drawing=replace(look.drawing, **FORMS.get(tab, {})))
-
-
-class Development:
-    """Develops RAW of one setting."""
-
-    @torch.no_grad()
-    def __init__(self, isp: DictionaryISP, setting: ISPParams) -> None:
-        matrix = torch.linalg.pinv(setting.matrix) if isp.find(ColorCorrection) else torch.eye(3)
-        gains = setting.gains if isp.find(WhiteBalance) else torch.ones(3)
-        self.colour = matrix * gains
-        self.shading = isp.find(LensShading)
-        curve = grey_curve(isp, setting)
-        codes = np.interp(
-            np.linspace(0, 1, _LEVELS + 1), np.maximum.accumulate(curve.numpy()), np.linspace(0, 255, 256)
-        )
-        self.codes = torch.from_numpy(codes.round().astype(np.uint8))
-
-    @torch.no_grad()
-    def __call__(self, rgb: Tensor, place: tuple[int, int, int, int] | None = None) -> np.ndarray:
-        """Demosaiced RAW ``(3, H, W)`` to sRGB, uint8 ``(H, W, 3)``."""
-        height, width = rgb.shape[-2:]
-        if self.shading is not None:
-            top, left, *frame = place or (0, 0, height, width)
-            rgb = rgb / self.shading.mask(place_in_frame(height, width, (top, left), (frame[0], frame[1])))[0]
-        linear = (self.colour @ rgb.reshape(3, -1)).mul_(_LEVELS).clamp_(0, _LEVELS)
-        picture: np.ndarray = self.codes[linear.int()].T.reshape(height, width, 3).numpy()
-        return np.ascontiguousarray(picture)
 
 
 @lru_cache(maxsize=1)
@@ -250,39 +221,34 @@ def _levels(made: Drawn) -> str:
     return f"shot_var {levels['shot_var'].item():.2e}, read_var {levels['read_var'].item():.2e}"
 
 
-def _developed(made: Drawn, *packed: Tensor) -> list[np.ndarray]:
-    """The central part of RAW ``(4, h, w)``, or of mosaics, developed by its own setting."""
-    factor = 2 if made.augment.pattern is None else 1
-    return [_developed_part(made, _cropped(part, factor)) for part in packed]
+@torch.no_grad()
+def _developed(made: Drawn, part: Tensor, scale: int = 1) -> np.ndarray:
+    """The central part of RAW, or of linear RGB at 1 / ``scale`` of the size, developed by a draw's own setting."""
+    rgb = part if scale > 1 else pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
+    top, left, height, width = (place // scale for place in (*_centre(made.srgb)[:2], *made.srgb.shape[-2:]))
+    place = place_in_frame(*rgb.shape[-2:], (top, left), (height, width))
+    return _to_uint8(made.augment.isp.forward_pixels(rgb[None], _batched(made.pair.params.isp), place)[0])
 
 
-def _developed_part(made: Drawn, part: Tensor) -> np.ndarray:
-    rgb = pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
-    top, left, *_ = _centre(made.srgb, HEIGHT, WIDTH)
-    place = (top, left, made.srgb.shape[-2], made.srgb.shape[-1])
-    return Development(made.augment.isp, made.pair.params.isp)(rgb, place)
+def _batched(setting: ISPParams) -> ISPParams:
+    return ISPParams(*(value[None] for value in setting))
 
 
-def _centre(image: Tensor, height: int, width: int) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the central part of at most this size."""
-    sides = tuple(image.shape[-2:])
-    size = [min(side, most) for side, most in zip(sides, (height, width), strict=True)]
+def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the central part of at most this size, in pixels of the mosaic."""
+    scale = 2 if image.shape[-3] == PACKED else 1
+    sides = [scale * side for side in image.shape[-2:]]
+    height, width = (min(side, most) for side, most in zip(sides, size, strict=True))
     step = 2 * _WHOLE_CELLS
-    top, left = ((side - part) // step * _WHOLE_CELLS for side, part in zip(sides, size, strict=True))
-    return top, left, size[0], size[1]
+    top, left = ((side - part) // step * _WHOLE_CELLS for side, part in zip(sides, (height, width), strict=True))
+    return top, left, height, width
 
 
-def _crop(image: Tensor, height: int, width: int) -> Tensor:
-    top, left, height, width = _centre(image, height, width)
+def _crop(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
+    """The central part of a picture, a mosaic or packed RAW."""
+    scale = 2 if image.shape[-3] == PACKED else 1
+    top, left, height, width = (place // scale for place in _centre(image, size))
     return image[..., top : top + height, left : left + width]
-
-
-def _cropped(raw: Tensor, factor: int) -> Tensor:
-    """The central part of RAW whose sites are ``factor`` pixels apart in a plane."""
-    height, width = (factor * side for side in raw.shape[-2:])
-    top, left, height, width = _centre(torch.empty(height, width, device="meta"), HEIGHT, WIDTH)
-    rows, columns = slice(top // factor, (top + height) // factor), slice(left // factor, (left + width) // factor)
-    return raw[..., rows, columns]
 
 
 def _thumbnail(srgb: Tensor) -> Tensor:

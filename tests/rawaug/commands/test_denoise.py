@@ -15,10 +15,12 @@ import torch
 from torch import Tensor
 
 import denoisers
-from rawaug.bayer import CFA, mosaic, pattern
+from rawaug.bayer import CFA, mosaic, noise_variance, pack, pattern, unpack
 from rawaug.cli import main
 from rawaug.commands.denoise import denoise_file, denoise_folder, run
-from rawaug.commands.frame_denoisers import ClassicalDenoiser, denoise_mosaic, levels_of
+from rawaug.commands.frame_denoisers import frame_denoiser, levels_of
+from rawaug.data.pairs import Sample
+from rawaug.evaluation.scores import denoise
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
@@ -70,8 +72,9 @@ def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
     tmp_path: Path, bayer_dng: Dng, own: CFA, self_ensemble: bool
 ) -> None:
     frame = read_raw(shot(tmp_path / "a.dng", bayer_dng, own))
-    model = LocalMean(width=4, scales=2)
-    denoised = denoise_mosaic(model, CFA.GRBG, frame, LEVELS, self_ensemble)
+    model, packed = LocalMean(width=4, scales=2), pack(frame.mosaic[None], own)
+    sample = Sample(packed, packed, noise_variance(packed, *LEVELS))
+    denoised = unpack(denoise(model, sample, own, 8 if self_ensemble else 1, CFA.GRBG), own)[0]
     assert denoised.shape == frame.mosaic.shape
     clean = a_scene(own)
     inner = (..., slice(12, -12), slice(12, -12))
@@ -219,7 +222,7 @@ def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> 
     assert after < before / 3
     frame = read_raw(source)
     white = dataclasses.replace(frame, mosaic=clean + 0.01 * torch.randn(clean.shape))
-    rest = (ClassicalDenoiser("TotalVariation")(white, (0.0, 1e-4)) - clean).square().mean()
+    rest = (frame_denoiser(classical="TotalVariation")(white, (0.0, 1e-4)) - clean).square().mean()
     assert rest < 1e-4 / 2
 
 

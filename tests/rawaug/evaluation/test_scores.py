@@ -15,7 +15,7 @@ import torch
 import denoisers
 from rawaug.bayer import CFA
 from rawaug.cli import main
-from rawaug.commands.evaluate import evaluate
+from rawaug.commands.evaluate import run as evaluate
 from rawaug.data import Pair, demo_pairs
 from rawaug.data.pairs import Sample
 from rawaug.evaluation.scores import (
@@ -31,7 +31,6 @@ from rawaug.evaluation.scores import (
     summary,
 )
 from rawaug.evaluation.tables import print_scores
-from rawaug.files import write_json
 from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -71,8 +70,10 @@ def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest
     assert "measured *" in said and "noise levels of 1 of 2 images were measured against their clean frames" in said
 
 
-def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path, middles: list[Pair]) -> None:
-    result = evaluate(identity, "given:")
+def test_a_denoiser_that_does_nothing_scores_as_its_input(
+    identity: Path, middles: list[Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = evaluate(str(identity), data="given:")
     assert result["kind"] == "denoiser" and len(result["images"]) == 4
     assert result["psnr"] == pytest.approx(result["psnr_noisy"], abs=1e-4)
     assert result["ssim"] == pytest.approx(result["ssim_noisy"], abs=1e-5)
@@ -81,20 +82,21 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(identity: Path, middle
     assert set(result["images"][0]) == {"name", "shot_var", "read_var", *figures, *(f"{f}_noisy" for f in figures)}
     assert all(result[f"{key}_worst25"] <= result[key] <= result[f"{key}_best25"] for key in figures)
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
-    early: list[dict[str, Any]] = []
-    again = evaluate(identity, "given:", self_ensemble=True, first=early.append)
-    assert early == [result]  # known before the views are scored
+    shown: list[dict[str, Any]] = []
+    monkeypatch.setattr("rawaug.commands.evaluate.print_scores", shown.append)
+    again = evaluate(str(identity), data="given:", self_ensemble=True)
+    assert shown == [result, again]  # known before the views are scored
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
 def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path, middles: list[Pair]) -> None:
     DictionaryISP(ISPConfig(cfa="GRBG")).save(tmp_path / "isp.safetensors")
-    result = evaluate(tmp_path / "isp.safetensors", "given:")
+    figures = tmp_path / "new" / "isp.json"
+    result = evaluate(str(tmp_path / "isp.safetensors"), data="given:", json=str(figures))
     assert result["kind"] == "isp"
     assert not {"ssim", "psnr_noisy", "self_ensemble", "seed"} & set(result)
     assert len(result["weights_sha256"]) == 64 and result["version"]
-    write_json(result, tmp_path / "new" / "isp.json")
-    assert json.loads((tmp_path / "new" / "isp.json").read_text()) == result
+    assert json.loads(figures.read_text()) == result
 
 
 def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
@@ -120,14 +122,13 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
 
 def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) -> None:
     given.extend(demo_pairs("test", count=2))
-    result = evaluate(identity, "given:", classical=["Wavelet", "TotalVariation"])
+    result = evaluate(str(identity), data="given:", classical=["Wavelet", "TotalVariation"])
     for name, gain in {"Wavelet": 3.0, "TotalVariation": 2.0}.items():
         scores = result["classical"][name]
         assert scores["psnr"] > result["psnr_noisy"] + gain and scores["psnr_srgb"] > result["psnr_srgb_noisy"] + gain
         assert len(scores["images"]) == 2
-    print_scores(result)
     with pytest.raises(ValueError, match="classical filter 'Median' is unknown; use one of BM3D, NonLocalMeans"):
-        evaluate(identity, "given:", classical=["Median"])
+        evaluate(str(identity), data="given:", classical=["Median"])
 
 
 def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
@@ -150,7 +151,7 @@ def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
     identity: Path, tmp_path: Path, middles: list[Pair]
 ) -> None:
     del middles[2:]
-    result = evaluate(identity, "given:", self_ensemble=True, report=tmp_path / "new" / "page.html")
+    result = evaluate(str(identity), data="given:", self_ensemble=True, report=str(tmp_path / "new" / "page.html"))
     assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
     page = (tmp_path / "new" / "page.html").read_text()
     assert page.count("<h3>") == 2 and "Self-ensemble" in page and f"{result['psnr']:.2f}" in page
@@ -159,7 +160,7 @@ def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
 def test_what_is_for_denoisers_is_refused_for_an_isp(middles: list[Pair]) -> None:
     for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
         with pytest.raises(ValueError, match="is an ISP"):
-            evaluate("universal-small", "given:", **flags)
+            evaluate("universal-small", data="given:", **flags)
 
 
 def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -214,6 +214,14 @@ def test_every_control_changes_the_picture_and_the_code(browser: Any) -> None:
     changed(browser, "pair", before)
 
 
+def test_a_choice_that_is_typed_again_stays(browser: Any) -> None:
+    for _ in range(2):
+        picked(browser, "camera", "Nikon D750")
+    open_tab(browser, "Code")
+    assert "--camera 'Nikon D750'" in code(browser)
+    open_tab(browser, "Pair")
+
+
 def test_what_cannot_be_is_said_on_the_page(browser: Any, pictures: Path) -> None:
     alert = browser.locator("[role=alert]")
     uploaded(browser, pictures / "broken.png")

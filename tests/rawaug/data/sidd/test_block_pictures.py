@@ -11,7 +11,7 @@ from scipy.io import savemat
 from torch import Tensor
 
 from rawaug.bayer import turn
-from rawaug.commands.evaluate import evaluate
+from rawaug.commands.evaluate import run as evaluate
 from rawaug.data.sidd import blocks as sidd_blocks
 from rawaug.data.sidd.blocks import SiddBlocks, SiddPlusBlocks
 from rawaug.data.sidd.frames import SiddScene
@@ -73,7 +73,7 @@ def test_a_right_isp_scores_as_such_on_the_published_pictures(
     assert torch.equal(pairs[3].srgb, pictures[0, 3]) and torch.equal(pairs[40].srgb, pictures[1, 8]), "turned back"
     assert pairs[3].rendered and pairs[3].noisy_srgb is not None and torch.equal(pairs[3].noisy_srgb, pictures[0, 3])
     camera.save(tmp_path / "camera.safetensors")
-    assert evaluate(tmp_path / "camera.safetensors", f"sidd:{tmp_path}")["psnr"] > 70.0
+    assert evaluate(str(tmp_path / "camera.safetensors"), data=f"sidd:{tmp_path}")["psnr"] > 70.0
 
 
 def test_without_pictures_or_metadata_psnr_r_is_refused(
