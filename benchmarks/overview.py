@@ -18,7 +18,6 @@ import denoisers
 import rawaug
 from rawaug import bayer
 from rawaug.data.demo.pairs import demo_files
-from rawaug.explore.views import Development
 from rawaug.io import encode_srgb, read_picture
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
@@ -42,7 +41,6 @@ def panels() -> dict[str, Tensor]:
     model = denoisers.from_pretrained("rawaug-small")
     denoised = model(pair.noisy, pair.variance).clamp(max=1.0)
     before, after = (psnr(x, pair.clean).item() for x in (pair.noisy, denoised))
-    develop = Development(augment.isp, pair.map(lambda x: x[0]).params.isp)
     sensor = bayer.pattern(str(augment.cfa))
 
     def shown(packed: Tensor) -> Tensor:
@@ -57,12 +55,12 @@ def panels() -> dict[str, Tensor]:
         picture[:, -INSET:, :INSET] = inset
         return picture
 
-    finished = torch.from_numpy(develop(sensor.demosaic(bayer.unpack(denoised, augment.cfa))[0])).permute(2, 0, 1)
+    finished = augment.isp.forward_pixels(sensor.demosaic(bayer.unpack(denoised, augment.cfa)), pair.params.isp)
     return {
         "an sRGB picture": srgb / 255.0,
         f"clean RAW of a {CAMERA}": shown(pair.clean),
         f"noisy RAW, ISO {ISO:,}: {before:.1f} dB": shown(pair.noisy),
-        f"denoised, developed: {after:.1f} dB": finished / 255.0,
+        f"denoised, developed: {after:.1f} dB": finished[0].clamp(0, 1),
     }
 
 

@@ -94,7 +94,7 @@ def run(
         raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
     frames = open_pairs(data, split="test", **vars(settings or PairSettings()))
     pairs = Readable(frames if bin == 1 else Binned(frames, bin))
-    about = {"kind": kind, "data": data, "weights_sha256": sha256(file), "version": __version__}
+    about: dict[str, Any] = {"kind": kind, "data": data, "weights_sha256": sha256(file), "version": __version__}
     about |= {} if bin == 1 else {"bin": bin}
 
     def written(found: dict[str, Any]) -> dict[str, Any]:

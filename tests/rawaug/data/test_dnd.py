@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.commands.frame_denoisers import Frame
+from rawaug.commands.frame_denoisers import FrameDenoiser
 from rawaug.commands.submit import submit_dnd
 from rawaug.data import Dnd, check_dnd_submission, open_pairs, write_dnd_submission
 from rawaug.data.mat import read_value
@@ -77,25 +77,15 @@ def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:
     assert int(read_value(out / "0022.mat", "israw")) == 1 and read_value(out / "0022.mat", "eval_version") == "1.0"
 
 
-class Halved:
-    """Halves a mosaic, and notes what it was given."""
-
-    reads_levels = True
-    linear = False
-
-    def __init__(self) -> None:
-        self.settings: dict[str, Any] = {}
-        self.seen: list[tuple[float, float]] = []
-
-    def __call__(self, frame: Frame, levels: tuple[float, float]) -> torch.Tensor:
-        self.seen.append(levels)
-        return frame.mosaic * 0.5 - 0.01
-
-
 def test_the_command_denoises_every_box_by_its_frames_levels_and_clips(folder: Path, tmp_path: Path) -> None:
-    method = Halved()
-    assert submit_dnd(str(folder), str(tmp_path / "out"), method) == 1000
-    assert method.seen[0] == (1e-3, 1e-6) and method.seen[21 * 20] == (0.022, 1e-6)
+    seen: list[tuple[float, float]] = []
+
+    def halved(packed: torch.Tensor, levels: tuple[float, float], _: CFA) -> torch.Tensor:
+        seen.append(levels)
+        return packed * 0.5 - 0.01
+
+    assert submit_dnd(str(folder), str(tmp_path / "out"), FrameDenoiser(halved, {})) == 1000
+    assert seen[0] == (1e-3, 1e-6) and seen[21 * 20] == (0.022, 1e-6)
     box = read_value(tmp_path / "out" / "0022.mat", "Idenoised")[7]
     expected = (Dnd(folder)[21 * 20 + 7].mosaic[0].numpy() * 0.5 - 0.01).clip(0.0)
     assert np.allclose(box, expected, atol=1e-7)

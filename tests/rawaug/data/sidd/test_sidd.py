@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy.io import savemat
 
 from rawaug.bayer import CFA, mosaic, pack, turn
 from rawaug.cli import main
-from rawaug.commands.frame_denoisers import Frame
+from rawaug.commands.frame_denoisers import FrameDenoiser
 from rawaug.commands.submit import submit_sidd
 from rawaug.data import (
     SiddBenchmark,
@@ -240,38 +241,28 @@ def test_the_benchmark_and_its_submission(blocks: Path, tmp_path: Path) -> None:
         assert torch.equal(read, torch.stack([block.mosaic / 2 for block in noisy]))
 
 
-class Noted:
-    """Leaves a mosaic as it is, and notes the levels that it was given."""
-
-    reads_levels = True
-    linear = False
-
-    def __init__(self) -> None:
-        self.settings: dict[str, Any] = {}
-        self.seen: list[tuple[float, float]] = []
-
-    def __call__(self, frame: Frame, levels: tuple[float, float]) -> torch.Tensor:
-        self.seen.append(levels)
-        return frame.mosaic + (0.1 if frame.cfa == CFA.GRBG else -2.0)
-
-
 def test_the_command_takes_published_levels_or_asks_for_them(blocks: Path, tmp_path: Path) -> None:
     for file in blocks.iterdir():
         (tmp_path / file.name).symlink_to(file)
     header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
     rows = [f"{name}, {k}, 1e-4, {k}, 1e-4, {k}, 1e-4" for k, name in enumerate(HELD_BACK)]
     (tmp_path / "noise_level_functions.csv").write_text("\n".join([header, *rows]))
-    method, out = Noted(), str(tmp_path / "SubmitRaw.mat")
+    seen: list[tuple[float, float]] = []
+
+    def noted(packed: torch.Tensor, levels: tuple[float, float], cfa: CFA) -> torch.Tensor:
+        seen.append(levels)
+        return packed + (0.1 if cfa == CFA.GRBG else -2.0)
+
+    method, out = FrameDenoiser(noted, {}), str(tmp_path / "SubmitRaw.mat")
     assert submit_sidd(str(tmp_path), out, method) == 1280
-    assert [method.seen[32 * k] for k in (0, 7, 39)] == [(0.0, 1e-4), (7.0, 1e-4), (39.0, 1e-4)]
+    assert [seen[32 * k] for k in (0, 7, 39)] == [(0.0, 1e-4), (7.0, 1e-4), (39.0, 1e-4)]
     written = check_submission(out, SIDE)
     assert torch.equal(written[0], (SiddBenchmark(blocks)[0].mosaic + 0.1).clamp(0.0, 1.0)) and written[32].max() == 0.0
     with pytest.raises(
         ValueError, match=rf"{HELD_BACK[0]}: its noise cannot be estimated .* put noise_level_functions"
     ):
         submit_sidd(str(blocks), out, method)
-    method.reads_levels = False
-    assert submit_sidd(str(blocks), out, method) == 1280 and method.seen[-1] == (0.0, 0.0)
+    assert submit_sidd(str(blocks), out, replace(method, reads_levels=False)) == 1280 and seen[-1] == (0.0, 0.0)
     assert main(["submit", "zurich:here", out]) == 2 and main(["submit", "sidd:", out]) == 2
 
 
