@@ -33,7 +33,7 @@ from rawaug import bayer
 from rawaug.data.demo.pairs import demo_photographs
 from rawaug.isp.fast import FastForward
 from rawaug.isp.model import DictionaryISP
-from rawaug.paper.baselines.cycleisp import CycleISP
+from rawaug.paper.baselines.networks import CycleISP
 from rawaug.paper.baselines.upi import UPI, unprocess_pixels
 from rawaug.plugin.augment import RawAugment
 

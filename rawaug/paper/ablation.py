@@ -5,9 +5,8 @@ luminance Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of C
 frame's as-shot gains and blind. And the other way round: fits that lack one stage.
 
 *Learned parts*: encoders, end-to-end training, the loss on the images between the stages and that on the weights'
-consistency ("Training" in the paper) are switched off one by one. Each seed draws its own frames: photographs, cameras
-in turn, lights, and which photographs are left out; all variants of a seed share them, so that differences are within a
-seed. Each fit's figures go into a file of their own, so that a stopped run can resume.
+consistency are switched off one by one. Each seed draws its own photographs, lights and left-out frames, which all
+variants share. Each fit's figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -90,20 +89,22 @@ def ablate(ablation: Ablation, overwrite: bool = False) -> dict[str, Any]:
     if len(pairs) < 2:
         raise ValueError(f"data: {ablation.data} has {len(pairs)} frame; leave-one-out needs two or more")
     config, folder = replace(ablation.fit, seed=ablation.seed), claim(ablation, overwrite)
-    stagewise: dict[str, list[list[list[float]]]] = {"blind": [], "as-shot gains": []}
-    without: dict[str, list[float]] = {"none": [], **{stage: [] for stage in LEFT_OUT}}
-    for left_out in progress(pairs, label="ablation", unit="frame"):
-        curves, values = measure([pair for pair in pairs if pair is not left_out], left_out, config)
-        for given, curve in curves.items():
-            stagewise[given].append(curve)
-        for stage, value in values.items():
-            without[stage].append(value)
-    means = {given: torch.tensor(curves).mean(0).tolist() for given, curves in stagewise.items()}
-    result = {"settings": asdict(ablation), "stages": means, "without": {k: fmean(v) for k, v in without.items()}}
+    every = [
+        measure([pair for pair in pairs if pair is not left_out], left_out, config)
+        for left_out in progress(pairs, label="ablation", unit="frame")
+    ]
+    means = {given: torch.tensor([curves[given] for curves, _ in every]).mean(0).tolist() for given in every[0][0]}
+    without = {stage: fmean(values[stage] for _, values in every) for stage in every[0][1]}
+    result = {"settings": asdict(ablation), "stages": means, "without": without}
     write_json(result, folder / "ablation.json")
     picture = folder / "ablation.png"
     _draw(result, picture, f"{ablation.data}: {len(pairs)} frames, each left out")
-    _print_stages(result)
+    sections = [
+        [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
+        for given, rows in means.items()
+    ]
+    print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
+    print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))
     print(f"picture: {picture}")
     return result
 
@@ -126,15 +127,16 @@ def measure(
 def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list[float]]:
     """PSNR of x, x1 ... x5 (a stage that is left out repeats the one before) in RGB, Y and UV: 6 rows of 3."""
     srgb, raw, place, known = _comparable(pair)
-    params = conditioning.with_white_balance(
-        isp, isp.choose(pair.srgb[None]), pair.white_balance if white_balance else None, None
-    )
+    given = pair.white_balance if white_balance else None
+    params = conditioning.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
     seen: dict[str, Tensor] = {}
     isp.reverse_pixels(srgb, params, place, seen)
     rows, image = [], srgb
     for name in ("x", "x1", "x2", "x3", "x4", "x5"):
         image = seen.get(name, image)
-        rows.append(_in_spaces(image, raw, known))
+        difference = (image - raw).permute(1, 0, 2, 3)[:, known[:, 0]]
+        yuv = torch.tensor(YUV) @ difference
+        rows.append([_decibels(difference), _decibels(yuv[:1]), _decibels(yuv[1:])])
     return rows
 
 
@@ -148,12 +150,6 @@ def _comparable(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     place = place_in_frame(*pair.raw.shape[-2:])[picked]
     srgb = as_float(pair.srgb[None])[picked]
     return srgb, raw, place, (srgb.amax(1, keepdim=True) < 0.98) & (raw.amax(1, keepdim=True) < 0.98)
-
-
-def _in_spaces(image: Tensor, raw: Tensor, known: Tensor) -> list[float]:
-    difference = (image - raw).permute(1, 0, 2, 3)[:, known[:, 0]]
-    yuv = torch.tensor(YUV) @ difference
-    return [_decibels(difference), _decibels(yuv[:1]), _decibels(yuv[1:])]
 
 
 def _decibels(difference: Tensor) -> float:
@@ -182,15 +178,6 @@ def _draw(result: dict[str, Any], path: Path, title: str) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _print_stages(result: dict[str, Any]) -> None:
-    sections = [
-        [[f"{given}, {space}", *(f"{row[k]:.2f}" for row in rows)] for k, space in enumerate(SPACES)]
-        for given, rows in result["stages"].items()
-    ]
-    print_rows("PSNR against RAW after each stage (dB), frames left out", ["given, space", *TITLES], *sections)
-    print("PSNR_r without a stage:", ", ".join(f"{stage} {value:.2f}" for stage, value in result["without"].items()))
-
-
 CAMERAS = (
     *("Canon EOS 5D Mark III", "Nikon D750", "Sony ILCE-7M3", "Fujifilm X-T3", "Panasonic DC-GH5"),
     *("Olympus E-M1 Mark II", "Pentax K-3", "Samsung Galaxy S7"),
@@ -198,12 +185,8 @@ CAMERAS = (
 PIXELS = 8192
 """Of a frame on which the forward pass is scored."""
 COLUMNS = {
-    "psnr_r": "PSNR_r",
-    "worst25": "worst 25%",
-    "as_shot": "as-shot gains",
-    "forward": "RAW to sRGB",
-    "cycle": "cycle",
-}
+    "psnr_r": "PSNR_r", "worst25": "worst 25%", "as_shot": "as-shot gains", "forward": "RAW to sRGB", "cycle": "cycle",
+}  # fmt: skip
 
 
 @dataclass
@@ -268,12 +251,21 @@ def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> di
             found[name].append(variant_scores(place, config, frames, left_out))
     rows = {name: _row(runs) for name, runs in found.items()}
     write_json({"settings": asdict(learned), "rows": rows}, folder / "table.json")
-    _print_components(rows, learned)
+    title = (
+        f"{learned.name}: fitted to {learned.frames} frames of {len(learned.cameras)} cameras, scored on "
+        f"{learned.left_out} others, seeds: {learned.seeds}; dB"
+    )
+    first, cells = next(iter(rows.values())), []
+    for name, row in rows.items():
+        apart = [a - b for a, b in zip(row["psnr_r"], first["psnr_r"], strict=True)]
+        figures = [mean_and_spread(row[key], 2) for key in COLUMNS]
+        cells.append([name, *figures, "" if row is first else mean_and_spread(apart, 2)])
+    print_rows(title, ["fit", *COLUMNS.values(), "PSNR_r beside the first"], cells)
     return rows
 
 
 def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:
-    """As many as are needed, in a random order, of those that hold a frame; ValueError if there are fewer."""
+    """As many as are needed of those that hold a frame, in a random order."""
     order = torch.randperm(len(pictures), generator=keyed_generator(seed, "photographs")).tolist()
     large = (p for p in (pictures[k] for k in order) if p.shape[-2] >= FRAME[0] and p.shape[-1] >= FRAME[1])
     chosen = list(islice(large, learned.frames + learned.left_out))
@@ -318,17 +310,3 @@ def _row(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
     means = {key: [fmean(run[key]) for run in runs] for key in COLUMNS if key != "worst25"}
     worst = [worst_and_best_quarter(run["psnr_r"])[0] for run in runs]
     return means | {"worst25": worst, "joint": [run["joint"] for run in runs], "parameters": runs[0]["parameters"]}
-
-
-def _print_components(rows: dict[str, dict[str, Any]], learned: ComponentAblation) -> None:
-    first = next(iter(rows.values()))
-    cells = []
-    for name, row in rows.items():
-        apart = [a - b for a, b in zip(row["psnr_r"], first["psnr_r"], strict=True)]
-        figures = [mean_and_spread(row[key], 2) for key in COLUMNS]
-        cells.append([name, *figures, "" if row is first else mean_and_spread(apart, 2)])
-    title = (
-        f"{learned.name}: fitted to {learned.frames} frames of {len(learned.cameras)} cameras, scored on "
-        f"{learned.left_out} others, seeds: {learned.seeds}; dB"
-    )
-    print_rows(title, ["fit", *COLUMNS.values(), "PSNR_r beside the first"], cells)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import singledispatch
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -74,7 +73,7 @@ class DownstreamConfig:
 
 
 class DownstreamScore(NamedTuple):
-    """PSNR in dB, in RAW and developed to sRGB."""
+    """PSNR in dB."""
 
     psnr: float
     psnr_srgb: float
@@ -93,7 +92,7 @@ def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConf
 
 
 def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) -> Denoiser:
-    """A denoiser trained on these samples, and watched by others of them."""
+    """A denoiser trained on these samples."""
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
     drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
     watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
@@ -111,14 +110,10 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     return mean_of(scores)
 
 
-@singledispatch
 def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
-    return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
-
-
-@_crops.register
-def _(model: DictionaryISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
-    """By the plugin, so that each crop keeps its place in its frame."""
+    if not isinstance(model, DictionaryISP):
+        return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
+    # The plugin keeps each crop's place in its frame.
     augment = RawAugment(model, noise, exposure=None if model.config.cameras else config.exposure)
     return PictureCrops(RawPairs(pictures, augment, config.train.crop))
 
@@ -139,7 +134,6 @@ class MadeCrops:
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> Sample:
-        """One crop of a random picture."""
         picture = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
         patch = bayer.RandomTurn(self.cfa, keep_cfa=False)(self.crop(picture, generator), generator)
         clean = bayer.pack(self.make(as_float(patch[None]), generator).clamp(0.0, 1.0), self.cfa)

@@ -32,22 +32,18 @@ from rawaug.isp.dictionary import plausible
 from rawaug.seeding import keyed_generator
 
 LIGHTS_TRIED = 32
-STOPS = 1.0
-CONTRAST = 0.5
-SATURATION = 1.3
+STOPS, CONTRAST, SATURATION = 1.0, 0.5, 1.3
 LUMA = (0.2126, 0.7152, 0.0722)
 
 
 def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
     """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own."""
-    published = published_cameras()
-    matrices = published.named(cameras)
+    matrices = published_cameras().named(cameras)
     frames = []
     for k, picture in enumerate(pictures):
-        generator = keyed_generator(seed, "varied frame", part, k)
         which = k % len(cameras)
         name = f"{part}_{k:03d}_{cameras[which].replace(' ', '-')}"
-        frames.append(_frame(picture, matrices[which], generator, name))
+        frames.append(_frame(picture, matrices[which], keyed_generator(seed, "varied frame", part, k), name))
     return frames
 
 
@@ -74,14 +70,12 @@ def _scene(picture: Tensor, generator: torch.Generator, name: str) -> Tensor:
 
 
 def overexposed(pair: Pair) -> Pair:
-    """The frame with :data:`STOPS` more light."""
     factor = 2.0**STOPS
     picture = encode_srgb((factor * decode_srgb(pair.srgb.float() / 255.0)).clamp(max=1.0))
     return replace(pair, srgb=_as_8_bits(picture), raw=(factor * pair.raw).clamp(max=1.0))
 
 
 def retouched(pair: Pair) -> Pair:
-    """The frame with an edited picture."""
     x = pair.srgb.float() / 255.0
     x = x + CONTRAST * (3.0 * x**2 - 2.0 * x**3 - x)
     luma = (torch.tensor(LUMA).reshape(3, 1, 1) * x).sum(0, keepdim=True)

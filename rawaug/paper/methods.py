@@ -8,11 +8,10 @@ The oracle is the setting of an ISP that comes closest to a frame's RAW,
 
 .. math:: \min_{w, v, g} \; \log \bigl( \| y - f^{-1}(x; w, v, g) \|^2 / P + \epsilon \bigr)
 
-over the weights of the atoms and, for an ISP of published cameras, the gains, which there follow from any light. The
-problem is convex in each of the three alone, not in all of them, so that descent starts where alternating least squares
-end (:mod:`rawaug.isp.conditioning`), with all P pixels for readings. A fitted ISP's gains stay within the hull of its
-own, and descent starts from the middle of the hulls. The settings of rows that know less are compared as well: none of
-them is better than the oracle.
+over the weights of the atoms and, for an ISP of published cameras, the gains, which there follow from any light.
+Descent starts where alternating least squares end (:mod:`rawaug.isp.conditioning`), with all P pixels for readings. A
+fitted ISP's gains stay within the hull of its own, and descent starts from the middle of the hulls. The settings of
+rows that know less are compared as well: none of them is better than the oracle.
 
 InvISP's figure on MIT-Adobe FiveK is the PSNR of demosaiced, white-balanced and gamma-compressed RAW,
 
@@ -30,7 +29,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial, singledispatch
+from functools import singledispatch
 from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean
@@ -61,8 +60,6 @@ SAMPLES = 64
 
 
 class Fitted(NamedTuple):
-    """A fitted family."""
-
     model: ReverseISP
     seconds: float
     parameters: int
@@ -112,10 +109,7 @@ def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, training: 
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
-    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass.
-
-    An unregistered pair is scored over blocks, by methods that do not learn by descent.
-    """
+    """PSNR_r of every row that the family fills, and the Mpix/s of the reverse pass; over blocks if unregistered."""
     pair.require_rendered()
     model = fitted.model
     if not pair.registered:
@@ -137,11 +131,11 @@ def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
 
 def _makers(model: ReverseISP, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
     """Row to the function from an sRGB patch and its place in the frame to a mosaic."""
-    return {row: partial(_made, model, setting) for row, setting in settings(model, pair).items()}
 
+    def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
+        return lambda patch, place: model.make(patch, given, place)
 
-def _made(model: ReverseISP, setting: Any, patch: Tensor, place: Tensor) -> Tensor:
-    return model.make(patch, setting, place)
+    return {row: maker(given) for row, given in settings(model, pair).items()}
 
 
 @singledispatch
@@ -180,9 +174,8 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
 
 
 def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams:
-    height, width = pair.raw.shape[-2:]
     generator = keyed_generator("raw samples", pair.name)
-    rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in (height, width))
+    rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in pair.raw.shape[-2:])
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
     return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
@@ -190,10 +183,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 
 @torch.no_grad()
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
-    """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back.
-
-    ``cycle`` goes through the mosaic; ``cycle_without_mosaic``, of the dictionary ISP, is the loss of its stages alone.
-    """
+    """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back."""
     model, through, without = fitted.model, [], []
     if not model.bidirectional:
         return {}
@@ -206,7 +196,7 @@ def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:
-    """What the mosaic and bilinear interpolation alone leave of sRGB pictures: the ceiling of a cycle through them."""
+    """What the mosaic and bilinear interpolation alone leave: the ceiling of a cycle."""
     values = [as_float(p[None]) for p in pictures]
     return fmean(psnr(bayer.demosaic(bayer.mosaic(x, cfa), cfa).clamp(0.0, 1.0), x).item() for x in values)
 

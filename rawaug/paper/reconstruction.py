@@ -53,24 +53,17 @@ from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable
 
 COLUMNS = {
-    "psnr_r": "PSNR_r",
-    "worst25": "worst 25%",
-    "best25": "best 25%",
-    "balanced": "balanced",
-    "cycle": "cycle",
-    "cycle_without_mosaic": "no mosaic",
-    "psnr_d": "PSNR_d",
-}
+    "psnr_r": "PSNR_r", "worst25": "worst 25%", "best25": "best 25%", "balanced": "balanced", "cycle": "cycle",
+    "cycle_without_mosaic": "no mosaic", "psnr_d": "PSNR_d",
+}  # fmt: skip
 
 
 def _cells(row: dict[str, Any], columns: Sequence[str]) -> list[str]:
-    def figures(name: str) -> str:
-        value = row.get(name)
-        return "" if value is None else mean_and_spread(value if isinstance(value, list) else [value], 2)
-
-    cells = [figures(name) for name in columns]
+    values = (row.get(name) or [] for name in columns)
+    listed = [value if isinstance(value, list) else [value] for value in values]
+    figures = [mean_and_spread(value, 2) if value else "" for value in listed]
     speed = "" if row["mpix_s"] is None else f"{row['mpix_s']:.3g}"
-    return [*cells, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
+    return [*figures, f"{row['parameters'] / 1e6:.3f}", f"{row['seconds']:.1f}", speed]
 
 
 def print_methods(title: str, rows: dict[str, dict[str, Any]], balanced: bool, ceiling: float) -> None:
@@ -178,7 +171,7 @@ def compare(comparison: Comparison, overwrite: bool = False) -> dict[str, dict[s
 
 
 class Table:
-    """A comparison whose data are open and checked; nothing is written yet."""
+    """A comparison whose data are open and checked."""
 
     def __init__(self, settings: Comparison) -> None:
         if settings.downstream is not None:
@@ -215,15 +208,14 @@ class Table:
         settings, longer, names = self.settings, scale != 1.0, names_of(self.scored)
         seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
         frames = range(settings.longer_frames if longer else len(self.scored))
-        folds: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
-        for seed, frame in progress(list(product(seeds, frames)), label=f"{family} x{scale:g}", unit="fit"):
-            folds[seed].append(self._fold(family, scale, seed, frame))
-        every = [fold for of_seed in folds.values() for fold in of_seed]
+        drawn = progress(list(product(seeds, frames)), label=f"{family} x{scale:g}", unit="fit")
+        every = [self._fold(family, scale, seed, frame) for seed, frame in drawn]
+        folds = [every[k : k + len(frames)] for k in range(0, len(every), len(frames))]
         speeds = [fold["mpix_s"] for fold in every if fold["mpix_s"] is not None]
         whole = {} if longer else self._whole(family)
 
         def by_seed(kind: str, row: str) -> list[list[float]]:
-            return [[fold[kind][row] for fold in of_seed] for of_seed in folds.values()]
+            return [[fold[kind][row] for fold in of_seed] for of_seed in folds]
 
         rows = {}
         for row in every[0]["rows"]:

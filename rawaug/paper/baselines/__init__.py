@@ -15,9 +15,7 @@ Parameters are those of the reverse pass at the default, published size.
 """
 
 from rawaug.paper.baselines.base import BaselineISP, Training, fit_baseline
-from rawaug.paper.baselines.cycleisp import CycleISP
-from rawaug.paper.baselines.invisp import InvISP
-from rawaug.paper.baselines.networks import InvertibleGrey, UNetISP
+from rawaug.paper.baselines.networks import CycleISP, InvertibleGrey, InvISP, UNetISP
 from rawaug.paper.baselines.upi import UPI, TunedUPI
 from rawaug.registry import BASELINES
 

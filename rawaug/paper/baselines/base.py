@@ -4,10 +4,10 @@ r"""What the methods that the dictionary ISP is compared with have in common, an
 which the mosaic keeps one channel a site. Whatever a method predicts, RAW and sRGB leave it within [0, 1]; training
 sees the values as they are.
 
-One loop fits all that learn by descent, each with its own loss, on random crops of the pairs. A step draws ``batch``
-crops from a generator keyed by the seed and the step's number. They start where the frame's CFA is that of the model,
-so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the budget, whichever of
-the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same weights.
+Networks are trained by Adam, each with its own loss, on random crops of the pairs, which start where the frame's CFA is
+that of the model, so frames of any pattern train one model. The learning rate falls to 0 by half a cosine over the
+budget, whichever of the two, seconds or steps, is further spent. Given steps alone, the same seed gives the same
+weights.
 """
 
 from __future__ import annotations
@@ -31,13 +31,16 @@ from rawaug.isp.stages import as_float
 from rawaug.progress import progress as progress_bar
 from rawaug.seeding import keyed_generator
 
+CLIP_NORM = 1.0
+"""The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
+
 
 @dataclass(frozen=True)
 class Training:
-    """How a method that learns by descent is trained.
+    """How a network is trained.
 
     Args:
-        seconds: stop after these, reading not counted; the step under way is finished.
+        seconds: stop after these; the step under way is finished.
         steps: stop after these. At least one of the two is given, and one step is done in any case.
         crop: side of the crops, even.
         batch: crops a step.
@@ -55,8 +58,7 @@ class Training:
     def spent(self, seconds: float, steps: int) -> float:
         """The part of the budget that is used up, of that limit which is nearer."""
         by_time = 0.0 if self.seconds is None or not steps else seconds / self.seconds  # one step is done in any case
-        by_steps = 0.0 if self.steps is None else steps / self.steps
-        return max(by_time, by_steps)
+        return max(by_time, 0.0 if self.steps is None else steps / self.steps)
 
 
 class BaselineISP(ReverseISP):
@@ -98,41 +100,17 @@ class BaselineISP(ReverseISP):
 
     def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
-        return bayer.mosaic(self.unprocess(checked_srgb(srgb), setting).clamp(0.0, 1.0), self.cfa)
+        return bayer.mosaic(self.unprocess(as_float(srgb), setting).clamp(0.0, 1.0), self.cfa)
 
     def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
         return self.reverse(srgb, setting)
 
     def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
         """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""
-        return self.render(checked_raw(raw), setting).clamp(0.0, 1.0)
+        return self.render(raw, setting).clamp(0.0, 1.0)
 
     def cycle(self, srgb: Tensor) -> Tensor:
         return self.forward(self.reverse(srgb))
-
-
-def checked_srgb(srgb: Tensor) -> Tensor:
-    """``(B, 3, H, W)``, uint8 or float, as float in [0, 1]."""
-    if srgb.ndim != 4 or srgb.shape[1] != 3:
-        raise ValueError(f"sRGB must have shape (B, 3, H, W), got {tuple(srgb.shape)}")
-    if srgb.dtype != torch.uint8 and not srgb.is_floating_point():
-        raise ValueError(f"sRGB must be uint8 or float in [0, 1], got {srgb.dtype}")
-    if srgb.shape[2] % 2 or srgb.shape[3] % 2:
-        raise ValueError(
-            f"a Bayer mosaic must have even sides, got sRGB of {tuple(srgb.shape[2:])}; crop a row or column"
-        )
-    return as_float(srgb)
-
-
-def checked_raw(raw: Tensor) -> Tensor:
-    """``(B, 1, H, W)`` with even sides."""
-    if raw.ndim != 4 or raw.shape[1] != 1:
-        raise ValueError(f"a mosaic must have shape (B, 1, H, W), got {tuple(raw.shape)}")
-    if raw.shape[2] % 2 or raw.shape[3] % 2:
-        raise ValueError(
-            f"a Bayer mosaic must have even sides, got {tuple(raw.shape[2:])}; crop the last row or column"
-        )
-    return raw
 
 
 class Crops(NamedTuple):
@@ -141,10 +119,6 @@ class Crops(NamedTuple):
     srgb: Tensor
     raw: Tensor
     white_balance: Tensor
-
-
-CLIP_NORM = 1.0
-"""The gradient's largest norm: short fits need high rates, at which the U-Net blows up without."""
 
 
 class CropTrainedISP(BaselineISP):
@@ -161,7 +135,6 @@ class CropTrainedISP(BaselineISP):
         """The method's own loss, a scalar, of the two directions where it has them."""
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
-        """Adam on random crops until the budget is spent; seconds begin with the first step."""
         given = [limit for limit in (training.seconds, training.steps) if limit is not None]
         if not given or min(given) <= 0:
             raise ValueError(f"give seconds or steps above 0, got {training.seconds} and {training.steps}")
@@ -199,7 +172,7 @@ def require_crops(pairs: Sequence[FramePair], side: int) -> None:
 def random_crops(
     pairs: Sequence[FramePair], cfa: CFA, training: Training, step: int, device: torch.device | str = "cpu"
 ) -> Crops:
-    """The batch of a step: crops of random pairs, in one CFA."""
+    """The batch of a step: crops of random pairs, keyed by the seed and the step."""
     generator = keyed_generator(training.seed, "baseline crops", step)
     crop = bayer.RandomCrop(training.crop)
 
@@ -217,25 +190,18 @@ Model = TypeVar("Model", bound=BaselineISP)
 
 
 def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -> Model:
-    """Fit a baseline in place; ``model.info`` records the steps, the seconds and the last loss.
+    """Fit one of :data:`rawaug.paper.baselines.BASELINES` in place; ``model.info`` records steps, seconds and loss.
 
-    UPI as published has nothing to fit: it comes back as it is, after 0 steps. Tuned UPI is solved in closed form, in
-    one step, whatever the budget.
-
-    Args:
-        model: one of :data:`rawaug.paper.baselines.BASELINES`, on any device.
-        pairs: frames; read once and kept in memory.
-        training: of methods that learn by descent.
+    UPI as published comes back as it is; tuned UPI is solved in closed form, whatever the budget.
 
     Raises:
         ValueError: if there is no budget or no pair, or a frame is smaller than a crop or not registered.
     """
-    frames = list(pairs)
-    if not frames:
+    if not pairs:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")
     start = time.perf_counter()
-    done, loss = model.learn(frames, training)
-    model.info = {"frames": [frame.name for frame in frames], "seed": training.seed, "steps": done}
+    done, loss = model.learn(pairs, training)
+    model.info = {"frames": [frame.name for frame in pairs], "seed": training.seed, "steps": done}
     model.info["seconds"] = round(time.perf_counter() - start, 2)
     if not math.isnan(loss):
         model.info["loss"] = loss

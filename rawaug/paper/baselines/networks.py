@@ -1,4 +1,4 @@
-r"""Two networks without a model of a camera: a plain U-Net, and the invertible-greyscale network.
+r"""The networks: a plain U-Net, invertible greyscale, CycleISP and InvISP.
 
 *The U-Net*, ``y = mosaic(x + U(x))``, is trained end to end with l1. The published size is 11.77 M parameters. That is
 UPI's U-Net with three channels in and out (five scales of three convolutions, 32 to 512 features, bilinear
@@ -6,39 +6,65 @@ interpolation up: 11,774,979 parameters), so the one in :mod:`denoisers.networks
 this one is concluded from the number of parameters. Source: Ronneberger et al., MICCAI 2015; Conde et al., AAAI 2022.
 
 *Invertible greyscale*, ``x = E(demosaic(y))``, ``y = mosaic(D(x))``: Xia et al. hide a colour picture in a grey one by
-an encoder E and restore it by a decoder D, trained together with the grey picture's likeness as a condition. In
-InvISP's comparison the hidden picture is the RAW and the visible one the sRGB, so E renders RAW and D goes back. E is a
-residual encoder-decoder: 3 x 3 convolutions to 64 features, 2 residual blocks, down to 128 and 256 features by strides
-of 2, 4 residual blocks, up by nearest neighbours with the finer features added, 2 residual blocks. D has 64 features
-throughout and 8 residual blocks, then 256 features, then a 1 x 1 convolution. Two things differ here, and are
-assumptions: the outputs are linear, since most of RAW is near black, where the published tanh is flat; and the losses
-are l1 of the two directions on the pairs, as for InvISP, since there is no grey picture to resemble. Source: Xia et
-al., "Invertible Grayscale", ACM TOG 37(6), 2018; Xing et al., CVPR 2021, for the use on RAW.
+an encoder E and restore it by a decoder D. In InvISP's comparison the hidden picture is the RAW and the visible one the
+sRGB. E is a residual encoder-decoder of 64, 128 and 256 features with 2, 4 and 2 residual blocks, strides of 2 down,
+nearest neighbours up, and the finer features added; D has 64 features and 8 residual blocks, then 256 features and a
+1 x 1 convolution. Two things differ here, and are assumptions: the outputs are linear, since most of RAW is near black,
+where the published tanh is flat; and the losses are l1 of the two directions, as for InvISP, since there is no grey
+picture to resemble. Source: Xia et al., "Invertible Grayscale", ACM TOG 37(6), 2018; Xing et al., CVPR 2021.
+
+*CycleISP*, ``y = mosaic(N_rgb2raw(x))`` and ``x = N_raw2rgb(pack(y), a(x'))``: three groups of five dual-attention
+blocks (:mod:`denoisers.cycleisp`) of 96 features a network. RAW has no trace of how its picture was coloured, so a
+colour branch a guides the way to sRGB: a blurred sRGB picture x' becomes a map in (0, 1) that re-weights the features.
+Loss: ``|y - y^|_1 + |log y - log y^|_1`` to RAW, ``|x - x^|_1`` to sRGB. Source: Zamir et al., CVPR 2020; sizes that
+the text leaves open (colour branch: two groups of two blocks; blur: 21 x 21, sigma 12) follow the published
+checkpoints.
+
+*InvISP*, ``x = f(r)``, ``r = f^-1(x)``, ``r = (w demosaic(y))^(1/2.2)`` with the as-shot white balance w of largest
+entry 1. f is eight blocks ``u = W v``, ``p = u_1 + F(u_23)``, ``q = u_23 exp(s(p)) + G(p)`` with the log-scale
+``s = 0.8 (2 sigmoid(H(p)) - 1)``, each of which is undone exactly. Loss: ``|f(r) - x|_1 + |f^-1(x) - r|_1``; with JPEG
+between, the second term is ``|f^-1(jpeg(f(r))) - r|_1``. Source: Xing et al., "Invertible Image Signal Processing",
+CVPR 2021; couplings of Dinh et al. (Real NVP), 1 x 1 convolutions of Kingma and Dhariwal (Glow), dense blocks of
+growth 32.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from denoisers import cycleisp
 from denoisers.network import pad_to_multiple
 from denoisers.networks import PUBLISHED_WIDTH, UNet
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.isp import stages
+from rawaug.isp.fit.samples import FramePair
+from rawaug.isp.stages import as_float
 from rawaug.paper.baselines.base import Crops, CropTrainedISP
 from rawaug.registry import BASELINES
 from rawaug.seeding import derived_seed, initialised_from
 
+BLUR_SIZE, BLUR_SIGMA = 21, 12.0
+LOG_FLOOR = 1e-3
+"""Below it CycleISP's log loss is flat: at 12 bits it is four levels above black."""
+SCALE_CLAMP = 0.8
+GAMMA = 2.2
+"""RAW is compressed before InvISP's network, as published, for its dynamic range."""
+Balance = Tensor | tuple[float, ...] | None
+
+
+def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
+
 
 @BASELINES.register("unet")
 class UNetISP(CropTrainedISP):
-    """The U-Net baseline, ``width`` features in its first scale; it has no forward pass.
-
-    Example:
-        >>> import torch
-        >>> UNetISP(width=4).reverse(torch.rand(1, 3, 10, 22)).shape
-        torch.Size([1, 1, 10, 22])
-    """
+    """The U-Net, ``width`` features in its first scale; it has no forward pass."""
 
     name = "unet"
     bidirectional = False
@@ -52,12 +78,10 @@ class UNetISP(CropTrainedISP):
         return self.network(srgb)
 
     def loss(self, crops: Crops) -> Tensor:
-        """l1 on the mosaic; there is no other direction."""
         return F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
 
 
-def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
+# -- invertible greyscale ---------------------------------------------------------------------------------------------
 
 
 class ResidualBlock(nn.Module):
@@ -101,12 +125,6 @@ class Encoder(nn.Module):
         return self.last(features)[..., : x.shape[-2], : x.shape[-1]]
 
 
-def decoder(features: int, blocks: int) -> nn.Sequential:
-    """D, sRGB to RAW."""
-    last = nn.Conv2d(4 * features, 3, 1)
-    return nn.Sequential(_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features), last)
-
-
 @BASELINES.register("invgrey")
 class InvertibleGrey(CropTrainedISP):
     """The invertible-greyscale network, one network a direction; ``blocks`` are the residual ones of the way back."""
@@ -118,7 +136,9 @@ class InvertibleGrey(CropTrainedISP):
         super().__init__(cfa)
         with initialised_from(derived_seed(seed, "baseline")):
             self.encoder = Encoder(features)
-            self.decoder = decoder(features, blocks)
+            last = nn.Conv2d(4 * features, 3, 1)
+            body = (_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features))
+            self.decoder = nn.Sequential(*body, last)
 
     @property
     def reverse_network(self) -> nn.Module:
@@ -131,6 +151,228 @@ class InvertibleGrey(CropTrainedISP):
         return self.encoder(bayer.demosaic(raw, self.cfa))
 
     def loss(self, crops: Crops) -> Tensor:
-        """l1 on the mosaic, and on sRGB."""
         reverse = F.l1_loss(bayer.mosaic(self.unprocess(crops.srgb), self.cfa), crops.raw)
         return reverse + F.l1_loss(self.render(crops.raw), crops.srgb)
+
+
+# -- CycleISP ---------------------------------------------------------------------------------------------------------
+
+
+class RGB2RAW(cycleisp.Trunk):
+    """sRGB ``(B, 3, H, W)`` to linear camera colour of the same shape."""
+
+    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
+        super().__init__(3, features, groups, blocks, reduction)
+        self.tail = nn.Sequential(_conv(features, 3))
+
+    def forward(self, srgb: Tensor) -> Tensor:
+        return self.tail(self.body(self.head(srgb)))
+
+
+class ColourBranch(cycleisp.Trunk):
+    """A picture ``(B, 3, H, W)`` to weights of features in (0, 1), ``(B, features, H/2, W/2)``."""
+
+    def __init__(self, features: int, reduction: int) -> None:
+        super().__init__(3, features, groups=2, blocks=2, reduction=reduction)
+        self.tail = nn.Sequential(_conv(features, features), nn.Sigmoid())
+
+    def forward(self, srgb: Tensor) -> Tensor:
+        from kornia.filters import gaussian_blur2d
+
+        if min(srgb.shape[-2:]) <= BLUR_SIZE // 2:
+            sides = "x".join(map(str, srgb.shape[-2:]))
+            raise ValueError(f"the colour branch needs sides larger than {BLUR_SIZE // 2} pixels, got {sides}")
+        blurred = gaussian_blur2d(srgb, BLUR_SIZE, (BLUR_SIGMA, BLUR_SIGMA), border_type="reflect")
+        return self.tail(self.body(F.max_pool2d(self.head(blurred), 2)))
+
+
+class RAW2RGB(cycleisp.Trunk):
+    """Packed RAW ``(B, 4, H/2, W/2)`` and the colour branch's weights to sRGB ``(B, 3, H, W)``."""
+
+    def __init__(self, features: int, groups: int, blocks: int, reduction: int) -> None:
+        super().__init__(4, features, groups, blocks, reduction)
+        self.tail = nn.Sequential(_conv(features, features), self.body[-1])
+        self.tail_rgb = nn.Sequential(nn.Conv2d(features, 12, 1))
+
+    def forward(self, packed: Tensor, colour: Tensor) -> Tensor:
+        features = self.body[:-1](self.head(packed))
+        features = self.body[-1](features + features * colour)
+        return F.pixel_shuffle(self.tail_rgb(self.tail(features)), 2)
+
+
+@BASELINES.register("cycleisp")
+class CycleISP(CropTrainedISP):
+    """CycleISP. To render RAW it needs a picture of the same scene whose colours it takes: ``model(raw, srgb)``."""
+
+    name = "cycleisp"
+    learning_rate = 3e-4
+
+    def __init__(
+        self,
+        cfa: CFA | str = "RGGB",
+        features: int = 96,
+        groups: int = 3,
+        blocks: int = 5,
+        reduction: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(cfa)
+        with initialised_from(derived_seed(seed, "baseline")):
+            self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
+            self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
+            self.ccm = ColourBranch(features, reduction)
+
+    @property
+    def reverse_network(self) -> nn.Module:
+        return self.rgb2raw
+
+    def unprocess(self, srgb: Tensor, setting: None = None) -> Tensor:
+        return self.rgb2raw(srgb)
+
+    def render(self, raw: Tensor, setting: Tensor | None = None) -> Tensor:
+        """As in the base class; the setting is an sRGB picture ``(B, 3, H, W)`` of the same scene, as published."""
+        if setting is None:
+            raise ValueError("cycleisp renders RAW in the colours of a picture: pass the sRGB of the same scene")
+        return self.raw2rgb(bayer.pack(raw, self.cfa), self.ccm(as_float(setting)))
+
+    def cycle(self, srgb: Tensor) -> Tensor:
+        return self.forward(self.reverse(srgb), srgb)
+
+    def loss(self, crops: Crops) -> Tensor:
+        predicted = bayer.mosaic(self.unprocess(crops.srgb), self.cfa)
+        log_predicted, log_raw = (image.clamp_min(LOG_FLOOR).log() for image in (predicted, crops.raw))
+        reverse = F.l1_loss(predicted, crops.raw) + F.l1_loss(log_predicted, log_raw)
+        return reverse + F.l1_loss(self.render(crops.raw, crops.srgb), crops.srgb)
+
+    def load_published(self, path: str | os.PathLike[str], part: str = "rgb2raw") -> None:
+        """Take the RGGB weights of a published checkpoint for a part: "rgb2raw", "raw2rgb" or "ccm", the colour branch.
+
+        Nothing in the file is run as code; errors are those of :func:`denoisers.cycleisp.load_published`.
+        """
+        cycleisp.load_published(getattr(self, part), path, part)
+
+
+# -- InvISP -----------------------------------------------------------------------------------------------------------
+
+
+class DenseBlock(nn.Module):
+    """Five 3 x 3 convolutions, each of which sees all before it; leaky ReLU 0.2; the last starts at zero."""
+
+    def __init__(self, inputs: int, outputs: int, growth: int) -> None:
+        super().__init__()
+        self.hidden = nn.ModuleList(_conv(inputs + k * growth, growth) for k in range(4))
+        self.last = _conv(inputs + 4 * growth, outputs)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.hidden:
+            x = torch.cat([x, F.leaky_relu(layer(x), 0.2)], dim=1)
+        return self.last(x)
+
+
+class InvertibleBlock(nn.Module):
+    """An invertible 1 x 1 convolution, then an affine coupling of one channel with two."""
+
+    def __init__(self, growth: int, shift: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.eye(3).roll(shift, 0))
+        self.add_one = DenseBlock(2, 1, growth)
+        self.scale_two = DenseBlock(1, 2, growth)
+        self.add_two = DenseBlock(1, 2, growth)
+
+    def forward(self, x: Tensor) -> Tensor:
+        one, two = F.conv2d(x, self.weight[:, :, None, None]).split([1, 2], dim=1)
+        one = one + self.add_one(two)
+        return torch.cat([one, two * self._log_scale(one).exp() + self.add_two(one)], dim=1)
+
+    def inverse(self, x: Tensor) -> Tensor:
+        one, two = x.split([1, 2], dim=1)
+        two = (two - self.add_two(one)) * (-self._log_scale(one)).exp()
+        one = one - self.add_one(two)
+        return F.conv2d(torch.cat([one, two], dim=1), torch.linalg.inv(self.weight)[:, :, None, None])
+
+    def _log_scale(self, one: Tensor) -> Tensor:
+        return SCALE_CLAMP * (2.0 * torch.sigmoid(self.scale_two(one)) - 1.0)
+
+
+class Flow(nn.Module):
+    """The blocks in a row; untrained, their exchanges of channels undo each other and the flow is the identity."""
+
+    def __init__(self, blocks: int, growth: int) -> None:
+        super().__init__()
+        shifts = [*[1] * (blocks - 1), -(blocks - 1) % 3]
+        self.blocks = nn.ModuleList(InvertibleBlock(growth, shift) for shift in shifts)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Compressed, balanced RAW ``(B, 3, H, W)`` to sRGB."""
+        for block in self.blocks:
+            x = block(x)
+        return x
+
+    def inverse(self, x: Tensor) -> Tensor:
+        """sRGB ``(B, 3, H, W)`` to compressed, balanced RAW."""
+        for block in reversed(self.blocks):
+            x = block.inverse(x)  # type: ignore[operator]
+        return x
+
+
+@BASELINES.register("invisp")
+class InvISP(CropTrainedISP):
+    """InvISP; the setting of a pass is the shot's as-shot multipliers R, G, B, ``(3,)`` or ``(B, 3)``.
+
+    Without, both passes take the geometric mean of the training pairs'. With ``jpeg_quality``, 1 to 100, the way back
+    is trained through a differentiable JPEG of the network's own rendering.
+    """
+
+    name = "invisp"
+    learning_rate = 3e-4
+
+    def __init__(
+        self,
+        cfa: CFA | str = "RGGB",
+        blocks: int = 8,
+        growth: int = 32,
+        jpeg_quality: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(cfa)
+        self.jpeg_quality = jpeg_quality
+        with initialised_from(derived_seed(seed, "baseline")):
+            self.flow = Flow(blocks, growth)
+        self.balance: Tensor
+        self.register_buffer("balance", torch.ones(1, 3))
+
+    def prepare(self, pairs: Sequence[FramePair]) -> None:
+        self.balance.copy_(torch.tensor([pair.white_balance for pair in pairs]).log().mean(0, keepdim=True).exp())
+
+    def balanced(self, white_balance: tuple[float, float, float]) -> Balance:
+        return white_balance
+
+    def unprocess(self, srgb: Tensor, setting: Balance = None) -> Tensor:
+        balanced = stages.gamma_expand(self.flow.inverse(srgb), GAMMA)
+        return stages.apply_gains(balanced, 1.0 / self._gains(setting, len(srgb)))
+
+    def render(self, raw: Tensor, setting: Balance = None) -> Tensor:
+        return self.flow(self.compressed(raw, setting))
+
+    def compressed(self, raw: Tensor, setting: Balance) -> Tensor:
+        """What the flow takes ``(B, 3, H, W)`` of a mosaic ``(B, 1, H, W)``."""
+        balanced = stages.apply_gains(bayer.demosaic(raw, self.cfa), self._gains(setting, len(raw)))
+        return stages.gamma_compress(balanced, GAMMA)
+
+    def loss(self, crops: Crops) -> Tensor:
+        raw = self.compressed(crops.raw, crops.white_balance)
+        rendered = self.flow(raw)
+        picture = crops.srgb if self.jpeg_quality is None else self._jpeg(rendered.clamp(0.0, 1.0))
+        return F.l1_loss(rendered, crops.srgb) + F.l1_loss(self.flow.inverse(picture), raw)
+
+    def _jpeg(self, srgb: Tensor) -> Tensor:
+        from kornia.enhance import jpeg_codec_differentiable
+
+        return jpeg_codec_differentiable(srgb, srgb.new_tensor([float(self.jpeg_quality or 100)]))
+
+    def _gains(self, setting: Balance, batch: int) -> Tensor:
+        given = self.balance if setting is None else setting
+        gains = torch.as_tensor(given, dtype=self.balance.dtype, device=self.balance.device).expand(batch, 3)
+        return gains / gains.amax(dim=1, keepdim=True)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -74,8 +74,7 @@ class SmoothstepISP(BaselineISP):
     """UPI's stages with a matrix and gains from wherever: the setting of a pass is :class:`UPIParams`."""
 
     @abstractmethod
-    def default_params(self, batch: int) -> UPIParams:
-        """The defaults of a pass."""
+    def default_params(self, batch: int) -> UPIParams: ...
 
     def balanced(self, white_balance: tuple[float, float, float]) -> UPIParams:
         """The defaults with as-shot multipliers R, G, B in place of their own; the digital gain stays."""
@@ -105,16 +104,7 @@ def render_pixels(x: Tensor, params: UPIParams) -> Tensor:
 
 @BASELINES.register("upi")
 class UPI(SmoothstepISP):
-    """UPI as published: a random camera a picture, or the mean one.
-
-    Example:
-        >>> upi, srgb = UPI("GRBG"), torch.rand(2, 3, 8, 10)
-        >>> params = upi.sample(2, torch.Generator().manual_seed(0))
-        >>> torch.equal(upi.reverse(srgb, params), upi.reverse(srgb, params))
-        True
-        >>> upi.reverse(srgb).shape
-        torch.Size([2, 1, 8, 10])
-    """
+    """UPI as published: a random camera a picture, or the mean one."""
 
     name = "upi"
 
@@ -159,17 +149,8 @@ class TunedUPI(SmoothstepISP):
         return UPIParams(self.matrix.expand(batch, 3, 3), self.gains.expand(batch, 3))
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
-        self.tune(pairs, training.seed)
-        return 1, math.nan
-
-    def tune(self, pairs: Iterable[FramePair], seed: int = 0) -> TunedUPI:
-        """Fit matrix and gains; pairs of any CFA, registered or not.
-
-        Raises:
-            ValueError: if there is no pair, a frame has too few pixels below the highlights, or what fits best turns
-                white black.
-        """
-        moments = Moments.of(sample_pixels(pairs, PIXELS, seed).pixels)
+        """Pairs of any CFA, registered or not; ValueError if what fits best turns white black."""
+        moments = Moments.of(sample_pixels(pairs, PIXELS, training.seed).pixels)
         product = moments.solve(torch.ones(len(moments.energy)).double())
         for _ in range(ROUNDS):
             product = moments.solve(1.0 / (moments.error(product) + LOG_MSE_EPS))
@@ -178,7 +159,7 @@ class TunedUPI(SmoothstepISP):
             raise ValueError("tuned UPI: the pairs fit only with negative gains; give frames with more colours")
         self.gains.copy_(1.0 / sums)
         self.matrix.copy_(product / sums[:, None])
-        return self
+        return 1, math.nan
 
 
 class Moments(NamedTuple):
@@ -195,8 +176,7 @@ class Moments(NamedTuple):
         known = samples.known * (linear.mean(1, keepdim=True) < HIGHLIGHT_KNEE)
         x, y, weight = (value[:, :, 0].double() for value in (linear, samples.target, known))
         if (weight.sum(2) < 32).any():
-            frame = int((weight.sum(2) < 32).any(1).nonzero()[0])
-            raise ValueError(f"frame {frame}: too few pixels below the highlights; use a better exposed frame")
+            raise ValueError("a frame has too few pixels below the highlights; use better exposed frames")
         weight = weight / weight.sum((1, 2), keepdim=True)
         a = torch.einsum("fip,fjp,fcp->fcij", x, x, weight)
         return cls(a, torch.einsum("fip,fcp,fcp->fci", x, y, weight), (weight * y * y).sum((1, 2)))

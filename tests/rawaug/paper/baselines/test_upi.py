@@ -14,6 +14,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.tone import inverse_smoothstep
+from rawaug.paper.baselines import Training, fit_baseline
 from rawaug.paper.baselines.upi import (
     LOG_MSE_EPS,
     UPI,
@@ -134,7 +135,7 @@ def shot(seed: int, digital: float = 1.0) -> Pair:
 
 
 def test_alike_frames_give_the_camera() -> None:
-    tuned = TunedUPI("GBRG").tune([shot(0), shot(1)])
+    tuned = fit_baseline(TunedUPI("GBRG"), [shot(0), shot(1)], Training())
     torch.testing.assert_close(tuned.matrix.data, MATRIX, atol=1e-3, rtol=0)
     torch.testing.assert_close(tuned.gains.data, GAINS, atol=1e-2, rtol=0)
     pair = shot(2)
@@ -142,7 +143,7 @@ def test_alike_frames_give_the_camera() -> None:
 
 
 def test_of_three_frames_the_two_that_agree_are_followed_and_not_the_bright_one() -> None:
-    tuned = TunedUPI("GBRG").tune([shot(0, 1.5), shot(1, 1.5), shot(2, 0.7)])
+    tuned = fit_baseline(TunedUPI("GBRG"), [shot(0, 1.5), shot(1, 1.5), shot(2, 0.7)], Training())
     assert tuned.gains[1].item() / 1.2 == pytest.approx(1.5, abs=0.05)
 
 
@@ -169,4 +170,4 @@ def test_the_moments_give_the_error() -> None:
 def test_a_white_frame_is_refused() -> None:
     white = replace(shot(0), srgb=torch.full((3, 64, 64), 255, dtype=torch.uint8))
     with pytest.raises(ValueError, match="too few pixels"):
-        TunedUPI().tune([white])
+        fit_baseline(TunedUPI(), [white], Training())
