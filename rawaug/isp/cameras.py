@@ -197,10 +197,7 @@ def white_point(xy: Array | tuple[float, float]) -> Tensor:
 
 
 def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = ALL_LIGHTS) -> Array:
-    """White points ``(batch, 3)``, XYZ with Y = 1.
-
-    Where both loci are defined one of them is taken, each as often as the other. All are moved by a Duv of N(0, 0.003).
-    """
+    """White points ``(batch, 3)``, XYZ with Y = 1; where both loci are defined, each as often as the other."""
     kelvin, lamps, among, by_day = lights
     drawn = torch.rand(batch, 4, generator=generator, dtype=torch.float64).numpy()
     duv = DUV_SPREAD * torch.randn(batch, generator=generator, dtype=torch.float64).numpy()

@@ -62,10 +62,7 @@ def _require_factor(name: str, value: Tensor) -> None:
 
 
 def with_raw_samples(isp: StagedISP, x: Tensor, params: ISPParams, raw_samples: Tensor, place: Tensor) -> ISPParams:
-    """Gains from a few RAW readings, channel by channel; then the colour atoms of that light, and the gains again.
-
-    Clipped readings are left out; a channel without any reading keeps its gain.
-    """
+    """Gains from RAW readings, then the colour atoms of that light, and the gains again; clipped ones do not count."""
     _require_places(raw_samples, x)
     rows, columns = raw_samples[..., 0].long(), raw_samples[..., 1].long()
     batch = torch.arange(len(x), device=x.device)[:, None]
@@ -109,10 +106,7 @@ def _mixed(
 
 
 def _nearest(target: Tensor, makes: Tensor, typical: Tensor) -> Tensor:
-    """Weights ``(B, N)`` on the simplex of what N atoms make of K readings, ``(B, N, K)``, nearest ``(B, K)``.
-
-    A weak pull to the typical weights decides where the readings do not.
-    """
+    """Weights ``(B, N)`` whose mixture of ``makes`` ``(B, N, K)`` is nearest ``target`` ``(B, K)``."""
     rows = []
     for wanted, atoms in zip(target.double(), makes.double(), strict=True):
         pull = (PULL * atoms.square().mean() * atoms.shape[1]).sqrt() * torch.eye(len(atoms)).to(atoms)

@@ -70,10 +70,9 @@ def l1_normalised(matrices: Tensor) -> Tensor:
 
 
 class ColourDictionary(nn.Module):
-    """N colour correction matrices, sRGB to camera, rows l1-normalised.
+    """N colour correction matrices, sRGB to camera, each with the light that it was seen in.
 
-    Each atom stores the light it was seen in, so that a known white balance can choose among them, as with a DNG's
-    two illuminants.
+    So a known white balance can choose among them, as among a DNG's two illuminants.
     """
 
     light: Tensor
@@ -158,10 +157,7 @@ def log_light(white_balance: Tensor) -> Tensor:
 
 
 class GainDictionary(nn.Module):
-    """M triplets (digital gain, red gain, blue gain), as the paper writes its atoms; kept as logarithms, so positive.
-
-    Drawn from U(1, 2) at first, as in the paper.
-    """
+    """M triplets (digital gain, red gain, blue gain) as in the paper, from U(1, 2) at first; kept as logarithms."""
 
     def __init__(self, atoms: int) -> None:
         super().__init__()

@@ -52,8 +52,7 @@ def trust(srgb: Tensor) -> Tensor:
 def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence[float]) -> ISPResult:
     """The RAW of a scene at 0 EV from aligned pictures of it; from one picture, its own divided by its exposure.
 
-    All share the setting that the ISP chooses for the picture nearest to 0 EV. Gains are divided by plainly: the
-    highlight-safe ones, which bring clipped sRGB back as saturated RAW, are not linear in the scene.
+    All share the setting that the ISP chooses for the picture nearest to 0 EV.
 
     Args:
         isp: the camera.
@@ -61,12 +60,11 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
         ev: exposure of each in stops.
 
     Returns:
-        The RAW ``(B, 3, H, W)``, all colours at every pixel and above 1 where the scene is brighter than white at
-        0 EV, as ``image``, and the setting.
+        As ``image`` the RAW ``(B, 3, H, W)``, all colours at every pixel and above 1 where the scene is brighter than
+        white at 0 EV, and the setting.
 
     Raises:
-        ValueError: if there are no pictures, another number of exposures, two equal exposures, or pictures of
-            different shapes.
+        ValueError: if exposures or shapes do not fit the pictures, or two exposures are equal.
     """
     _require_bracket(pictures, ev)
     nearest = min(range(len(ev)), key=lambda k: abs(ev[k]))
@@ -94,7 +92,7 @@ def render_exposure(isp: DictionaryISP, raw: Tensor, params: ISPParams, ev: floa
 
 
 def _linear_reverse(isp: DictionaryISP, x: Tensor, params: ISPParams) -> Tensor:
-    """x to x5, with plain division by the gains."""
+    """x to x5 with plain division by the gains: highlight-safe gains are not linear in the scene."""
     for stage in isp.ordered_stages:
         plain = isinstance(stage, WhiteBalance)
         x = inverse_gains(x, params.gains, knee=None) if plain else stage.reverse(x, params)

@@ -58,19 +58,11 @@ class BakedISP(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        _require_usual_order(isp)
         self.config = isp.config
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages))
-        cube = node_colours(nodes)
-        tables = Tables(cube, cube)
-        plain = torch.autocast(isp.gain.log_gains.device.type, enabled=False)
-        with torch.no_grad(), one_thread(), plain:  # the same table in every process
-            for stage in isp.ordered_stages:
-                tables = stage.bake(tables)
-            attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
-            self.register_buffer("table", _as_table(tables.x2, nodes))
-            self.register_buffer("attention", attention)
-            self.chooser = _Chooser(isp)
+        for name, table in zip(("table", "attention"), _tables(isp, nodes), strict=True):
+            self.register_buffer(name, table)
+        self.chooser = _Chooser(isp)
 
     def choose(self, srgb: Tensor) -> ISPParams:
         """The setting that the encoders (or their constants) choose for ``srgb`` ``(B, 3, H, W)``, as the ISP would."""
@@ -92,10 +84,7 @@ class BakedISP(nn.Module):
         white: float = math.inf,
         shaded: bool = True,
     ) -> Tensor:
-        """RAW of all three colours at every site, ``(B, 3, H, W)``, for mosaics other than Bayer's.
-
-        Three passes, one a colour. Without ``shaded`` it is x4, for :meth:`shade`; all else is as in the call.
-        """
+        """RAW of all three colours at every site, ``(B, 3, H, W)``; without ``shaded`` x4, for :meth:`shade`."""
         _require_batch(srgb, params, place)
         camera, rgb = self._camera(srgb, params, place), []
         if not shaded:
@@ -133,17 +122,10 @@ class FastForward(nn.Module):
 
     def __init__(self, isp: DictionaryISP, nodes: int = NODES) -> None:
         super().__init__()
-        _require_usual_order(isp)
         self.cfa = CFA(isp.cfa)
         self.stages = nn.ModuleList(deepcopy(isp.ordered_stages)).requires_grad_(False)
-        cube = node_colours(nodes)
-        tables = Tables(cube, cube.square())
-        with torch.no_grad(), one_thread(), torch.autocast(isp.gain.log_gains.device.type, enabled=False):
-            for stage in reversed(isp.ordered_stages):
-                tables = stage.bake_forward(tables)
-            attention = torch.empty(0, 0, 0, 4) if tables.attention is None else _as_table(tables.attention, nodes)
-        self.register_buffer("table", _as_table(tables.x2, nodes))
-        self.register_buffer("attention", attention)
+        for name, table in zip(("table", "attention"), _tables(isp, nodes, forward=True), strict=True):
+            self.register_buffer(name, table)
 
     def forward(self, linear: Tensor, params: ISPParams, place: Tensor | None = None) -> Tensor:
         """Linear camera RGB ``(B, 3, H, W)``, x5, to sRGB ``(B, 3, H, W)`` in [0, 1], float32.
@@ -163,10 +145,7 @@ class FastForward(nn.Module):
     def develop(
         self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None = None
     ) -> list[Tensor]:
-        """Mosaics of the same pictures, each ``(B, 1, H, W)`` with sides of at least 4, to sRGB.
-
-        Every picture is demosaiced by its own of :data:`rawaug.bayer.STENCILS`.
-        """
+        """Mosaics ``(B, 1, H, W)`` of the same pictures to sRGB, each picture demosaiced by its own method."""
         display = self._display(raws[0], params, place)
 
         def in_pytorch(raw: Tensor) -> Tensor:
@@ -186,16 +165,25 @@ class FastForward(nn.Module):
         return Display(table, curves, self.attention, torch.linalg.pinv(matrix), gains, frame, shading)
 
 
-def _require_usual_order(isp: DictionaryISP) -> None:
+@torch.no_grad()
+@one_thread()  # the same tables in every process
+def _tables(isp: DictionaryISP, nodes: int, forward: bool = False) -> tuple[Tensor, Tensor]:
+    """The tables of a pass: x2, or sRGB of the forward pass, and attention, empty for none."""
     if any(first.makes >= second.makes for first, second in pairwise(isp.ordered_stages)):
         order = " ".join(isp.config.stages)
         raise ValueError(f"augmentation needs the ISP's stages in the usual order, got {order}; fit it anew")
+    cube = node_colours(nodes)
+    tables = Tables(cube, cube.square() if forward else cube)
+    with torch.autocast(isp.gain.log_gains.device.type, enabled=False):
+        for stage in reversed(isp.ordered_stages) if forward else isp.ordered_stages:
+            tables = stage.bake_forward(tables) if forward else stage.bake(tables)
+    empty = torch.empty(0, 0, 0, 4)
+    return _as_table(tables.x2, nodes), empty if tables.attention is None else _as_table(tables.attention, nodes)
 
 
 def _batch_params(
     stages: nn.ModuleList, image: Tensor, params: ISPParams, place: Tensor | None, table: Tensor
 ) -> BatchParams:
-    """What the stages need of the settings of these pictures."""
     batch, _, height, width = image.shape
     made = BatchParams(
         torch.eye(3).to(table).expand(batch, 3, 3),

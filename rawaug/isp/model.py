@@ -27,15 +27,10 @@ from rawaug.isp.staged import StagedISP, thumbnail
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
 """A width, which is infinite where the light says nothing of the colour."""
-_CODES = 256
 
 
 class DictionaryISP(StagedISP):
-    """A learned, interpretable camera.
-
-    Args:
-        config: what it is made of.
-        seed: of the networks and gains that it starts with.
+    """A learned, interpretable camera: ``config`` says what it is made of, ``seed`` how it starts.
 
     Example:
         >>> isp = DictionaryISP()
@@ -60,8 +55,7 @@ class DictionaryISP(StagedISP):
     def draw_setting(self, batch: int, generator: torch.Generator) -> ISPParams:
         """Settings of ``batch`` pictures, drawn without looking at them from a generator on the CPU.
 
-        A camera in a light and a mixture of tone curves where the atoms are published cameras; else mixtures of the
-        atoms with uniform weights.
+        A camera in a light where the atoms are published cameras, else mixtures of the atoms with uniform weights.
         """
         config, device = self.config, self.colour.matrices.device
         if (cameras := self.camera_sampler()) is not None:
@@ -73,7 +67,6 @@ class DictionaryISP(StagedISP):
         """What draws settings where the atoms are published cameras, as these are now; else None.
 
         ``light`` is a colour temperature in kelvin or one of :data:`rawaug.isp.cameras.LAMPS`; any light by default.
-        Not ``consistent``, gains are those of another camera in another light.
         """
         if not isinstance(self.colour, CameraDictionary):
             return None
@@ -202,14 +195,9 @@ class DictionaryISP(StagedISP):
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:
-        """The reverse pass up to the mosaic as a table, at the centre of the lens shading.
+        """The reverse pass up to the mosaic, at the centre of the shading, of ``nodes`` sRGB values an axis.
 
-        Args:
-            setting: of one picture.
-            nodes: along each axis of the sRGB cube.
-
-        Returns:
-            Linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, of the cube's nodes, red changing fastest.
+        Returns linear camera RGB ``(nodes ** 3, 3)``, black 0 and white 1, red changing fastest.
         """
         cube = stages.node_colours(nodes)
         shading = self.find(stages.LensShading)
@@ -220,14 +208,13 @@ class DictionaryISP(StagedISP):
     @torch.no_grad()
     def tone_curve(self) -> Tensor:
         """x2, linear, of the 256 greys of sRGB, R, G, B: ``(256, 3)``. It holds tone and gamma."""
-        grey = torch.linspace(0.0, 1.0, _CODES).expand(1, 3, 1, _CODES)
-        return self.linear(grey)[0, :, 0].T.contiguous()
+        return self.linear(torch.linspace(0.0, 1.0, 256).expand(1, 3, 1, -1))[0, :, 0].T.contiguous()
 
     @torch.no_grad()
     def description(self, white_balance: Sequence[float] | None = None) -> dict[str, Any]:
         """What the ISP is made of, as JSON; ``setting`` is :meth:`typical_setting`, ``info`` what the fit recorded."""
-        setting, shading = self.typical_setting(white_balance), self.find(stages.LensShading)
-        info = dict(self.info)
+        setting, shading, info = self.typical_setting(white_balance), self.find(stages.LensShading), dict(self.info)
+        mask = shading and {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()}
         return {
             "kind": "isp",
             "cfa": str(self.cfa),
@@ -244,9 +231,7 @@ class DictionaryISP(StagedISP):
                 "gains": setting.gains[0].tolist(),
             },
             "tone_curve": self.tone_curve().tolist(),
-            "shading": None
-            if shading is None
-            else {"mean": shading.mask.mean.tolist(), "precision": shading.mask.precision.tolist()},
+            "shading": mask,
             "noise": info.pop("noise", None),
             "info": info,
         }
@@ -271,9 +256,7 @@ class DictionaryISP(StagedISP):
         if header.get("kind") != "isp":
             raise ValueError(f"{path}: holds {header.get('kind', 'no rawaug weights')}, not an ISP")
         try:
-            config = ISPConfig(**parse_object(header["config"]))
-            _require_sizes(config, state)
-            isp = cls(config)
+            isp = cls(ISPConfig(**parse_object(header["config"])))
             shapes, needed = ({k: v.shape for k, v in tensors.items()} for tensors in (state, isp.state_dict()))
             if wrong := sorted(key for key in shapes | needed if shapes.get(key) != needed.get(key)):
                 raise ValueError(f"tensor {wrong[0]} does not fit")
@@ -286,21 +269,6 @@ class DictionaryISP(StagedISP):
             reason = " ".join(str(error).split())
             raise ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}") from error
         return isp.eval()
-
-
-def _require_sizes(config: ISPConfig, state: dict[str, Tensor]) -> None:
-    """Refuse a configuration that is not the tensors' before memory is taken for it: a damaged one may ask for any."""
-    sizes = {"colour.matrices": config.colour_atoms, "gain.log_gains": config.gain_atoms}
-    if config.cameras:
-        sizes["colour.known"] = config.cameras
-    if config.tone_atoms:
-        sizes["stages.curve.dictionary.curves"] = config.tone_atoms
-    if config.encoders:
-        for k, width in enumerate(config.encoder_widths):
-            sizes[f"reverse_encoders.colour.layers.{2 * k}.weight"] = width
-    for key, size in sizes.items():
-        if key not in state or state[key].shape[:1] != (size,):
-            raise ValueError(f"tensor {key} does not fit")
 
 
 def _scene_referred(raw: Tensor) -> Tensor:

@@ -88,10 +88,7 @@ def _colourwise(hidden: int, outputs: int) -> nn.Sequential:
 
 
 class ToneNetwork(nn.Module):
-    """f1: a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU, piecewise linear in colour.
-
-    It starts as the identity (last layer zero), so that an untrained ISP is a plain gamma camera.
-    """
+    """f1: a residual 3-32-32-32-3 network of 1 x 1 convolutions with ReLU; the identity at first."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -205,10 +202,7 @@ class GaussianMask(nn.Module):
 
 
 class AttentionMask(nn.Module):
-    """A per-pixel gain ``A = 2 sigmoid(conv-ReLU-conv-ReLU-conv)`` in (0, 2), 1 x 1 kernels.
-
-    The factor 2, which the paper does not have, lets the untrained mask be the identity.
-    """
+    """A per-pixel gain ``A = 2 sigmoid(...)`` in (0, 2); the paper has no 2, with which it is the identity at first."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -238,7 +232,7 @@ class BatchParams(NamedTuple):
 
 
 class Stage(nn.Module, ABC):
-    """A stage of the ISP, which keeps ``config`` up to date; images are ``(B, 3, H, W)``.
+    """A stage of the ISP; images are ``(B, 3, H, W)``.
 
     Parameters whose names start with ``forward_`` belong to the forward pass, all others to the reverse pass.
     """
@@ -269,10 +263,7 @@ class Stage(nn.Module, ABC):
         return tables._replace(x2=self.forward(tables.x2, None)) if self.makes <= 2 else tables
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
-        """``batch`` with what this stage does to these pictures, of height and width ``size``.
-
-        ``place`` is ``(B, 4 to 6)`` as :class:`rawaug.isp.fast.BakedISP` takes it.
-        """
+        """``batch`` with what this stage does to these pictures of ``size``; ``place`` ``(B, 4 to 6)`` or None."""
         return batch
 
     def describe(self) -> str:

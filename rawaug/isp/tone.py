@@ -124,11 +124,7 @@ class ToneDictionary(nn.Module):
 
 @STAGES.register("curve")
 class ToneCurve(Stage):
-    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet.
-
-    Raises:
-        ValueError: if there are no tone atoms, or the stages contain the learned curve as well.
-    """
+    """f1 and f2 in one: the picture's inverse tone curve, or the typical one where the setting is not chosen yet."""
 
     name, makes = "curve", 2
 

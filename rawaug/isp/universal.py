@@ -41,7 +41,7 @@ TONE_AND_CAMERAS = ("curve", "colour", "gains")
 
 
 class Choice(NamedTuple):
-    """Atoms among points: their indices, and weights whose mixture is nearest the points' mean."""
+    """Atoms among points by index, and the weights whose mixture is nearest the points' mean."""
 
     atoms: list[int]
     typical: Tensor
@@ -89,7 +89,7 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
 
 @torch.no_grad()
 def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """The ISP with the published cameras of these names for its atoms: their matrices, all lights, the same tones."""
+    """The ISP with the published cameras of these names for its atoms: all lights, the same tones."""
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
     listed = published_cameras()
@@ -105,7 +105,7 @@ def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
 
 
 def camera_points(xyz_to_camera: Tensor) -> Tensor:
-    """Cameras as points ``(N, 9)`` whose squared distance is the error of their linear colour on photographs."""
+    """Cameras as points ``(N, 9)`` whose squared distance is the error of their colour on photographs."""
     return colour_coordinates(colour_matrix(xyz_to_camera), torch.tensor(COLOURS))
 
 

@@ -101,8 +101,6 @@ class Comparison:
         seconds: training budget of methods trained by gradient descent, without file reading.
         crop: side of the crops that these methods train on: small ones give more steps to a short budget.
         batch: crops in a step of them.
-        longer: factor of a second, longer budget for them; 0 for none.
-        longer_frames: left-out frames on which the longer budget is tried (first seed).
         patches: random patches of each left-out frame that are scored; null scores all.
         balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
             gamma-compressed RAW.
@@ -128,8 +126,6 @@ class Comparison:
     seconds: float = 20.0
     crop: int = 64
     batch: int = 2
-    longer: float = 0.0
-    longer_frames: int = 2
     patches: int | None = 8
     balanced: bool = False
     perturbed: list[str] = field(default_factory=list)
@@ -156,7 +152,7 @@ class Comparison:
 
     def shortest(self) -> Comparison:
         """One step of every method, on the first frames."""
-        few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "longer": 0.0, "seconds": 0.1}
+        few: dict[str, Any] = {"count": 2, "test_count": 1, "patches": 1, "seeds": 1, "seconds": 0.1}
         downstream = self.downstream and self.downstream.shortest()
         return replace(self, **few, select="first", fit=self.fit.shortest(), downstream=downstream)
 
@@ -181,9 +177,6 @@ class Table:
         self.pairs = _fitted_frames(settings, found)
         self.scored = _test_frames(settings, found) if settings.test else self.pairs
         self.fit = replace(settings.fit, noisy=settings.fit.noisy or bool(settings.noise))
-        if settings.longer and not 1 <= settings.longer_frames <= len(self.scored):
-            where, count = settings.test or settings.data, len(self.scored)
-            raise ValueError(f"longer_frames is {settings.longer_frames}; {where} has {count} frames")
         self._fitted: dict[str, Fitted] = {}
         side = settings.downstream.train.crop if settings.downstream else 2
         pictures = open_pictures(settings.pictures, min_side=side)
@@ -193,9 +186,7 @@ class Table:
         """All rows; printed, and written with every single figure."""
         settings, rows = self.settings, dict[str, dict[str, Any]]()
         for family in settings.methods:
-            rows |= self._rows(family, 1.0)
-            if settings.longer and learns_by_descent(family):
-                rows |= self._rows(family, settings.longer)
+            rows |= self._rows(family)
         ceiling = mosaic_only_psnr(self.pictures, CFA(self.pairs[0].cfa))
         write_json({"settings": asdict(settings), "rows": rows, "mosaic_only_psnr": ceiling}, self._path("table"))
         frames = len(next(iter(rows.values()))["frames"])
@@ -204,15 +195,13 @@ class Table:
         print_methods(title, rows, settings.balanced, ceiling)
         return rows
 
-    def _rows(self, family: str, scale: float) -> dict[str, dict[str, Any]]:
-        settings, longer, names = self.settings, scale != 1.0, names_of(self.scored)
-        seeds = range(settings.seed, settings.seed + (1 if longer else settings.seeds))
-        frames = range(settings.longer_frames if longer else len(self.scored))
-        drawn = progress(list(product(seeds, frames)), label=f"{family} x{scale:g}", unit="fit")
-        every = [self._fold(family, scale, seed, frame) for seed, frame in drawn]
-        folds = [every[k : k + len(frames)] for k in range(0, len(every), len(frames))]
+    def _rows(self, family: str) -> dict[str, dict[str, Any]]:
+        names = names_of(self.scored)
+        drawn = progress(list(product(self._seeds(), range(len(names)))), label=family, unit="fit")
+        every = [self._fold(family, seed, frame) for seed, frame in drawn]
+        folds = [every[k : k + len(names)] for k in range(0, len(every), len(names))]
         speeds = [fold["mpix_s"] for fold in every if fold["mpix_s"] is not None]
-        whole = {} if longer else self._whole(family)
+        whole = self._whole(family)
 
         def by_seed(kind: str, row: str) -> list[list[float]]:
             return [[fold[kind][row] for fold in of_seed] for of_seed in folds]
@@ -220,10 +209,10 @@ class Table:
         rows = {}
         for row in every[0]["rows"]:
             values = by_seed("rows", row)
-            name = row_name(family, row) + (f", {scale:g} times as long" if longer else "")
+            name = row_name(family, row)
             rows[name] = {
                 "psnr_r": [fmean(of_seed) for of_seed in values],
-                "frames": {names[k]: [of_seed[k] for of_seed in values] for k in frames},
+                "frames": {name: [of_seed[k] for of_seed in values] for k, name in enumerate(names)},
                 "worst25": [worst_and_best_quarter(of_seed)[0] for of_seed in values],
                 "best25": [worst_and_best_quarter(of_seed)[1] for of_seed in values],
                 "seconds": fmean(fold["seconds"] for fold in every),
@@ -235,13 +224,13 @@ class Table:
                 rows[name]["balanced"] = [fmean(of_seed) for of_seed in by_seed("balanced", row)]
         return rows
 
-    def _fold(self, family: str, scale: float, seed: int, frame: int) -> dict[str, Any]:
+    def _fold(self, family: str, seed: int, frame: int) -> dict[str, Any]:
         """Fitted without one frame, scored on it; or fitted to all, scored on a test frame."""
         settings, name = self.settings, names_of(self.scored)[frame]
-        training = self._training(seed, scale)
+        training = self._training(seed)
         measured = settings.patches, settings.balanced, settings.perturbed
         key = fingerprint(family, asdict(training), *measured, *self._frames())
-        path = self._path(f"{family}-x{scale:g}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
+        path = self._path(f"{family}-{'on' if settings.test else 'without'}-{name}-seed{seed}")
         return resumed(path, key, lambda: self._scored(family, training, frame, key))
 
     def _scored(self, family: str, training: Training, frame: int, key: str) -> dict[str, Any]:
@@ -266,8 +255,7 @@ class Table:
         """What is measured elsewhere than on the pairs, by a fit on all of them: cycle and PSNR_d."""
         settings = self.settings
         downstream = settings.downstream if settings.downstream and family in settings.downstream.methods else None
-        seeds = range(settings.seed, settings.seed + settings.seeds)
-        training = self._training(settings.seed)
+        training, seeds = self._training(settings.seed), self._seeds()
         samples = (family, asdict(training), settings.pictures, *self._frames())
         key = fingerprint(*samples, list(seeds), downstream and asdict(downstream))
 
@@ -283,9 +271,11 @@ class Table:
 
         return resumed(self._path(f"{family}-all-frames"), key, measured)
 
-    def _training(self, seed: int, scale: float = 1.0) -> Training:
-        settings = self.settings
-        return Training(settings.seconds * scale, crop=settings.crop, batch=settings.batch, seed=seed)
+    def _seeds(self) -> range:
+        return range(self.settings.seed, self.settings.seed + self.settings.seeds)
+
+    def _training(self, seed: int) -> Training:
+        return Training(self.settings.seconds, crop=self.settings.crop, batch=self.settings.batch, seed=seed)
 
     def _frames(self) -> tuple[Any, ...]:
         """What a fit depends on besides its family, budget and seed."""

@@ -87,9 +87,9 @@ def adam(
     state: Mapping[int, Any] | None = None,
     clip_norm: float | None = None,
 ) -> Iterator[tuple[torch.optim.Adam, Tensor]]:
-    """Adam on ``loss(step)`` until ``spent(step)`` is 1; the rate falls to 0 by half a cosine of what is spent.
+    """Adam on ``loss(step)`` until ``spent(step)`` is 1, under a cosine; yields the optimiser and each step's loss.
 
-    Yields the optimiser and the loss after each step; ``start`` and ``state`` resume a descent.
+    ``start`` and ``state`` resume a descent.
     """
     optimiser = torch.optim.Adam(tensors, lr=learning_rate)
     if state:
