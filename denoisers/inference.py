@@ -14,6 +14,9 @@ from denoisers.domains import levels_of
 from denoisers.network import PACKED
 from rawaug import bayer
 
+OVERLAP = 96
+"""Of tiles, at least."""
+
 
 def _pieces(size: int, tile: int, overlap: int, stride: int) -> tuple[list[int], int]:
     """Where the tiles begin along a side, and how long they are, at most ``tile``; the last one reaches the end."""
@@ -30,7 +33,7 @@ def tiled(
     noisy: Tensor,
     variance: Tensor | None = None,
     tile: int = 1536,
-    overlap: int = 96,
+    overlap: int | None = None,
     each: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> Tensor:
     """Denoise a picture of any size piece by piece, without gradients: ``f(y)[core] = f(y[core + overlap])[core]``.
@@ -50,7 +53,7 @@ def tiled(
         noisy: ``(B, 4, h, w)``.
         variance: the noise variance of each value, shape of ``noisy``.
         tile: side of a piece in packed pixels, overlap included.
-        overlap: context on each inner side, dropped from the result.
+        overlap: context on each inner side, dropped from the result; by default 96, or the next multiple of the stride.
         each: iterates over the tiles; may show progress, as ``tqdm`` does.
 
     Raises:
@@ -63,6 +66,7 @@ def tiled(
         torch.Size([1, 4, 300, 90])
     """
     stride, scale = (getattr(model, name, 1) for name in ("stride", "upscale"))
+    overlap = -(-OVERLAP // stride) * stride if overlap is None else overlap
     if not 0 <= 2 * overlap < tile:
         raise ValueError(f"overlap must be at least 0 and less than half the tile {tile}, got {overlap}")
     if tile % stride or overlap % stride:

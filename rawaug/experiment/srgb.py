@@ -22,12 +22,13 @@ import torch
 from torch import Tensor
 
 import denoisers
+from denoisers.files import DEFAULT
 from denoisers.network import Denoiser
 from rawaug import bayer
-from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.contestants import Contestant, contestant
 from rawaug.evaluation.page import Figure, Page, Part, draw_curves, encode_png, most_detailed
-from rawaug.evaluation.scores import denoise, label_of
+from rawaug.evaluation.scores import label_of
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe
@@ -64,16 +65,20 @@ class SrgbRecipe(Recipe):
     Of the keys ``noise`` is that of training; ``views`` and ``self_ensemble``, which are for RAW, change nothing.
 
     Args:
+        rivals: denoisers of RAW to compare with, as ``rawaug benchmark`` names them, in place of ``untouched``.
         levels: (shot_var, read_var) of the RAW noise of validation and test, a row of the table each.
     """
 
     target: ClassVar[Target] = "srgb"
+    rivals: list[str] = field(default_factory=lambda: [DEFAULT])
     levels: list[tuple[float, float]] = field(default_factory=lambda: [(5e-4, 1e-6), (2e-3, 1e-5), (8e-3, 1e-4)])
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.levels or self.data.validation is None:
             raise ValueError("levels and data.validation: give at least one level and frames to choose weights on")
+        if self.untouched:
+            raise ValueError("untouched: denoisers to compare with are named in rivals")
         for label in self.arms:
             network = self.network_of(label)
             given = network.settings.get("channels"), network.settings.get("variance_map")
@@ -109,6 +114,10 @@ class SrgbRun(TrainingRun):
 
     recipe: SrgbRecipe
 
+    def __init__(self, recipe: SrgbRecipe, overwrite: bool, given: Mapping[str, Any]) -> None:
+        super().__init__(recipe, overwrite, given)
+        self.rivals = [contestant(name, find_device(recipe.device)) for name in recipe.rivals]
+
     @cached_property
     def test_shots(self) -> dict[Levels, list[Shot]]:
         """The test frames by level."""
@@ -141,9 +150,8 @@ class SrgbRun(TrainingRun):
         for spec in self.recipe.classical:
             chosen = {level: best_filter(spec, shots) for level, shots in self.validation_shots.items()}
             found[label_of(spec)] = chosen
-        for name, (model, info) in self.untouched.items():
-            method = raw_way(model.to(find_device(self.recipe.device)), CFA(info.get("cfa", "RGGB")))
-            found[f"{name}, then LibRaw"] = dict.fromkeys(self.recipe.levels, method)
+        for rival in self.rivals:
+            found[f"{rival.name}, then LibRaw"] = dict.fromkeys(self.recipe.levels, raw_way(rival))
         return found
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
@@ -203,11 +211,11 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
         return develop(path)[None] / 255.0
 
 
-def raw_way(model: Denoiser, own: CFA) -> Method:
-    """A RAW denoiser before the development, told the levels."""
+def raw_way(rival: Contestant) -> Method:
+    """A denoiser of RAW before the development, told the levels."""
 
     def method(shot: Shot) -> Tensor:
-        denoised = denoise(model, shot.raw, shot.pair.cfa, own=own)
+        denoised = rival.run(shot.raw.noisy, shot.raw.variance, shot.pair.cfa)
         return developed(bayer.unpack(denoised, shot.pair.cfa)[0], shot.pair)
 
     return method

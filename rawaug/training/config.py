@@ -11,7 +11,7 @@ from rawaug.registry import LOSSES, require_between
 MOST = 2**31
 """Of steps, samples and processes."""
 
-Weighing = Literal["linear", "normalised", "stabilised", "mixed"]
+Weighing = Literal["linear", "normalised", "stabilised", "mixed", "relative"]
 """How the loss weighs light and shade, see :mod:`rawaug.training.criteria`."""
 
 
@@ -44,8 +44,8 @@ class TrainConfig:
         schedule: of the learning rate after warm-up: cosine, down to 1%, or step, halved every ``halve_every`` steps.
         halve_every: steps between halvings.
         loss: l1, l2 or charbonnier, or {name, settings}.
-        weigh: loss weighting of light and shade: linear, normalised, stabilised or mixed, see
-            :mod:`rawaug.training.criteria`.
+        weigh: loss weighting of light and shade: linear, normalised, stabilised, mixed or relative,
+            see :mod:`rawaug.training.criteria`.
         ema: decay of the running average of the weights, which are validated and saved; 0 disables it.
         clip_norm: gradient norm limit; 0 disables it.
         validate_every: steps between validations; the best weights are kept.

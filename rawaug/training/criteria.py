@@ -7,6 +7,7 @@ linear          the RAW itself: shadows, whose errors are small, hardly count
 normalised      the RAW in units of the noise's deviation at each pixel, which is that of the network's input
 stabilised      :math:`2 \sqrt{y / s + r / s^2 + 3/8}`, where noise has deviation 1 in shadow and light alike
 mixed           the mean of both, the linear one divided by the noise's mean deviation in the picture
+relative        the picture in units of its own error before denoising; needs no variance: for developed pictures
 ==============  ====================================================================================================
 
 with s = ``shot_var`` and r = ``read_var`` of the picture. An sRGB curve weighs errors much like ``stabilised``, both
@@ -27,6 +28,9 @@ from rawaug.registry import LOSSES
 
 Criterion = Callable[[Tensor, Tensor], Tensor]
 """Of a denoised and a clean (or target) RAW, a scalar."""
+
+LEAST_ERROR = 1.0 / 255.0
+"""Of a picture with hardly any noise: the step of an 8-bit file."""
 
 
 @LOSSES.register("l1")
@@ -85,11 +89,18 @@ def mixed(loss: Criterion, sample: Sample) -> Criterion:
     return lambda denoised, clean: 0.5 * (in_root(denoised, clean) + loss(denoised / deviation, clean / deviation))
 
 
+def relative(loss: Criterion, sample: Sample) -> Criterion:
+    """``loss`` in units of the picture's root mean square error, so that weak noise counts as much as strong noise."""
+    error = (sample.noisy - sample.clean).square().mean((1, 2, 3), keepdim=True).sqrt().clamp_min(LEAST_ERROR)
+    return lambda denoised, clean: loss(denoised / error, clean / error)
+
+
 WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
     "linear": linear,
     "normalised": normalised,
     "stabilised": stabilised,
     "mixed": mixed,
+    "relative": relative,
 }
 
 

@@ -176,10 +176,21 @@ def test_every_network_works_in_every_domain(make: Make, domain: str) -> None:
 @torch.no_grad()
 def test_drunet_s_correction_does_not_depend_on_brightness_away_from_the_limits() -> None:
     """Nor, having no biases, is it limited to the size of the errors that it was trained on."""
-    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False)).double()
+    net = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False, domain="ksigma")).double()
     signal = torch.randn(1, 4, 32, 32, generator=torch.Generator().manual_seed(0)).double()
     torch.testing.assert_close(net.residual(signal + 100.0), net.residual(signal))
     torch.testing.assert_close(net.residual(7.0 * signal), 7.0 * net.residual(signal))
+    blind = awake(DRUNet(width=4, scales=3, blocks=1, variance_map=False)).double()
+    assert (blind.residual(signal + 100.0) - blind.residual(signal)).std() > 0.1, "its noise may grow with the light"
+
+
+@torch.no_grad()
+def test_drunet_of_patches_keeps_every_pixel_in_its_place() -> None:
+    net = awake(DRUNet(width=4, scales=2, blocks=1, channels=3, variance_map=False, patch=2)).double()
+    picture = torch.randn(1, 3, 96, 95, generator=torch.Generator().manual_seed(0)).double()
+    correction = net(picture) - picture
+    moved = F.pad(picture, (16, 0, 16, 0), mode="reflect")
+    torch.testing.assert_close((net(moved) - moved)[..., 48:80, 48:80], correction[..., 32:64, 32:64])
 
 
 @torch.no_grad()

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
-from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
+from rawaug.evaluation.contestants import Contestant
 from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.experiment.srgb import Shot, SrgbRecipe, best_filter, developed, filtered, key_of, raw_way, scored, shots_of
 from rawaug.metrics import psnr
@@ -21,7 +20,7 @@ from rawaug.training.config import DenoiserConfig
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [
     "--data.pictures", "tiny:", "--data.validation", "tiny:validation", "--data.test", "tiny:test", "--device", "cpu",
-    "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--untouched", "[]", "--train.precision", "32-true",
+    "--levels", "[[2.0e-3, 1.0e-5], [8.0e-3, 1.0e-4]]", "--rivals", "[]", "--train.precision", "32-true",
     "--denoiser.settings", '{"width": 4, "scales": 2, "channels": 3, "variance_map": false}', "--steps", "2",
     "--train.crop", "32", "--train.batch", "4", "--train.validate-every", "1",
 ]  # fmt: skip
@@ -60,18 +59,12 @@ def test_noise_is_that_of_the_level_the_same_for_all(shots: dict[tuple[float, fl
 
 
 def test_a_raw_denoiser_is_developed_after(shots: dict[tuple[float, float], list[Shot]]) -> None:
-    class Perfect(torch.nn.Module):
-        def __init__(self, shift: float) -> None:
-            super().__init__()
-            self.shift = torch.nn.Parameter(torch.tensor(shift))
-
-        def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
-            return noisy + self.shift
+    def brighter(by: float) -> Contestant:
+        return Contestant("brighter", lambda noisy, variance, cfa: noisy + by)
 
     shot = shots[LEVELS[1]][0]
-    same = raw_way(Perfect(0.0), CFA.RGGB)(shot)  # type: ignore[arg-type]
-    assert torch.equal(same, shot.noisy)
-    assert raw_way(Perfect(0.1), CFA.RGGB)(shot).mean() > shot.noisy.mean() + 0.02  # type: ignore[arg-type]
+    assert torch.equal(raw_way(brighter(0.0))(shot), shot.noisy)
+    assert raw_way(brighter(0.1))(shot).mean() > shot.noisy.mean() + 0.02
 
 
 def test_the_filter_is_as_strong_as_the_noise_of_its_shots(shots: dict[tuple[float, float], list[Shot]]) -> None:

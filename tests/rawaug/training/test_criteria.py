@@ -28,7 +28,7 @@ def test_the_losses_are_their_formulas() -> None:
     a, b = level(0.5), level(0.2)
     assert L1()(a, b).item() == pytest.approx(0.3)
     assert L2()(a, b).item() == pytest.approx(0.09)
-    assert Charbonnier(epsilon=0.4)(a, b).item() == pytest.approx(0.5)
+    assert Charbonnier(epsilon=0.4)(a, b).item() == pytest.approx(0.5, rel=1e-3)
 
 
 def test_linear_is_the_loss_itself() -> None:
@@ -93,3 +93,13 @@ def test_shadows_count_more_the_more_is_stabilised() -> None:
 def test_an_unknown_weighing_is_named() -> None:
     with pytest.raises(ValueError, match=r"train\.weigh 'cubic' is unknown; use one of linear, normalised, stabil"):
         weighed(L1(), "cubic", SAMPLE)
+
+
+def test_relative_counts_a_picture_by_the_share_of_its_error_that_stays() -> None:
+    clean = torch.full((2, 3, 8, 8), 0.5)
+    noisy = clean + torch.tensor([0.02, 0.2])[:, None, None, None]
+    half = 0.5 * (noisy + clean)
+    sample = Sample(noisy, clean, torch.zeros_like(noisy))
+    assert weighed(L1(), "relative", sample)(half, clean).item() == pytest.approx(0.5, rel=1e-3)
+    same = Sample(clean, clean, torch.zeros_like(clean))
+    assert weighed(L1(), "relative", same)(clean + 0.01, clean).item() == pytest.approx(0.01 * 255, rel=1e-3)
