@@ -3,9 +3,8 @@
     python -m benchmarks.real_frames CAMERA_FILES [--out rawaug/data/real_frames]
 
 CAMERA_FILES is a folder with ``raw/canon/*.crw`` and ``raw_jpeg/gopro/hero7_*.dng``, all CC0. Every frame is binned
-4 x 4 by colour site, which leaves a sixteenth of its own noise, and stored in 14 of 16 bits as a PNG of its planes R,
-Gr, Gb, B from top to bottom; ``frames.json`` says what else is known. The own noise is measured on the whole frame and
-divided by 16.
+4 x 4 by colour site, which leaves a twentieth of its own noise, and stored in 14 of 16 bits as a PNG of its planes R,
+Gr, Gb, B from top to bottom; ``frames.json`` says what else is known. The own noise is measured on the whole frame.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from rawaug.bayer import bin_mosaic, pack
+from rawaug.bayer import bin_mosaic, binned_variance, pack
 from rawaug.data.real import BLACK, FACTOR, FRAMES, WHITE
 from rawaug.io import RawFrame, read_raw
 from rawaug.noise import estimate_noise
@@ -55,7 +54,7 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
         "cfa": str(frame.cfa),
         "white_balance": frame.white_balance,
         "color_matrix": frame.color_matrix.tolist(),
-        "own_noise": [estimate.shot_var / FACTOR**2, estimate.read_var / FACTOR**2],
+        "own_noise": [level * binned_variance(FACTOR) for level in (estimate.shot_var, estimate.read_var)],
         "source": file.name,
         "source_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
     }

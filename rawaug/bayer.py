@@ -15,6 +15,7 @@ packed form: networks read the mosaic with the pattern as one-hot planes.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
@@ -227,10 +228,12 @@ def _cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tenso
 
 
 def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int) -> Tensor:
-    """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides: each site is the mean of ``factor``^2 of its colour.
+    """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides, each site the mean of its colour around its place.
 
-    The pattern stays; independent noise has 1 / ``factor``^2 of its variance. The four sites of a new cell are means
-    over nearly the same area, so that demosaicing takes them to lie farther apart than they do.
+    The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
+    the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
+    of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
+    independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
 
     Raises:
         ValueError: if the CFA is not Bayer's (X-Trans), or a side is not a multiple of 2 ``factor``.
@@ -241,10 +244,28 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int) -> Tensor:
     """
     if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
-    planes = pack(raw, cfa)
-    *lead, height, width = planes.shape
-    cells = planes.reshape(*lead, height // factor, factor, width // factor, factor)
-    return unpack(cells.mean((-3, -1)), cfa)
+    CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
+    rows = [_window_means(raw[..., i::2, :], -2, factor, i) for i in (0, 1)]
+    sites = [[_window_means(row[..., j::2], -1, factor, j) for j in (0, 1)] for row in rows]
+    return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
+
+
+def binned_variance(factor: int) -> float:
+    """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
+    part = (factor - 1) / 4 % 1
+    return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
+
+
+def _window_means(plane: Tensor, axis: int, factor: int, odd: int) -> Tensor:
+    """Means over ``factor`` sites of one colour, in an axis of which it has the even or the odd sites."""
+    move = (factor - 1) / 4 * (1 if odd else -1)
+    first, part = math.floor(move), move % 1
+    sites = torch.arange(plane.shape[axis], device=plane.device)
+    near, far = (
+        plane.index_select(axis, (sites + k).clamp(0, len(sites) - 1)).unflatten(axis, (-1, factor)).mean(axis)
+        for k in (first, first + 1)
+    )
+    return torch.lerp(near, far, part)
 
 
 def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:

@@ -71,7 +71,8 @@ def open_pairs(
         as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
         max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
             for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
-        bin: K makes each site the mean of K x K sites of its colour: a reference with 1 / K^2 of its own noise.
+        bin: K makes each site the mean of K x K sites of its colour around it: a reference with about 1 / K^2 of its
+            own noise.
         settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
 
     Raises:

@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA, bin_mosaic
+from rawaug.bayer import CFA, bin_mosaic, binned_variance
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
@@ -138,9 +138,9 @@ class Pair:
         return self._window(rows, columns, self.cfa)
 
     def binned(self, factor: int) -> Pair:
-        """The frame at 1 / ``factor`` of its sides, whose noise has 1 / ``factor``^2 of the variance.
+        """The frame at 1 / ``factor`` of its sides, whose noise has about 1 / ``factor``^2 of the variance.
 
-        Each site is the mean of ``factor`` x ``factor`` sites of its colour; pictures are averaged in linear light.
+        RAW by :func:`rawaug.bayer.bin_mosaic`; pictures are averaged in linear light.
 
         Raises:
             ValueError: if a side is shorter than two of the new cell's.
@@ -151,6 +151,7 @@ class Pair:
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
         changed: dict[str, Any] = {}
+        left = binned_variance(factor)
         for key in ("raw", "noisy", "srgb", "noisy_srgb"):
             image = getattr(self, key)
             if image is None:
@@ -158,9 +159,9 @@ class Pair:
             cut = image[:, :height, :width]
             changed[key] = bin_mosaic(cut, self.cfa, factor) if len(cut) == 1 else _bin_picture(cut, factor)
         if self.shot_var is not None and self.read_var is not None:
-            changed |= {"shot_var": self.shot_var / factor**2, "read_var": self.read_var / factor**2}
+            changed |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
         if self.own_noise is not None:
-            changed["own_noise"] = (self.own_noise[0] / factor**2, self.own_noise[1] / factor**2)
+            changed["own_noise"] = (self.own_noise[0] * left, self.own_noise[1] * left)
         return replace(self, **changed)
 
     def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:

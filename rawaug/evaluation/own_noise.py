@@ -2,7 +2,7 @@ r"""The noise that "clean" references have themselves, as a share of a denoiser'
 
 A reference is a photograph, ``r = x + m``, with noise m of its own. An error against it is ``|d - x|^2 + |m|^2`` as
 far as m is independent of the denoised d, so that even a perfect denoiser has the variance of m left. Binned K x K by
-colour site (:func:`rawaug.bayer.bin_mosaic`) the references have 1 / K^2 of it.
+colour site (:func:`rawaug.bayer.bin_mosaic`) the references have about 1 / K^2 of it.
 """
 
 from __future__ import annotations

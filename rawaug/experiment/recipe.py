@@ -54,7 +54,7 @@ class DataConfig(PairSettings):
         test_count: number of pairs to use; null for all.
         test_crop: side of the central crop used of each test frame; null for the whole frame.
         bin: K bins validation and test frames K x K by colour site before noise is added: clean references of real
-            photographs, which then have 1 / K^2 of their own noise.
+            photographs, which then have about 1 / K^2 of their own noise.
     """
 
     pairs: str | None = "demo:train"

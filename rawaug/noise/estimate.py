@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA, pack
+from rawaug.bayer import CFA, binned_variance, pack
 from rawaug.errors import escape, extra
 
 if TYPE_CHECKING:
@@ -274,7 +274,7 @@ def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
     Example:
         >>> from rawaug.data import open_pairs
         >>> own_noise(open_pairs("real:test", bin=2), 0)  # doctest: +ELLIPSIS
-        (1.9...e-06, 1.0...e-08)
+        (1.0...e-06, 5.6...e-09)
     """
     from rawaug.data.pairs import Binned  # late: measuring noise needs no datasets
 
@@ -286,7 +286,8 @@ def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
         estimate = estimate_noise(whole.raw, whole.cfa)
     except ValueError:
         return None
-    return None if estimate.r2 < WORST_FIT else (estimate.shot_var / factor**2, estimate.read_var / factor**2)
+    left = binned_variance(factor)
+    return None if estimate.r2 < WORST_FIT else (estimate.shot_var * left, estimate.read_var * left)
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:

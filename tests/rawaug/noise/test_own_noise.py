@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, binned_variance
 from rawaug.data import Binned, Pair
 from rawaug.noise import own_noise, own_noise_share
 
@@ -43,4 +43,6 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     small = reference(scene(64, 64))
     assert own_noise([small], 0) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
-    assert own_noise(Binned([stated], 4), 0) == pytest.approx((2e-6, 1e-8))
+    assert own_noise(Binned([stated], 4), 0) == pytest.approx(
+        (3.2e-5 * binned_variance(4), 1.6e-7 * binned_variance(4))
+    )
