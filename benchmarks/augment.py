@@ -30,7 +30,7 @@ from torch import Tensor
 
 from benchmarks.measure import arguments, fastest, finish, memory_used, seconds, sized, start
 from rawaug import bayer
-from rawaug.data.demo.pairs import demo_photographs
+from rawaug.data.demo import demo_photographs
 from rawaug.isp.fast import FastForward
 from rawaug.isp.model import DictionaryISP
 from rawaug.paper.baselines.networks import CycleISP

@@ -21,7 +21,7 @@ import denoisers
 from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import DemoCamera, open_pairs
-from rawaug.data.demo.pairs import FRAME
+from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.scores import Method, classical_method, network_method, row_of
 from rawaug.evaluation.tables import PANEL, Row, draw

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.data.demo.pairs import demo_photographs
+from rawaug.data.demo import demo_photographs
 from rawaug.io import RawFrame, read_raw, write_dng
 from rawaug.io.raw import develop
 from rawaug.metrics import psnr

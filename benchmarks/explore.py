@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.measure import arguments, finish, show, start
-from rawaug.data.demo.pairs import demo_files
+from rawaug.data.demo import demo_files
 from rawaug.explore.page import as_html
 from rawaug.explore.view_state import Look
 from rawaug.explore.views import VIEWS, denoised

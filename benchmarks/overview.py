@@ -17,7 +17,7 @@ from torch import Tensor
 import denoisers
 import rawaug
 from rawaug import bayer
-from rawaug.data.demo.pairs import demo_files
+from rawaug.data.demo import demo_files
 from rawaug.io import encode_srgb, read_picture
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model

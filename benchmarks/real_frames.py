@@ -63,7 +63,7 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("camera_files", type=Path)
-    parser.add_argument("--out", type=Path, default=Path(str(FRAMES)))
+    parser.add_argument("--out", type=Path, default=FRAMES)
     args = parser.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     frames = {}

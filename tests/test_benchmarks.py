@@ -14,7 +14,7 @@ from benchmarks import augment, crops, denoise, equal_minutes, measure, networks
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.data.demo.pairs import FRAME
+from rawaug.data.demo import FRAME
 from rawaug.data.folders import RawFolder
 from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import frozen_levels, frozen_sample

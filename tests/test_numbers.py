@@ -258,22 +258,11 @@ def test_what_is_no_epoch_is_refused(epoch: Any) -> None:
         refused(lambda thing=thing: thing.set_epoch(epoch), r"an epoch is an integer from 0 to 2\^63 - 1")  # type: ignore[misc]
 
 
-class Endless:
-    """A dataset that says it has more pictures than any memory can count."""
-
-    def __len__(self) -> int:
-        return 2**62
-
-    def __getitem__(self, index: int) -> Tensor:
-        return SRGB[0]
-
-
 def test_indices_beyond_the_dataset() -> None:
     pairs = RawPairs(list(SRGB), AUGMENT, crop=8)
     for index in (2, 2**63, 2**200, -(2**63) - 1):
-        refused(lambda index=index: pairs[index], "there is no picture -?[0-9]+: the dataset has 2", IndexError)  # type: ignore[misc]
-    refused(lambda: RawPairs([], AUGMENT)[0], "the dataset has 0", IndexError)
-    refused(lambda: RawPairs(Endless(), AUGMENT), "at most 1073741824 pictures can be counted")
+        refused(lambda index=index: pairs[index], "out of range", IndexError)  # type: ignore[misc]
+    refused(lambda: RawPairs([], AUGMENT)[0], "out of range", IndexError)
     assert RawPairs([SRGB[0]], AUGMENT, crop=8, seed=2**80)[0].noisy.isfinite().all()
 
 

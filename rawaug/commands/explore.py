@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from rawaug.data.demo.pairs import demo_files
+from rawaug.data.demo import demo_files
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_in
 from rawaug.errors import extra
 from rawaug.explore.page import address, build, listening, server_of

@@ -21,7 +21,7 @@ from denoisers.classical import Stabilised
 from denoisers.files import DEFAULT, JOINT, find
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import NoisyBlock, Sample
+from rawaug.data.pairs import Sample
 from rawaug.evaluation.contestants import load_network
 from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
@@ -194,7 +194,7 @@ class FrameDenoiser:
     reads_levels: bool = True
     linear: bool = False
 
-    def __call__(self, frame: RawFrame | NoisyBlock, levels: tuple[float, float]) -> Tensor:
+    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
         """float32 ``(1, H, W)``, of full colour ``(3, H, W)``, on the CPU, at most 1, not clipped at black."""
         denoised = self.run(bayer.pack(frame.mosaic[None], frame.cfa), levels, frame.cfa)
         image = denoised if self.linear else bayer.unpack(denoised, frame.cfa)

@@ -23,9 +23,9 @@ from rawaug.data import (
     write_dnd_submission,
     write_submission,
 )
-from rawaug.data.pairs import NoisyBlock
-from rawaug.data.sidd.blocks import BLOCKS
+from rawaug.data.sidd import BLOCKS
 from rawaug.files import require_writable
+from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise
 from rawaug.progress import progress
 from rawaug.registry import Spec
@@ -75,12 +75,12 @@ def submit_sidd(path: str, out: str, method: FrameDenoiser) -> int:
 def _sidd_denoised(benchmark: SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
     for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
         blocks = benchmark[first : first + BLOCKS]
-        levels = blocks[0].levels or (_estimated(blocks) if method.reads_levels else _UNUSED)
+        levels = blocks[0].noise_profile or (_estimated(blocks) if method.reads_levels else _UNUSED)
         for block in blocks:
             yield method(block, levels).clamp(0.0, 1.0)
 
 
-def _estimated(blocks: list[NoisyBlock]) -> tuple[float, float]:
+def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
     """The noise levels of a frame by its blocks."""
     try:
         estimate = estimate_noise(torch.cat([block.mosaic for block in blocks], dim=-1), blocks[0].cfa)
@@ -96,7 +96,8 @@ def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
     """Write and check DND's submission; the number of boxes."""
     boxes = Dnd(path)
     denoised = (
-        method(box, box.levels or _UNUSED).clamp(0.0, 1.0) for box in progress(boxes, label="benchmark", unit="box")
+        method(box, box.noise_profile or _UNUSED).clamp(0.0, 1.0)
+        for box in progress(boxes, label="benchmark", unit="box")
     )
     write_dnd_submission(out, denoised)
     check_dnd_submission(out, boxes)

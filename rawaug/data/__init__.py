@@ -14,14 +14,19 @@ from typing import Any
 from torch.utils.data import ConcatDataset
 
 from rawaug.data.check import check
-from rawaug.data.demo.camera import DemoCamera
-from rawaug.data.demo.drawn import Shapes, dead_leaves
-from rawaug.data.demo.pairs import demo_pairs, demo_photographs, demo_pictures
-from rawaug.data.dnd import Dnd, check_dnd_submission, write_dnd_submission
+from rawaug.data.demo import DemoCamera, demo_pairs, demo_photographs, demo_pictures
+from rawaug.data.drawn import Shapes, dead_leaves
 from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import PairFolder, require_no_pairs
-from rawaug.data.pairs import Binned, LazyPairs, NoisyBlock, Pair
-from rawaug.data.sidd.blocks import SiddBenchmark, check_submission, write_submission
+from rawaug.data.pairs import Binned, LazyPairs, Pair
+from rawaug.data.submissions import (
+    Dnd,
+    SiddBenchmark,
+    check_dnd_submission,
+    check_submission,
+    write_dnd_submission,
+    write_submission,
+)
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
@@ -29,7 +34,6 @@ __all__ = [
     "Binned",
     "DemoCamera",
     "Dnd",
-    "NoisyBlock",
     "Pair",
     "PairFolder",
     "PictureFolder",
@@ -108,9 +112,7 @@ def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence
     if isinstance(pairs, LazyPairs):
         return pairs
     if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
-        raise ValueError(
-            f"data must be a path, kind:path or a non-empty sequence of rawaug.data.Pair, got {type(pairs).__name__}"
-        )
+        raise ValueError(f"data must be a path, kind:path or a non-empty list of Pair, got {type(pairs).__name__}")
     return pairs
 
 

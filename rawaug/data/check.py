@@ -18,13 +18,12 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data.dnd import Dnd
 from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below, files_in
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
-from rawaug.data.sidd.blocks import SiddBenchmark, SiddBlocks, SiddPlusBlocks, check_submission
-from rawaug.data.sidd.frames import SiddFrames, is_scene
+from rawaug.data.sidd import SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
+from rawaug.data.submissions import Dnd, SiddBenchmark, check_submission
 from rawaug.errors import escape
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import isolated
@@ -44,14 +43,18 @@ class PartReport:
     signal: tuple[float, float] | None = None
     broken: list[str] = field(default_factory=list)
 
-    def add(self, other: PartReport) -> None:
-        """Add another report's counts; a damaged file of many blocks is one line."""
-        for what, counts in other.counts.items():
-            self.counts[what].update(counts)
-        if other.signal is not None:
-            low, high = self.signal or other.signal
-            self.signal = min(low, other.signal[0]), max(high, other.signal[1])
-        self.broken += [line for line in other.broken if line not in self.broken]
+    def add(self, facts: dict[str, str], signal: tuple[float, float] | None) -> None:
+        for what, value in facts.items():
+            self.counts[what][value] += 1
+        if signal is not None:
+            low, high = self.signal or signal
+            self.signal = min(low, signal[0]), max(high, signal[1])
+
+    def add_broken(self, error: Exception) -> None:
+        """Note a damaged item; a file of many blocks is one line."""
+        line = " ".join(str(error).split())
+        if line not in self.broken:
+            self.broken.append(line)
 
     def __str__(self) -> str:
         examined = "" if self.examined == self.items else f", {self.examined} examined"
@@ -104,7 +107,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file() and path.suffix in (".csv", ".mat"):
-        return DataReport(path, [_part("SIDD submission", partial(_submission, path), first)])
+        return DataReport(path, [_part("SIDD submission", partial(check_submission, path), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
         raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
@@ -169,61 +172,47 @@ class _RawFrames(Lazy[RawFrame]):
         return read_raw(self.files[index])
 
 
-def _submission(path: Path) -> list[Tensor]:
-    return list(check_submission(path))
-
-
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:
     """Read the items one by one; failures become lines of the report."""
     part = PartReport(what)
     try:
         items = open_part()
     except (OSError, ValueError) as error:
-        part.broken.append(" ".join(str(error).split()))
+        part.add_broken(error)
         return part
     part.items = len(items)
     part.examined = part.items if first is None else min(first, part.items)
     opening, names = pickle.dumps(open_part), getattr(items, "names", range(part.items))
     for index in range(part.examined):
         try:
-            part.add(isolated(_facts, opening, index, name=names[index]))
-        except OSError as error:  # of the helper: a crash or a hang
-            part.broken.append(str(error))
+            part.add(*isolated(_facts, opening, index, name=names[index]))
+        except (OSError, ValueError) as error:
+            part.add_broken(error)
     return part
 
 
 @lru_cache(maxsize=1)
 def _opened(opening: bytes) -> Any:
-    """The dataset, opened once in the helper process."""
     return pickle.loads(opening)()
 
 
-def _facts(opening: bytes, index: int) -> PartReport:
-    """A report on one item."""
-    items, facts = _opened(opening), PartReport("")
-    try:
-        _take(facts, getattr(items, "read", items.__getitem__)(index))
-    except (OSError, ValueError) as error:
-        facts.broken.append(" ".join(str(error).split()))
-    return facts
-
-
-def _take(part: PartReport, item: Any) -> None:
-    """Count one item: a picture, pair, RAW frame or noisy block."""
-    if isinstance(item, Tensor):
-        part.counts["sizes"][f"{item.shape[-2]} x {item.shape[-1]}"] += 1
-        return
-    raw: Tensor = item.raw if isinstance(item, Pair) else item.mosaic
-    part.counts["sizes"][f"{raw.shape[-2]} x {raw.shape[-1]}"] += 1
-    part.counts["cfas"][str(item.cfa)] += 1
-    if isinstance(item, RawFrame):
+def _facts(opening: bytes, index: int) -> tuple[dict[str, str], tuple[float, float] | None]:
+    """What is counted of an item (a picture, pair, RAW frame or noisy block), and the range of its signal."""
+    items = _opened(opening)
+    item = getattr(items, "read", items.__getitem__)(index)
+    image: Tensor = item.raw if isinstance(item, Pair) else getattr(item, "mosaic", item)
+    facts = {"sizes": f"{image.shape[-2]} x {image.shape[-1]}"}
+    if item is image:
+        return facts, None
+    facts["cfas"] = str(item.cfa)
+    levels = (item.shot_var, item.read_var) if isinstance(item, Pair) else item.noise_profile
+    if isinstance(item, RawFrame) and item.white > 1:
         black = "/".join(f"{level:g}" for level in dict.fromkeys(item.black))
-        part.counts["levels"][f"black {black}, white {item.white:g}"] += 1
-    levels = (item.shot_var, item.read_var) if isinstance(item, Pair) else getattr(item, "levels", None)
-    if levels is not None and None not in levels:
-        part.counts["levels"]["shot_var {:.1e}, read_var {:.1e}".format(*levels)] += 1
-    if camera := getattr(item, "camera", None):
-        part.counts["cameras"][camera] += 1
-    if iso := getattr(item, "iso", None):
-        part.counts["iso"][f"{iso:g}"] += 1
-    part.signal = raw.min().item(), raw.max().item()
+        facts["levels"] = f"black {black}, white {item.white:g}"
+    elif levels is not None and None not in levels:
+        facts["levels"] = "shot_var {:.1e}, read_var {:.1e}".format(*levels)
+    if item.camera != "unknown":
+        facts["cameras"] = item.camera
+    if item.iso:
+        facts["iso"] = f"{item.iso:g}"
+    return facts, (image.min().item(), image.max().item())

@@ -24,6 +24,9 @@ from rawaug.data.pairs import Pair
 from rawaug.io import encode_srgb
 from rawaug.io.raw import XYZ_FROM_SRGB
 
+UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3)
+"""Gains and matrix where a dataset states none."""
+
 
 def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
     """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1."""

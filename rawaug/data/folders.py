@@ -130,11 +130,9 @@ class PictureFolder(Dataset[Tensor]):
 
     @property
     def names(self) -> list[str]:
-        """The paths of the files."""
         return [str(self.file(index)) for index in range(len(self))]
 
     def file(self, index: int) -> Path:
-        """The file at ``index``."""
         return self.path / os.fsdecode(self._names[index])
 
     def read(self, index: int) -> Tensor:
@@ -165,11 +163,10 @@ class PictureFolder(Dataset[Tensor]):
     def report(self) -> str:
         """What was skipped so far, one line a file."""
         skipped = self.skipped
-        folder = escape(self.path)
         if not skipped:
-            return f"{folder}: none of {len(self)} pictures skipped so far"
-        lines = map(escape, skipped.values())
-        return "\n".join([f"{folder}: {len(skipped)} of {len(self)} pictures skipped", *lines])
+            return f"{escape(self.path)}: none of {len(self)} pictures skipped so far"
+        head = f"{escape(self.path)}: {len(skipped)} of {len(self)} pictures skipped"
+        return "\n".join([head, *map(escape, skipped.values())])
 
     def being_read(self) -> list[Path]:
         """The files that processes are reading now, or were reading when they died."""
@@ -177,7 +174,8 @@ class PictureFolder(Dataset[Tensor]):
 
     def _attempt(self, index: int) -> Tensor | None:
         """The picture, or None if it is damaged, which is then remembered."""
-        slot = _slot()
+        worker = get_worker_info()
+        slot = 0 if worker is None else (1 + worker.id) % _SLOTS
         self._reading[slot] = index
         try:
             return self.read(index)
@@ -187,14 +185,11 @@ class PictureFolder(Dataset[Tensor]):
         finally:
             self._reading[slot] = -1
         self._bad[index] = 1
-        count = int(self._bad.sum())
-        if count > self.allowed_share * len(self):
-            names = [f"{self.file(i)}" for i in self._bad.nonzero()[:_NAMED, 0].tolist()]
-            more = f" and {count - _NAMED} more" if count > _NAMED else ""
-            raise ValueError(
-                f"{self.path}: {count} of {len(self)} pictures are unusable, more than allowed_share "
-                f"{self.allowed_share:.0%}: {', '.join(names)}{more}; last: {self._reasons[index]}"
-            )
+        bad = self._bad.nonzero()[:, 0].tolist()
+        if len(bad) > self.allowed_share * len(self):
+            count = f"{len(bad)} of {len(self)} pictures are unusable, more than allowed_share {self.allowed_share:.0%}"
+            names = ", ".join([*(str(self.file(i)) for i in bad[:_NAMED]), *(["..."] if len(bad) > _NAMED else [])])
+            raise ValueError(f"{self.path}: {count}: {names}; last: {self._reasons[index]}")
         return None
 
 
@@ -204,11 +199,6 @@ _OPENED: WeakSet[PictureFolder] = WeakSet()
 def being_read() -> list[Path]:
     """:meth:`PictureFolder.being_read` of all folders that this process has opened."""
     return [file for folder in _OPENED for file in folder.being_read()]
-
-
-def _slot() -> int:
-    worker = get_worker_info()
-    return (0 if worker is None else 1 + worker.id) % _SLOTS
 
 
 def reports(pictures: Any) -> list[str]:
@@ -273,7 +263,6 @@ class Readable(Sequence[Pair]):
             return None
 
     def reasons(self) -> list[str]:
-        """The reasons for the pairs skipped so far, in order."""
         return [self.broken[index] for index in sorted(self.broken)]
 
     def kept(self) -> Sequence[Pair]:
@@ -367,7 +356,6 @@ def _centre(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
-    """File stems, or paths where two stems are equal."""
     names = [file.stem for file in files]
     if len(set(names)) < len(names):
         above = os.path.commonpath([file.resolve().parent for file in files])

@@ -23,9 +23,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ from rawaug.data.folders import RAW_EXTENSIONS
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
 from rawaug.errors import extra
 from rawaug.files import replacing
-from rawaug.io import read_raw
+from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import MAX_PIXELS, read_plane
 from rawaug.io.tiff import opened_tiff
@@ -45,39 +44,29 @@ from rawaug.io.tiff import opened_tiff
 # -- metadata ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Metadata:
-    """What is known of a mosaic besides its numbers; None where it is not."""
+Metadata = dict[str, Any]
+"""What is known of a mosaic besides its numbers: values of :data:`KINDS`."""
 
-    cfa: CFA | None = None
-    black: tuple[float, ...] | None = None
-    white: float | None = None
-    white_balance: tuple[float, float, float] | None = None
-    color_matrix: Tensor | None = None
-    shot_var: float | None = None
-    read_var: float | None = None
 
-    @classmethod
-    def parse(cls, values: Mapping[str, Any], where: str | Path) -> Metadata:
-        """From plain values or arrays; other keys are ignored."""
-        parsed: dict[str, Any] = {}
-        for key, value in values.items():
-            if key not in KINDS or value is None:
-                continue
+def parsed(values: Mapping[str, Any], where: str | Path) -> Metadata:
+    """Metadata of plain values or arrays; other keys, and None, are left out."""
+    found: Metadata = {}
+    for key, value in values.items():
+        if key in KINDS and value is not None:
             try:
-                parsed[key] = KINDS[key](value)
+                found[key] = KINDS[key](value)
             except (TypeError, ValueError, OverflowError) as error:
                 raise ValueError(f"{where}: {key} is not valid: {' '.join(str(error).split())}") from error
-        return cls(**parsed)
+    return found
 
-    def joined(self, given: Metadata, file: Path) -> Metadata:
-        """The metadata of ``file``, completed by what is ``given``."""
-        for key in ("cfa", "black", "white"):
-            own, other = getattr(self, key), getattr(given, key)
-            if own is not None and other is not None and own != other:
-                raise ValueError(f"{file}: states {key} {shown(own)}, not {shown(other)} as given; leave {key} out")
-        chosen = {key: getattr(given, key) if getattr(self, key) is None else getattr(self, key) for key in KINDS}
-        return Metadata(**chosen)
+
+def completed(stated: Metadata, given: Metadata, file: Path) -> Metadata:
+    """What a file states and what is ``given`` besides; ValueError where they contradict each other."""
+    for key, value in given.items():
+        own = stated.get(key, value)
+        if own != value:
+            raise ValueError(f"{file}: states {key} {_shown(own)}, not {_shown(value)} as given; leave {key} out")
+    return given | stated
 
 
 def levels(value: Any) -> tuple[float, ...]:
@@ -126,8 +115,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
 """What may be stated, and how each is read."""
 
 
-def shown(value: Any) -> str:
-    """A CFA or levels in a message."""
+def _shown(value: Any) -> str:
     return "/".join(f"{level:g}" for level in value) if isinstance(value, tuple) else f"{value}"
 
 
@@ -237,45 +225,27 @@ TWO_IN_ONE = (".npz", ".mat")
 # -- one mosaic -------------------------------------------------------------------------------------------------------
 
 
-class Mosaic(NamedTuple):
-    """A mosaic float32 ``(1, H, W)``, sides even (of an odd side the last line is left out), and its sensor."""
-
-    raw: Tensor
-    cfa: CFA
-    white_balance: tuple[float, float, float] | None
-    color_matrix: Tensor | None
-    levels: tuple[float, float] | None
-    camera: str = "unknown"
-    iso: float | None = None
-
-
-def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> Mosaic:
+def read_mosaic(file: Path, which: str, given: Metadata, alone: bool = False, max_pixels: int = MAX_PIXELS) -> RawFrame:
     """The noisy or clean mosaic (``which``) of a file, which is ``alone`` if it holds both by these names."""
     suffix = file.suffix.lower()
     if suffix in RAW_EXTENSIONS:
-        return _camera_file(file, given)
+        frame = read_raw(file)
+        completed({"cfa": frame.cfa, "black": levels(frame.black), "white": frame.white}, given, file)
+        return frame
     if suffix not in READERS:
         raise ValueError(f"{file}: cannot hold a mosaic; use {', '.join(READERS)} or a RAW format")
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file")
     numbers, values = READERS[suffix](file, which, alone, max_pixels)
-    stated = Metadata.parse(values, file).joined(given, file)
-    if stated.cfa is None:
+    stated = completed(parsed(values, file), given, file)
+    if "cfa" not in stated:
         raise ValueError(f"{file}: does not state its CFA; give cfa, such as RGGB")
-    return Mosaic(
-        raw=_normalised(file, numbers, stated.cfa, stated),
-        cfa=stated.cfa,
-        white_balance=stated.white_balance,
-        color_matrix=stated.color_matrix,
-        levels=None if stated.shot_var is None or stated.read_var is None else (stated.shot_var, stated.read_var),
-    )
-
-
-def _camera_file(file: Path, given: Metadata) -> Mosaic:
-    frame = read_raw(file)
-    Metadata(frame.cfa, levels(frame.black), frame.white).joined(given, file)
-    gains, matrix = (frame.white_balance, frame.color_matrix) if frame.color_known else (None, None)
-    return Mosaic(frame.mosaic, frame.cfa, gains, matrix, frame.noise_profile, frame.camera, frame.iso)
+    known: dict[str, Any] = {"color_known": {"white_balance", "color_matrix"} <= stated.keys()}
+    if known["color_known"]:
+        known |= {"white_balance": stated["white_balance"], "color_matrix": stated["color_matrix"]}
+    if {"shot_var", "read_var"} <= stated.keys():
+        known["noise_profile"] = stated["shot_var"], stated["read_var"]
+    return RawFrame(_normalised(file, numbers, stated), stated["cfa"], **known)
 
 
 def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
@@ -288,33 +258,25 @@ def _name_of(file: Path, names: Iterable[str], which: str, alone: bool) -> str:
     raise _Unclear(f"{file}: has no array {which}, but {', '.join(arrays) or 'none'}; name its mosaics noisy and clean")
 
 
-def _normalised(file: Path, numbers: np.ndarray, cfa: CFA, stated: Metadata) -> Tensor:
+def _normalised(file: Path, numbers: np.ndarray, stated: Metadata) -> Tensor:
     """Numbers as RAW float32 ``(1, H, W)``, black 0, white 1."""
     if numbers.dtype.kind not in "fui" or not numbers.size:
         raise ValueError(f"{file}: holds {numbers.dtype} {numbers.shape}; a mosaic must hold numbers")
-    black, white = _levels_of(file, numbers, stated)
+    if numbers.dtype.kind == "f" and not {"black", "white"} & stated.keys():
+        stated = stated | {"black": (0.0,), "white": 1.0}
+    for key in ("black", "white"):
+        if key not in stated:
+            raise ValueError(f"{file}: does not state its {key} level; give black and white")
+    black, white, cfa = stated["black"], stated["white"], stated["cfa"]
+    if white <= max(black):
+        raise ValueError(f"{file}: white level {white:g} is not above black level {_shown(black)}")
     low, high = float(numbers.min()), float(numbers.max())
     if not (high <= white and low > 2 * min(black) - white):
-        raise ValueError(
-            f"{file}: has values from {low:.4g} to {high:.4g}, outside black {shown(black)} and white {white:g}; "
-            "give the right black and white"
-        )
+        stated_range = f"black {_shown(black)} and white {white:g}; give the right black and white"
+        raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}, outside {stated_range}")
     packed = _packed(file, torch.from_numpy(np.ascontiguousarray(numbers, np.float32)), cfa)
     sites = torch.tensor(black, dtype=torch.float32).reshape(-1, 1, 1)
     return bayer.unpack((packed - sites) / (white - sites), cfa)
-
-
-def _levels_of(file: Path, numbers: np.ndarray, stated: Metadata) -> tuple[tuple[float, ...], float]:
-    black, white = stated.black, stated.white
-    if black is None and white is None and numbers.dtype.kind == "f":
-        return (0.0,), 1.0
-    for key, level in (("black", black), ("white", white)):
-        if level is None:
-            raise ValueError(f"{file}: does not state its {key} level; give black and white")
-    assert black is not None and white is not None
-    if white <= max(black):
-        raise ValueError(f"{file}: white level {white:g} is not above black level {shown(black)}")
-    return black, white
 
 
 def _packed(file: Path, numbers: Tensor, cfa: CFA) -> Tensor:

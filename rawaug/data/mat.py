@@ -8,8 +8,6 @@ naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,32 +40,7 @@ def mat_version(path: str | Path) -> str:
 
 
 def variables(path: str | Path) -> list[str]:
-    """The names of a file's variables."""
-    return isolated(_variables, Path(path))
-
-
-def _variables(path: Path) -> list[str]:
-    if mat_version(path) == "5":
-        from scipy.io import whosmat
-
-        with damage_as_os_error(path, _UNREADABLE, _Missing):
-            return [name for name, *_ in whosmat(path)]
-    with _hdf5(path) as file:
-        return _names(file)
-
-
-@contextmanager
-def _hdf5(path: Path) -> Iterator[Any]:
-    with damage_as_os_error(path, _UNREADABLE, _Missing):
-        with extra("data"):
-            import h5py
-
-        with h5py.File(path, "r") as file:
-            yield file
-
-
-def _names(file: Any) -> list[str]:
-    return [name for name in file if not name.startswith("#")]
+    return list(isolated(_shapes, Path(path)))
 
 
 def read_array(path: str | Path, name: str) -> np.ndarray:
@@ -88,36 +61,45 @@ def read_value(path: str | Path, name: str) -> Any:
 def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
     """RAW of two or more ``axes`` and white 1 as float32, with a channel axis before the last two."""
     if values.ndim != axes or values.dtype.kind != "f" or not values.size:
-        raise ValueError(
-            f"{file}: holds {values.dtype} {values.shape}; normalised RAW must be floating point with {axes} axes"
-        )
+        raise ValueError(f"{file}: holds {values.dtype} {values.shape}; normalised RAW is floats with {axes} axes")
     low, high = float(values.min()), float(values.max())
     if not (low > -1 and high <= 1):
-        raise ValueError(
-            f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0 and white at 1"
-        )
+        raise ValueError(f"{file}: has values from {low:.4g} to {high:.4g}; normalised RAW has black at 0, white at 1")
     return torch.from_numpy(np.ascontiguousarray(values, np.float32)).unsqueeze(-3)
 
 
+def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """The variables by name; HDF5 states their shapes with their values."""
+    version = mat_version(path)
+    with damage_as_os_error(path, _UNREADABLE):
+        if version == "5":
+            from scipy.io import whosmat
+
+            return {name: shape for name, shape, _ in whosmat(path)}
+        with _hdf5(path) as file:
+            return {name: () for name in file if not name.startswith("#")}
+
+
+def _hdf5(path: Path) -> Any:
+    with extra("data"):
+        import h5py
+
+    return h5py.File(path, "r")
+
+
 def _read(path: Path, name: str, plain: bool) -> Any:
-    if mat_version(path) == "5":
-        return _read_5(path, name, plain)
-    with _hdf5(path) as file:
-        if name not in file:
-            raise _missing(path, name, _names(file))
-        node = _member(file, name)
-        return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
+    shapes, version = _shapes(path), mat_version(path)
+    if name not in shapes:
+        raise ValueError(f"{path}: has no variable {name}; its variables are: {', '.join(shapes) or 'none'}")
+    with damage_as_os_error(path, _UNREADABLE):
+        if version == "5":
+            from scipy.io import loadmat
 
-
-def _read_5(path: Path, name: str, plain: bool) -> Any:
-    from scipy.io import loadmat, whosmat
-
-    with damage_as_os_error(path, _UNREADABLE, _Missing):
-        shapes = {found: shape for found, shape, _ in whosmat(path)}
-        if name not in shapes:
-            raise _missing(path, name, list(shapes))
-        _require_size(8 * math.prod(shapes[name]), name)
-        return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
+            _require_size(8 * math.prod(shapes[name]), name)
+            return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
+        with _hdf5(path) as file:
+            node = _member(file, name)
+            return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
 
 
 def _require_size(size: int, name: str) -> None:
@@ -134,14 +116,6 @@ def _member(group: Any, name: str) -> Any:
     return group[name]
 
 
-class _Missing(ValueError):
-    """The variable does not exist; the file is not damaged."""
-
-
-def _missing(path: Path, name: str, existing: list[str]) -> _Missing:
-    return _Missing(f"{path}: has no variable {name}; its variables are: {', '.join(existing) or 'none'}")
-
-
 def _values(node: Any) -> Any:
     """The values of an HDF5 dataset; refuses external storage and datasets above the size limit."""
     if node.external or node.is_virtual:
@@ -151,7 +125,6 @@ def _values(node: Any) -> Any:
 
 
 def _plain(node: Any, file: Any) -> Any:
-    """An HDF5 node of a 7.3 file as plain values."""
     import h5py
 
     if isinstance(node, h5py.Group):

@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
-from rawaug.data.development import develop_mosaic
+from rawaug.data.development import UNKNOWN_COLOUR, develop_mosaic
 from rawaug.data.folders import RawFolder, files_below
-from rawaug.data.formats import READABLE, TWO_IN_ONE, Metadata, read_mosaic
+from rawaug.data.formats import READABLE, TWO_IN_ONE, parsed, read_mosaic
 from rawaug.data.pairs import LazyPairs, Pair
 from rawaug.registry import DATASETS
 
@@ -57,8 +55,6 @@ class PairSettings(MosaicSettings):
 
 
 class PairFiles(NamedTuple):
-    """The files of a pair, which may be one."""
-
     name: str
     noisy: Path
     clean: Path
@@ -98,7 +94,7 @@ class PairFolder(LazyPairs):
         black: float | Sequence[float] | None = None,
         white: float | None = None,
     ) -> None:
-        self.given = Metadata.parse({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
+        self.given = parsed({"cfa": cfa, "black": black, "white": white}, f"pairs:{path}")
         self.pairs = _pairs_below(Path(path), noisy, clean)
         super().__init__([pair.name for pair in self.pairs])
 
@@ -107,7 +103,7 @@ class PairFolder(LazyPairs):
         return tuple(dict.fromkeys((noisy, clean)))
 
     def stamp(self, index: int) -> str:
-        given = (self.given.cfa, self.given.black, self.given.white)
+        given = tuple(self.given.get(key) for key in ("cfa", "black", "white"))
         return super().stamp(index) + (f" {given}" if any(given) else "")
 
     def read(self, index: int) -> Pair:
@@ -118,26 +114,22 @@ class PairFolder(LazyPairs):
             for file, which in zip(files, ("noisy", "clean"), strict=True)
         )
         for what, one, other in (
-            ("size", tuple(noisy.raw.shape[1:]), tuple(clean.raw.shape[1:])),
+            ("size", tuple(noisy.mosaic.shape[1:]), tuple(clean.mosaic.shape[1:])),
             ("CFA", noisy.cfa, clean.cfa),
         ):
             if one != other:
                 raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
-        stated = [
-            (mosaic.white_balance, mosaic.color_matrix)
-            for mosaic in (clean, noisy)
-            if mosaic.white_balance is not None and mosaic.color_matrix is not None
-        ]
-        gains, matrix = stated[0] if stated else ((1.0, 1.0, 1.0), torch.eye(3))
-        shot_var, read_var = noisy.levels or (None, None)
+        stated = [(frame.white_balance, frame.color_matrix) for frame in (clean, noisy) if frame.color_known]
+        gains, matrix = stated[0] if stated else UNKNOWN_COLOUR
+        shot_var, read_var = noisy.noise_profile or (None, None)
         return Pair(
             name=name,
-            srgb=develop_mosaic(clean.raw, clean.cfa, gains, matrix),
-            raw=clean.raw,
+            srgb=develop_mosaic(clean.mosaic, clean.cfa, gains, matrix),
+            raw=clean.mosaic,
             cfa=clean.cfa,
             white_balance=gains,
             color_matrix=matrix,
-            noisy=noisy.raw,
+            noisy=noisy.mosaic,
             shot_var=shot_var,
             read_var=read_var,
             camera=noisy.camera,
@@ -155,10 +147,8 @@ def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:
         if partner and partner.resolve() in files:
             raise ValueError(f"{file}: is the noisy frame of {partner.name}; read both as pairs:{spec}")
         if found and as_clean:
-            raise ValueError(
-                f"{file}: is noisy by its name and would be taken for a clean frame; "
-                f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"
-            )
+            advice = f"noisy/clean pairs are read as pairs:{spec}; rename it if it is clean"
+            raise ValueError(f"{file}: is noisy by its name and would be taken for a clean frame; {advice}")
 
 
 def looks_like_pairs(files: Sequence[Path]) -> bool:
@@ -208,9 +198,7 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
         )
         partner = index.get(wanted.casefold())
         if partner is None:
-            raise FileNotFoundError(
-                f"{file}: has no clean frame {top / wanted}; add it, or set clean, the pattern of clean files"
-            )
+            raise FileNotFoundError(f"{file}: has no clean frame {top / wanted}; add it, or set the pattern clean")
         if partner == file:
             raise ValueError(f"{file}: would be its own clean frame by the pattern {clean}")
         found.append(PairFiles(re.sub(r"_noisy$", "", _stem(top, file), flags=re.IGNORECASE), file, partner))
@@ -227,9 +215,7 @@ def _clean_pattern(noisy: str) -> str:
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
     if not count:
-        raise ValueError(
-            f"the pattern {noisy} does not contain the word noisy; give the pattern of the clean files too"
-        )
+        raise ValueError(f"the pattern {noisy} does not contain the word noisy; give that of the clean files too")
     return clean
 
 

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, groupby
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, overload, runtime_checkable
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 import torch
@@ -105,18 +105,16 @@ class Pair:
 
     @property
     def balance_known(self) -> bool:
-        """Whether ``white_balance`` is the camera's."""
         return self.white_balance != (1.0, 1.0, 1.0)
 
     def with_levels(self) -> Pair:
-        """This pair, with noise levels measured against ``raw`` if the capture states none."""
+        """This pair, with levels measured against ``raw`` if the capture states none."""
         if self.noisy is None or self.shot_var is not None:
             return self
         shot_var, read_var = measured_levels(self.raw, self.noisy)
         return replace(self, shot_var=shot_var, read_var=read_var, levels_from_clean=True)
 
     def require_rendered(self) -> None:
-        """Raise ValueError if ``srgb`` is no rendering in the camera's colours."""
         if not self.rendered:
             raise ValueError(
                 f"{self.name}: has no sRGB picture, and its white balance and colour matrix are unknown; "
@@ -172,9 +170,8 @@ class Pair:
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])
         if tuple(image.shape) != expected or image.dtype != dtype:
-            raise ValueError(
-                f"pair {self.name}: {field} must be {dtype} {expected}, got {image.dtype} {tuple(image.shape)}"
-            )
+            got = f"{image.dtype} {tuple(image.shape)}"
+            raise ValueError(f"pair {self.name}: {field} must be {dtype} {expected}, got {got}")
 
 
 def _bin_picture(srgb: Tensor, factor: int) -> Tensor:
@@ -191,25 +188,12 @@ class Sample(NamedTuple):
     variance: Tensor
 
 
-@dataclass(frozen=True)
-class NoisyBlock:
-    """A piece of a benchmark's frame of which only the noisy version is public.
+class FrameLabel(NamedTuple):
+    """The scene that a frame shows, the phone that took it, and its ISO."""
 
-    Attributes:
-        name: as the benchmark counts: frame and block.
-        mosaic: float32 ``(1, H, W)``, black 0, white 1, as published.
-        cfa: the pattern of ``mosaic``, which begins at the corner of the block.
-        levels: (shot_var, read_var) where they are published.
-        white_balance: as-shot multipliers of R, G, B, green being 1; all 1 where they are not known.
-        color_matrix: float32 ``(3, 3)``, white-balanced camera colour to linear sRGB, rows summing to 1.
-    """
-
-    name: str
-    mosaic: Tensor
-    cfa: CFA
-    levels: tuple[float, float] | None = None
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
+    scene: str
+    phone: str
+    iso: int
 
 
 class Lazy(Sequence[T], ABC, Generic[T]):
@@ -246,13 +230,15 @@ class LazyPairs(Lazy[Pair]):
 
     max_pixels: int = MAX_PIXELS
     """sRGB pictures, and mosaics in PNG files, with more are refused before they are decoded."""
+    labels: Sequence[FrameLabel] = ()
+    """One a frame, where the dataset knows them without reading any."""
 
     def files_of(self, index: int) -> Sequence[Path]:
         """The files that identify a pair; none where its name does."""
         return ()
 
     def stamp(self, index: int) -> str:
-        """What a pair depends on, without reading it: path, size and modification time of its files, or its name."""
+        """What a pair depends on: path, size and modification time of its files, or its name."""
         files = [f"{f.resolve()} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in self.files_of(index)]
         return " ".join(files) or self.names[index]
 
@@ -278,7 +264,6 @@ def lazy(pairs: Sequence[Pair]) -> LazyPairs:
 
 
 def names_of(pairs: Sequence[Pair]) -> list[str]:
-    """Names of the pairs."""
     return lazy(pairs).names
 
 
@@ -293,14 +278,13 @@ def shared_frame(first: Sequence[Pair], second: Sequence[Pair]) -> str | None:
 
 
 def _identities(pairs: LazyPairs) -> set[str]:
-    files = {index: pairs.files_of(index) for index in range(len(pairs))}
-    return {str(file.resolve()) for some in files.values() for file in some} | {
-        pairs.names[index] for index, some in files.items() if not some
-    }
+    found: set[str] = set()
+    for index, name in enumerate(pairs.names):
+        found |= {str(file.resolve()) for file in pairs.files_of(index)} or {name}
+    return found
 
 
 def require_split(kind: str, split: str, known: Iterable[str]) -> None:
-    """Raise ValueError if a dataset has no such split."""
     if split not in known:
         raise ValueError(f"{kind}: no split {split}; use one of {', '.join(known)}")
 
@@ -311,8 +295,7 @@ class SomePairs(LazyPairs):
     def __init__(self, pairs: Sequence[Pair], indices: Iterable[int] | None = None) -> None:
         self.pairs, self.indices = lazy(pairs), list(range(len(pairs)) if indices is None else indices)
         super().__init__([self.pairs.names[index] for index in self.indices])
-        if isinstance(pairs, Labelled):
-            self.labels = [pairs.labels[index] for index in self.indices]
+        self.labels = [self.pairs.labels[index] for index in self.indices] if self.pairs.labels else ()
 
     def read(self, index: int) -> Pair:
         return self.pairs[self.indices[index]]
@@ -368,54 +351,30 @@ OWN_PICTURES = "pairs"
 """``data.pictures`` of a recipe that augments the pictures of its own pairs."""
 
 
-class PairPictures(Sequence[Tensor]):
+class PairPictures(Lazy[Tensor]):
     """The pictures uint8 ``(3, H, W)`` of pairs; a pair is read when its picture is asked for."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
+        super().__init__(names_of(pairs))
 
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
+    def read(self, index: int) -> Tensor:
         return self.pairs[index].srgb
-
-
-SELECTIONS = ("first", "scenes", "phones")
-
-
-class FrameLabel(NamedTuple):
-    """The scene that a frame shows, the phone that took it, and its ISO."""
-
-    scene: str
-    phone: str
-    iso: int
-
-
-@runtime_checkable
-class Labelled(Protocol):
-    """A dataset whose frames have labels, known without reading any."""
-
-    @property
-    def labels(self) -> Sequence[FrameLabel]: ...
 
 
 def selected(pairs: Sequence[Pair], kept: int, count: int | None, select: str | Sequence[str] = "first") -> list[int]:
     """Choose ``count`` (None: all) of the first ``kept`` pairs without reading any; returns their indices."""
     if not isinstance(select, str):
         return _named(names_of(pairs)[:kept], select)[:count]
-    if select not in SELECTIONS:
-        raise ValueError(f"data.select {select!r} is unknown; use {', '.join(SELECTIONS)} or a list of names")
     if select == "first":
         return list(range(kept)[:count])
-    if not isinstance(pairs, Labelled):
+    choices = {"scenes": whole_scenes, "phones": one_a_phone}
+    if select not in choices:
+        raise ValueError(f"data.select {select!r} is unknown; use first, {', '.join(choices)} or a list of names")
+    labels = lazy(pairs).labels
+    if not labels:
         raise ValueError(f"data.select: {select} needs frames with labels, such as sidd:; use first or names")
-    if count is None:
-        return list(range(kept))
-    choose = whole_scenes if select == "scenes" else one_a_phone
-    return choose(pairs.labels[:kept], count)
+    return list(range(kept)) if count is None else choices[select](labels[:kept], count)
 
 
 def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
@@ -424,10 +383,8 @@ def whole_scenes(labels: Sequence[FrameLabel], count: int) -> list[int]:
     totals = list(accumulate(len(list(group)) for _, group in groupby(order, key=lambda k: labels[k].scene)))
     if count not in totals:
         near = sorted(totals, key=lambda total: abs(total - count))[:2]
-        raise ValueError(
-            f"data.count: {count} pairs are not whole scenes; use {' or '.join(map(str, sorted(near)))}, "
-            "or select: first"
-        )
+        use = " or ".join(map(str, sorted(near)))
+        raise ValueError(f"data.count: {count} pairs are not whole scenes; use {use}, or select: first")
     return order[:count]
 
 

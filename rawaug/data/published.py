@@ -37,8 +37,9 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,7 @@ from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
 
+_SPLITS: dict[str, Any] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))
 CAMERAS = ("canon", "nikon")
 FIVEK_DNG = re.compile(r"a(\d{4})-.*\.dng", re.IGNORECASE)
 
@@ -66,14 +68,9 @@ def fivek_pairs(
     adjust_maximum_thr: float = 0.0,
     jpeg_quality: int | None = None,
 ) -> RawFolder:
-    """The pairs of a split, Canon before Nikon, each sorted by number.
+    """The pairs of a split below a folder, Canon before Nikon, each sorted by number.
 
-    Args:
-        path: contains the DNGs under their published names, ``a0016-jmac_MG_0795.dng``, at any depth.
-        split: ``"train"`` or ``"test"``.
-        cameras: some of :data:`CAMERAS`.
-        adjust_maximum_thr: LibRaw's scaling by the frame's own maximum.
-        jpeg_quality: the pictures as JPEGs of this quality give them back; None leaves them as they are.
+    ``adjust_maximum_thr`` and ``jpeg_quality`` are those of :class:`rawaug.data.RawFolder`.
     """
     wanted = [number for camera in cameras for number in fivek_numbers(camera, split)]
     files = {found[1]: file for file in files_in(path, "FiveK", (".dng",)) if (found := FIVEK_DNG.fullmatch(file.name))}
@@ -87,48 +84,32 @@ def fivek_pairs(
     return RawFolder(chosen, camera_jpeg=False, adjust_maximum_thr=adjust_maximum_thr, jpeg_quality=jpeg_quality)
 
 
-_as_invisp = partial(fivek_pairs, adjust_maximum_thr=0.75, jpeg_quality=90)
-"""As its published script makes the pictures."""
-
 for _camera in CAMERAS:
-    DATASETS.register(f"fivek_{_camera}")(partial(fivek_pairs, cameras=[_camera]))
-    DATASETS.register(f"invisp_{_camera}")(partial(_as_invisp, cameras=[_camera]))
+    _of_camera = partial(fivek_pairs, cameras=[_camera])
+    DATASETS.register(f"fivek_{_camera}")(_of_camera)
+    # InvISP's pictures as its published script makes them
+    DATASETS.register(f"invisp_{_camera}")(partial(_of_camera, adjust_maximum_thr=0.75, jpeg_quality=90))
 
 
 def fivek_numbers(camera: str, split: str) -> list[str]:
-    """The numbers, four digits, of the DNGs of a split."""
-    splits = _splits()
     if camera not in CAMERAS:
         raise ValueError(f"fivek: no camera {camera}; use one of {', '.join(CAMERAS)}")
-    require_split("fivek", split, splits[camera])
-    return splits[camera][split].split()
-
-
-@cache
-def _splits() -> dict[str, dict[str, str]]:
-    content: dict[str, dict[str, str]] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))
-    return content
+    require_split("fivek", split, _SPLITS[camera])
+    numbers: list[str] = _SPLITS[camera][split].split()
+    return numbers
 
 
 WHITE = {".jpg": 2**10, ".png": 2**12 - 1}
 """White level by the picture's extension."""
 
-_ARRAYS = (".npy", ".npz")
-_MAGIC = b"\x93NUMPY"
-
 RAWIR_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
-"""By split."""
 
 
 @DATASETS.register("rawir")
 class Rawir(LazyPairs):
-    """The pairs below a folder, in RGGB.
+    """The pairs below a folder, in RGGB; of subfolders ``train``, ``val`` or ``test`` only the one of the split.
 
-    Args:
-        path: contains ``.npy`` or ``.npz`` files with a picture beside each, at any depth. Where it has subfolders
-            ``train``, ``val`` or ``test``, only the one of the split is taken.
-        split: ``"train"``, ``"validation"`` or ``"test"``.
-        white: in digital numbers; by default as :data:`WHITE` says.
+    ``white`` is in digital numbers, by default as :data:`WHITE` says.
     """
 
     def __init__(self, path: str | Path, split: str = "train", white: float | None = None) -> None:
@@ -136,7 +117,7 @@ class Rawir(LazyPairs):
         folder, self.white = Path(path), white
         if any((folder / name).is_dir() for name in RAWIR_FOLDERS.values()):
             folder = folder / RAWIR_FOLDERS[split]
-        self.files = self.of_split(files_in(folder, "RAWIR", _ARRAYS), split)
+        self.files = self.of_split(files_in(folder, "RAWIR", (".npy", ".npz")), split)
         if not self.files:
             raise ValueError(f"{path}: has no pair for {split}; it needs files of {TENTH} RAWs")
         self.pictures = [picture_beside(file) for file in self.files]
@@ -147,7 +128,6 @@ class Rawir(LazyPairs):
         return files
 
     def camera_of(self, file: Path) -> str:
-        """The camera of a file, which the names do not say."""
         return "unknown"
 
     def read(self, index: int) -> Pair:
@@ -158,13 +138,14 @@ class Rawir(LazyPairs):
             raw=unpack(read_packed(file, picture, self.white), CFA.RGGB),
             cfa=CFA.RGGB,
             camera=self.camera_of(file),
-            registered=not _is_p20(file),
+            registered=not any("p20" in part.lower() for part in file.parts),
         )
 
 
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
     """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level."""
-    numbers, stated = _archive(file) if file.suffix == ".npz" else (_array(file), None)
+    with damage_as_os_error(file, "cannot be read as packed RAW"):
+        numbers, stated = _archived(file) if file.suffix == ".npz" else (_array(file), None)
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
     white = white or stated or WHITE[picture.suffix.lower()]
@@ -175,30 +156,23 @@ def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
 
 def _array(file: Path) -> np.ndarray:
     """The array of an ``.npy`` file, mapped: one that claims more than the file holds takes no memory."""
-    with damage_as_os_error(file, "cannot be read as an array"):
-        with file.open("rb") as opened:
-            if opened.read(len(_MAGIC)) != _MAGIC:  # NumPy would open an archive of arrays, or a pickle
-                raise ValueError("does not begin as one")
-        return np.load(file, mmap_mode="r", allow_pickle=False)
+    with file.open("rb") as opened:
+        if opened.read(6) != b"\x93NUMPY":  # NumPy would open an archive of arrays, or a pickle
+            raise ValueError("does not begin as an array")
+    return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
-def _archive(file: Path) -> tuple[np.ndarray, float]:
+def _archived(file: Path) -> tuple[np.ndarray, float]:
     """``raw`` and ``max_val`` of an ``.npz`` file."""
-    with damage_as_os_error(file, "cannot be read as raw and max_val"):
-        arrays = read_npz(file, lambda names: ["raw", "max_val"])
-        return arrays["raw"], float(arrays["max_val"])
+    arrays = read_npz(file, lambda names: ["raw", "max_val"])
+    return arrays["raw"], float(arrays["max_val"])
 
 
 def picture_beside(file: Path) -> Path:
-    """The picture of the same stem."""
     for suffix in WHITE:
         if file.with_suffix(suffix).is_file():
             return file.with_suffix(suffix)
     raise FileNotFoundError(f"{file}: has no {' or '.join(WHITE)} of the same stem beside it; download it too")
-
-
-def _is_p20(file: Path) -> bool:
-    return any("p20" in part.lower() for part in file.parts)
 
 
 TENTH = 10
@@ -207,12 +181,7 @@ _TURN = {"test": (0,), "validation": (1,), "train": tuple(range(2, TENTH))}
 
 @DATASETS.register("rgb2raw")
 class Rgb2Raw(Rawir):
-    """The pairs of a split; a pair's camera is the name of its folder.
-
-    Args:
-        path: contains the arrays, ``.npy`` or ``.npz``, with a picture beside each, at any depth.
-        split: ``"train"``, ``"validation"`` or ``"test"``.
-    """
+    """The pairs of a split below a folder; a pair's camera is the name of its folder."""
 
     def of_split(self, files: list[Path], split: str) -> list[Path]:
         """By the place of a RAW among those of its folder."""
@@ -239,10 +208,7 @@ _BITS = 10
 class Zurich(LazyPairs):
     """The pairs of a split, sorted by number.
 
-    Args:
-        path: contains ``train`` and ``test`` with ``huawei_raw`` and ``canon`` in each.
-        split: ``"train"`` or ``"test"``.
-        black, white: in digital numbers of 10 bits. PNGs of 8 bits hold a quarter of them.
+    ``black`` and ``white`` are in digital numbers of 10 bits; PNGs of 8 bits hold a quarter of them.
     """
 
     def __init__(
@@ -263,9 +229,7 @@ class Zurich(LazyPairs):
         numbers = read_plane(file, self.max_pixels)
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
-            raise ValueError(
-                f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is not a RAW of this dataset"
-            )
+            raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is of another dataset")
         light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
         return Pair(
             name=self.names[index],
@@ -287,11 +251,7 @@ class RawBench(LazyPairs):
 
     Settings were held but for the ISO, so the clean frame is brought to the noisy one's exposure: it is multiplied by
     the ratio of their means, where neither is clipped, and has noise of its own that this ratio amplifies. The picture
-    is a plain development of it.
-
-    Args:
-        path: contains the folders of the scenes.
-        split: is ignored: the dataset has no splits.
+    is a plain development of it. There are no splits.
     """
 
     def __init__(self, path: str | Path, split: str = "test") -> None:

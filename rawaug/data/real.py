@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from rawaug.data.pairs import LazyPairs, Pair, require_split
 from rawaug.io.pictures import read_plane
 from rawaug.registry import DATASETS
 
-FRAMES = resources.files("rawaug.data").joinpath("real_frames")
+FRAMES = Path(__file__).with_name("real_frames")
 FACTOR = 4
 BLACK, WHITE = 512, 16383
 """Of the PNGs. Below black lies what is left of the noise there."""
@@ -56,7 +55,7 @@ class RealFrames(LazyPairs):
         name = self.names[index]
         known = _frames()[name]
         cfa, gains, matrix = CFA(known["cfa"]), tuple(known["white_balance"]), torch.tensor(known["color_matrix"])
-        numbers = read_plane(Path(str(FRAMES.joinpath(f"{name}.png")))).astype(np.float32)
+        numbers = read_plane(FRAMES / f"{name}.png").astype(np.float32)
         planes = torch.from_numpy((numbers - BLACK) / (WHITE - BLACK)).reshape(4, -1, numbers.shape[-1])
         raw = unpack(planes, cfa)
         return Pair(
@@ -74,5 +73,5 @@ class RealFrames(LazyPairs):
 
 @cache
 def _frames() -> dict[str, dict[str, Any]]:
-    frames: dict[str, dict[str, Any]] = json.loads(FRAMES.joinpath("frames.json").read_text(encoding="utf-8"))
+    frames: dict[str, dict[str, Any]] = json.loads((FRAMES / "frames.json").read_text(encoding="utf-8"))
     return frames

@@ -19,10 +19,9 @@ import math
 import struct
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from os import SEEK_END
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -32,13 +31,15 @@ from rawaug import __version__
 from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.files import replacing
-from rawaug.io.gain_map import of_planes, opcode_list
+from rawaug.io.gain_map import GainMap, of_planes, opcode_list
 from rawaug.io.raw import XYZ_FROM_SRGB, RawFrame
 from rawaug.io.tiff import (
     ACTIVE_AREA,
     CFA_PHOTOMETRIC,
     DNG_VERSION,
     LINEAR_PHOTOMETRIC,
+    OPCODE_LIST_2,
+    OPCODE_LIST_3,
     all_pages,
     main_mosaic,
     opened_tiff,
@@ -94,20 +95,21 @@ def write_dng(
     directories = {"ExifTag": _exif(frame, carried.byte_order), **carried.directories}
     directories = {name: entries for name, entries in directories.items() if entries}
     own = _camera(frame) if DNG_VERSION in carried.tags else _camera(frame) | _color(frame, baseline_exposure)
-    tags = own | carried.tags | _tags_of_any_pixels(frame)
+    tags = own | carried.tags | {254: (LONG, 1, 0), 274: (SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation])}
     if rgb is None:
         tags |= _tags_of_the_mosaic(frame)
     else:
         tags = {code: tag for code, tag in tags.items() if code not in _OF_MOSAICS} | _tags_of_full_colour(frame)
-    pointers: list[Tag] = [(name, LONG, 1, 0, True) for name in directories]
+    extra_tags = [(code, *tag, True) for code, tag in sorted(tags.items())]
+    extra_tags += [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
-            _write(partial, numbers, carried.byte_order, [*(tags[code] for code in sorted(tags)), *pointers])
+            _write(partial, numbers, carried.byte_order, extra_tags)
         for name, entries in directories.items():
             append_directory(partial, name, entries)
 
 
-def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]) -> None:
+def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[tuple[Any, ...]]) -> None:
     with extra("raw"):
         import imagecodecs
         import tifffile
@@ -115,7 +117,6 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
     height, width, *colours = numbers.shape
     # even and odd columns of a mosaic are components: their colours differ
     columns = np.ascontiguousarray(numbers) if colours else numbers.reshape(height, width // 2, 2)
-    software = f"rawaug {__version__}"
     tifffile.imwrite(
         path,
         iter([imagecodecs.jpeg8_encode(columns, lossless=True, predictor=1, bitspersample=16)]),
@@ -128,7 +129,7 @@ def _write(path: Path, numbers: np.ndarray, byte_order: str, tags: Sequence[Tag]
         planarconfig="contig" if colours else None,
         photometric=LINEAR_PHOTOMETRIC if colours else CFA_PHOTOMETRIC,
         extratags=tags,
-        software=software,
+        software=f"rawaug {__version__}",
         metadata=None,
     )
 
@@ -149,9 +150,7 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     if frame.mosaic.shape[0] != 1 or frame.mosaic.ndim != 3 or height % 2 or width % 2:
         raise ValueError(f"{path}: the mosaic must be (1, H, W) with even sides, got {tuple(frame.mosaic.shape)}")
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
-        raise ValueError(
-            f"{path}: levels must satisfy 0 <= black < white <= 65535, got {frame.black} and {frame.white}"
-        )
+        raise ValueError(f"{path}: levels must be 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
     numbers = np.empty((height, width), np.uint16)
     for (i, j), black in zip(CFA(frame.cfa).sites, frame.black, strict=True):
         plane = frame.mosaic[0, i::2, j::2].double().mul_(frame.white - black).add_(black).round_()
@@ -171,74 +170,61 @@ def linear_numbers(frame: RawFrame, rgb: Tensor, path: Path) -> np.ndarray:
     return (rgb.permute(1, 2, 0).clamp(0, 1) * LINEAR_WHITE).round().numpy().astype(np.uint16)
 
 
-def _camera(frame: RawFrame) -> dict[int, Tag]:
+def _camera(frame: RawFrame) -> Tags:
     make, _, model = frame.camera.partition(" ")
     names = {271: make, 272: model or make, _UNIQUE_CAMERA_MODEL: frame.camera}
     # tifffile takes text of 7 bits; DNG has UTF-8 in its place
-    return {code: (code, ASCII, 0, name if name.isascii() else name.encode(), True) for code, name in names.items()}
+    return {code: (ASCII, 0, name if name.isascii() else name.encode()) for code, name in names.items()}
 
 
-def _color(frame: RawFrame, baseline_exposure: float) -> dict[int, Tag]:
+def _color(frame: RawFrame, baseline_exposure: float) -> Tags:
     """Tags that are only written if the source is not a DNG."""
-    tags: list[Tag] = [
-        (DNG_VERSION, BYTE, 4, bytes((1, 4, 0, 0)), True),
-        (50707, BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0)), True),
-        (50721, SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel()), True),
-        (50728, RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance]), True),
-        (50730, SRATIONAL, 1, _rationals([baseline_exposure]), True),
-        (50778, SHORT, 1, _D65, True),
-    ]
-    for code, on_mosaic in ((51009, True), (51022, False)):
-        maps = [m for m in frame.gain_maps if m.on_mosaic == on_mosaic]
-        if maps:
-            opcodes = opcode_list(maps)
-            tags.append((code, UNDEFINED, len(opcodes), opcodes, True))
-    if frame.exposure.date:
-        tags.append((306, ASCII, 0, frame.exposure.date, True))
-    return _by_code(tags)
+    tags: Tags = {
+        DNG_VERSION: (BYTE, 4, bytes((1, 4, 0, 0))),
+        50707: (BYTE, 4, bytes((1, 3 if frame.gain_maps else 1, 0, 0))),
+        50721: (SRATIONAL, 9, _rationals(xyz_to_camera(frame).ravel())),
+        50728: (RATIONAL, 3, _rationals([1 / gain for gain in frame.white_balance])),
+        50730: (SRATIONAL, 1, _rationals([baseline_exposure])),
+        50778: (SHORT, 1, _D65),
+        **_opcodes(OPCODE_LIST_2, [m for m in frame.gain_maps if m.on_mosaic]),
+        **_opcodes(OPCODE_LIST_3, [m for m in frame.gain_maps if not m.on_mosaic]),
+    }
+    return tags | {306: (ASCII, 0, frame.exposure.date)} if frame.exposure.date else tags
 
 
-def _tags_of_any_pixels(frame: RawFrame) -> dict[int, Tag]:
-    return _by_code([(254, LONG, 1, 0, True), (274, SHORT, 1, _EXIF_ORIENTATIONS[frame.orientation], True)])
+def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
+    opcodes = opcode_list(maps)
+    return {code: (UNDEFINED, len(opcodes), opcodes)} if maps else {}
 
 
-def _tags_of_the_mosaic(frame: RawFrame) -> dict[int, Tag]:
+def _tags_of_the_mosaic(frame: RawFrame) -> Tags:
     levels = [frame.black[CFA(frame.cfa).sites.index((i, j))] for i in (0, 1) for j in (0, 1)]
-    tags: list[Tag] = [
-        (33421, SHORT, 2, (2, 2), True),
-        (33422, BYTE, 4, bytes("RGB".index(colour) for colour in CFA(frame.cfa).value), True),
-        (50710, BYTE, 3, bytes((0, 1, 2)), True),
-        (50711, SHORT, 1, 1, True),
-        (50713, SHORT, 2, (2, 2), True),
-        (50714, RATIONAL, 4, _rationals(levels, 2**14), True),
-        (50717, LONG, 1, round(frame.white), True),
-    ]
-    if frame.noise_profile is not None:
-        tags.append((51041, DOUBLE, 2, frame.noise_profile, True))
-    return _by_code(tags)
+    tags: Tags = {
+        33421: (SHORT, 2, (2, 2)),
+        33422: (BYTE, 4, bytes("RGB".index(colour) for colour in CFA(frame.cfa).value)),
+        50710: (BYTE, 3, bytes((0, 1, 2))),
+        50711: (SHORT, 1, 1),
+        50713: (SHORT, 2, (2, 2)),
+        50714: (RATIONAL, 4, _rationals(levels, 2**14)),
+        50717: (LONG, 1, round(frame.white)),
+    }
+    return tags | {51041: (DOUBLE, 2, frame.noise_profile)} if frame.noise_profile is not None else tags
 
 
-_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, 51009)
+_OF_MOSAICS = (50710, 50733, 50734, 50737, 50738, 51008, OPCODE_LIST_2)
 """Green split, Bayer's sharpness, antialias strength, and opcodes of what is before demosaicing."""
 
 
-def _tags_of_full_colour(frame: RawFrame) -> dict[int, Tag]:
+def _tags_of_full_colour(frame: RawFrame) -> Tags:
     """Levels by colour; shading maps of the mosaic's sites become maps of the planes."""
-    # LibRaw takes a black level of three colours for that of four, the last one 0, and develops 3 % too dark
-    tags: list[Tag] = [
-        (50713, SHORT, 2, (1, 1), True),
-        (50714, RATIONAL, 3, _rationals((0, 0, 0)), True),
-        (50717, LONG, 3, (LINEAR_WHITE,) * 3, True),
-    ]
     maps = [m for found in frame.gain_maps if found.on_mosaic for m in of_planes(found, frame.cfa)]
-    if maps:
-        opcodes = opcode_list(maps)
-        tags.append((51009, UNDEFINED, len(opcodes), opcodes, True))
-    return _by_code(tags)
-
-
-def _by_code(tags: Iterable[Tag]) -> dict[int, Tag]:
-    return {tag[0]: tag for tag in tags}
+    # LibRaw takes a black level of three colours for that of four, the last one 0, and develops 3 % too dark
+    return {
+        50713: (SHORT, 2, (1, 1)),
+        50714: (RATIONAL, 3, _rationals((0, 0, 0))),
+        50717: (LONG, 3, (LINEAR_WHITE,) * 3),
+        **_opcodes(OPCODE_LIST_2, maps),
+    }
 
 
 def xyz_to_camera(frame: RawFrame) -> np.ndarray:
@@ -296,12 +282,11 @@ _REPLACED = (274, 305, 347, 37500, *_SUB_DIRECTORIES.values())
 _DROPPED = frozenset((*_LAYOUT, *_PREVIEW, *_LEVELS, *_DIGESTS, *_REPLACED))
 _CROP = (50718, 50719, 50720, 51125)
 
-Tag = tuple[Any, int, int, Any, bool]
-"""As tifffile takes them: code, type, count, value, once."""
+Tags = dict[int, tuple[int, int, Any]]
+"""Type, count and value by code; tifffile counts text itself."""
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """One value of a directory, its bytes in the file's order."""
 
     code: int
@@ -310,12 +295,11 @@ class Entry:
     data: bytes
 
 
-@dataclass(frozen=True)
-class CarriedTags:
+class CarriedTags(NamedTuple):
     """Of a source: its byte order (``<`` or ``>``), the tags of the picture, and its sub-directories by name."""
 
     byte_order: str
-    tags: dict[int, Tag]
+    tags: Tags
     directories: dict[str, list[Entry]]
 
 
@@ -332,10 +316,10 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
             first = pages[0].tags
             dng = any(DNG_VERSION in page.tags for page in pages)
             mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []
-            tags: dict[int, Tag] = {}
+            tags: Tags = {}
             for page in (pages[0], *mosaics):
                 kept = [tag for tag in page.tags if (tag.code not in _DROPPED if dng else tag.code in _OF_ANY_TIFF)]
-                tags |= {tag.code: (tag.code, int(tag.dtype), tag.count, _value(tag), True) for tag in kept}
+                tags |= {tag.code: (int(tag.dtype), tag.count, _value(tag)) for tag in kept}
             if mosaics and not _fills_active_area(mosaics[0], size):
                 tags = {code: tag for code, tag in tags.items() if code not in _CROP}
             order = tiff.byteorder

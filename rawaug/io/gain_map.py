@@ -74,9 +74,7 @@ def _parse(body: bytes, on_mosaic: bool) -> GainMap:
     gains = np.frombuffer(body, ">f4", size, _GRID.size).reshape(points_v, points_h, map_planes)
     spaced = all(spacing > 0 for spacing, points in zip(grid[:2], (points_v, points_h), strict=True) if points > 1)
     if not (spaced and np.isfinite(grid).all() and np.isfinite(gains).all() and gains.min() > 0):
-        raise ValueError(
-            f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and smallest gain {gains.min():g} is invalid"
-        )
+        raise ValueError(f"a gain map of spacing {grid[0]:g} x {grid[1]:g} and least gain {gains.min():g} is invalid")
     return GainMap(
         area=(top, left, bottom, right),
         pitch=(rows, columns),
@@ -130,20 +128,13 @@ def _multiply(product: Tensor, m: GainMap, plane: int, where: Tensor | None) -> 
     top, left, bottom, right = m.area
     height, width = product.shape
     window = slice(top, min(bottom, height), m.pitch[0]), slice(left, min(right, width), m.pitch[1])
-    gains = m.gains[plane]
-    for axis, size in enumerate((height, width)):
-        low, high, part = _between(torch.arange(size)[window[axis]], size, m.origin[axis], m.spacing[axis], gains, axis)
-        part = part[:, None] if axis == 0 else part
-        gains = torch.lerp(gains.index_select(axis, low), gains.index_select(axis, high), part)
+    rows, columns = (_weights(m, axis, product.shape[axis])[window[axis]] for axis in (0, 1))
+    gains = rows @ m.gains[plane] @ columns.T
     product[window] *= gains if where is None else torch.where(where[window], gains, 1.0)
 
 
-def _between(
-    pixels: Tensor, size: int, origin: float, spacing: float, gains: Tensor, axis: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The nodes on either side of each pixel along an axis, and how far it is from the first towards the second."""
-    last = gains.shape[axis] - 1
-    position = ((pixels + 0.5) / size - origin) / spacing if last else torch.zeros(len(pixels))
-    position = position.clamp(0, last)
-    low = position.floor().long()
-    return low, (low + 1).clamp(max=last), (position - low).float()
+def _weights(m: GainMap, axis: int, size: int) -> Tensor:
+    """Of the map's nodes along an axis at each of ``size`` pixels, ``(size, nodes)``."""
+    nodes = m.gains.shape[1 + axis]
+    position = ((torch.arange(size) + 0.5) / size - m.origin[axis]) / (m.spacing[axis] if nodes > 1 else 1.0)
+    return (1 - (position.clamp(0, nodes - 1)[:, None] - torch.arange(nodes)).abs()).clamp_min(0)

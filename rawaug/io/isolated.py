@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 LIMIT, SECONDS = "RAWAUG_READ_SECONDS", 60.0
 _IDLE_SECONDS = 60
+_ADVICE = "leave it out, or copy it again"
 _one_at_a_time = threading.Lock()
 
 
@@ -41,14 +42,12 @@ def isolated(read: Callable[..., T], *arguments: Any, name: object = None) -> T:
             return value
         except TimeoutError:
             _stop_helper()
-            raise OSError(
-                f"{name}: cannot be read within {seconds:g} s ({LIMIT}); leave it out, or copy it again"
-            ) from None
+            raise OSError(f"{name}: cannot be read within {seconds:g} s ({LIMIT}); {_ADVICE}") from None
         except BrokenProcessPool as error:
             _stop_helper()
             how = re.search(r"exit codes? .*\{(.*)\}", str(error))
             why = f" ({how[1]})" if how else ""
-            raise OSError(f"{name}: crashes the decoder{why}; leave it out, or copy it again") from None
+            raise OSError(f"{name}: crashes the decoder{why}; {_ADVICE}") from None
 
 
 @contextmanager

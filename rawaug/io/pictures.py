@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -74,15 +73,13 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
         torch.Size([3, 480, 640])
     """
-    with _text_damage_as_os_error(Path(path)):
-        pixels, orientation = _read(Path(path), max_pixels)
+    pixels, orientation = _read(Path(path), max_pixels)
     return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()
 
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG."""
-    with _text_damage_as_os_error(Path(path)):
-        pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
+    pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
         raise ValueError(f"{path}: has {pixels.dtype} channels {names}; a mosaic must have one channel of 8 or 16 bits")
@@ -111,15 +108,6 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_first_line(output.geterror())})")
 
 
-@contextmanager
-def _text_damage_as_os_error(path: Path) -> Iterator[None]:
-    """OpenImageIO's binding fails on header texts that are not valid UTF-8."""
-    try:
-        yield
-    except UnicodeDecodeError as error:
-        raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
-
-
 def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
 
@@ -144,7 +132,10 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
     spec = source.spec()
     spec.attribute(_FORMAT, source.format_name())
     _require_size(spec, path, max_pixels)
-    pixels = source.read_image(kind(spec))
+    try:
+        pixels = source.read_image(kind(spec))
+    except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
+        raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
     error = source.geterror()  # also set where a decoder padded a truncated file
     # a GIF is marked as animated only if its frames have a duration
     moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
@@ -204,9 +195,7 @@ def _round_to_8_bits(pixels: np.ndarray, path: Path, linear: bool = False) -> np
     """Floating point in [0, 1] to the nearest 8-bit level, through the sRGB transfer where the values are linear."""
     low, high = float(pixels.min()), float(pixels.max())
     if not (low >= -_HALF_LEVEL and high <= 1 + _HALF_LEVEL):
-        raise ValueError(
-            f"{path}: has values from {low:.4g} to {high:.4g}, expected [0, 1]; scale or tone-map it first"
-        )
+        raise ValueError(f"{path}: has values from {low:.4g} to {high:.4g}, expected [0, 1]; scale or tone-map it")
     values = np.clip(pixels, 0, 1)
     if linear:
         values = encode_srgb(torch.from_numpy(values)).numpy()
@@ -278,10 +267,6 @@ def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
     with extra("raw"):
         from PIL import Image
 
-    if srgb.ndim != 3 or srgb.shape[0] != 3 or srgb.dtype != torch.uint8:
-        raise ValueError(f"a picture must be uint8 (3, H, W), got {srgb.dtype} {tuple(srgb.shape)}")
-    if not 1 <= quality <= 100:
-        raise ValueError(f"quality must be 1 to 100, got {quality}")
     stored = BytesIO()
     picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
     picture.save(stored, "JPEG", quality=quality, subsampling="4:2:2")

@@ -18,7 +18,7 @@ import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,7 @@ _developed_in: int | None = None
 
 @dataclass(frozen=True)
 class RawFrame:
-    """One RAW file.
+    """A mosaic, and what its file states of it.
 
     Attributes:
         mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
@@ -112,21 +112,22 @@ class RawFrame:
             LibRaw renders with, or a typical camera's if neither the file nor LibRaw has one.
         camera: make and model, or ``"unknown"``.
         iso: None if unknown.
-        noise_profile: (shot_var, read_var) of a DNG's NoiseProfile tag, the mean over planes; None without one.
+        noise_profile: (shot_var, read_var) that the file states (of a DNG's NoiseProfile the mean over planes); None
+            if it states none.
         orientation: LibRaw's flip: 0, or a sum of 1 (columns reversed), 2 (rows reversed), 4 (transposed last).
         name: the file's name without extension.
-        color_known: false where ``color_matrix`` is the typical one.
+        color_known: false where ``color_matrix`` is not this camera's.
         gain_maps: a DNG's correction of the lens shading, which is not applied to ``mosaic``.
         exposure: seconds, f-number, focal length in mm and EXIF date, each None if unknown.
     """
 
     mosaic: Tensor
     cfa: CFA
-    black: tuple[float, float, float, float]
-    white: float
-    white_balance: tuple[float, float, float]
-    daylight: tuple[float, float, float]
-    color_matrix: Tensor
+    black: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    white: float = 1.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    daylight: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    color_matrix: Tensor = field(default_factory=lambda: torch.eye(3))
     camera: str = "unknown"
     iso: float | None = None
     noise_profile: tuple[float, float] | None = None
@@ -195,9 +196,7 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
             pixels = raw.postprocess(adjust_maximum_thr=adjust_maximum_thr, **settings)
     height, width = frame.mosaic.shape[-2:]
     if (pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2) != (height, width):
-        raise ValueError(
-            f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}, so they do not match"
-        )
+        raise ValueError(f"{path}: LibRaw renders {pixels.shape[:2]} from a mosaic of {height} x {width}")
     return frame, torch.from_numpy(pixels[:height, :width]).permute(2, 0, 1).contiguous()
 
 
@@ -217,9 +216,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
             tags = read_tiff_tags(path)
             size = path.stat().st_size
             if tags.mosaic_end is not None and tags.mosaic_end > size:  # LibRaw would not say what is wrong
-                raise OSError(
-                    f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic_end} bytes; copy it again"
-                )
+                raise OSError(f"{path}: cannot be read as RAW: truncated, {size} of {tags.mosaic_end} bytes")
             if raw.sizes.raw_height * raw.sizes.raw_width > MAX_PIXELS:
                 declared = f"{raw.sizes.raw_height} x {raw.sizes.raw_width}"
                 raise ValueError(f"{path}: declares {declared} pixels, above the limit of {MAX_PIXELS}; copy it again")
@@ -227,9 +224,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
             yield raw, tags
     except rawpy.LibRawError as error:
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
-        raise OSError(
-            f"{path}: cannot be read as RAW (LibRaw: {reason}); check that it is complete and from a supported camera"
-        ) from error
+        advice = "check that it is complete and from a supported camera"
+        raise OSError(f"{path}: cannot be read as RAW (LibRaw: {reason}); {advice}") from error
     except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
         raise ValueError(f"{path}: has no Bayer mosaic ({error}); only Bayer RAW is supported") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
@@ -295,9 +291,8 @@ def _black_of_sites(path: Path, raw: Any, black: np.ndarray, tags: TiffTags) -> 
     lines = []
     for above, start, length in zip((tags.black_rows, tags.black_columns), first, (height, width), strict=True):
         if above and len(above) != start + length:
-            raise OSError(
-                f"{path}: its TIFF tags are damaged (black levels of {len(above)} lines, not {start + length})"
-            )
+            lengths = f"black levels of {len(above)} lines, not {start + length}"
+            raise OSError(f"{path}: its TIFF tags are damaged ({lengths})")
         lines.append(np.array(above or (0.0,) * (start + length), np.float32)[start:])
     cells = np.tile(black, (-(-height // 2), -(-width // 2)))[:height, :width]
     return np.asarray(cells + lines[0][:, None] + lines[1])

@@ -11,7 +11,7 @@ plane, with noise variance S y + O for a signal y whose black is 0 and white 1: 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
@@ -40,7 +40,7 @@ class _Layout(NamedTuple):
 
 
 _LAYOUTS = {42: _Layout("I", "H", "HHI"), 43: _Layout("Q", "Q", "HHQ")}
-"""By the number after the byte order: TIFF and BigTIFF."""
+"""Of TIFF and BigTIFF, by the number after the byte order."""
 
 
 def require_no_circle(path: Path) -> None:
@@ -103,7 +103,7 @@ def _number(file: BinaryIO, form: str, place: int) -> int:
 MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
 _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
 ACTIVE_AREA = 50829
-_OPCODE_LIST_2, _OPCODE_LIST_3 = 51009, 51022
+OPCODE_LIST_2, OPCODE_LIST_3 = 51009, 51022
 CFA_PHOTOMETRIC, LINEAR_PHOTOMETRIC = 32803, 34892
 _RATIONALS = (5, 10)
 
@@ -118,8 +118,8 @@ class TiffTags:
     mosaic_end: int | None = None
     black: tuple[float, float, float, float] | None = None
     gain_maps: tuple[GainMap, ...] = ()
-    black_rows: tuple[float, ...] = ()
-    black_columns: tuple[float, ...] = ()
+    black_rows: Sequence[float] = ()
+    black_columns: Sequence[float] = ()
     area: tuple[int, int] = (0, 0)
 
 
@@ -138,13 +138,10 @@ def read_tiff_tags(path: Path) -> TiffTags:
             profile = _noise_profile(pages)
             if mosaic is None:
                 return TiffTags(make, model, profile)
-            rows, columns = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
-            black = _black(mosaic, _mean(rows) + _mean(columns))
+            (above, rows), (beside, columns) = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
+            black, end, maps = _black(mosaic, above + beside), _mosaic_end(mosaic), _gain_maps(mosaic)
             area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
-            rows, columns = _about_zero(rows), _about_zero(columns)
-            return TiffTags(
-                make, model, profile, _mosaic_end(mosaic), black, _gain_maps(mosaic), rows, columns, area[:2]
-            )
+            return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2])
     except tifffile.TiffFileError:
         return TiffTags()
 
@@ -207,24 +204,15 @@ def _numbers(tag: Any) -> Any:
         return values[0::2] / values[1::2]
 
 
-def _deltas(mosaic: Any, code: int) -> tuple[float, ...]:
-    """Offsets of the black level for each row or column of the active area; empty if there are none."""
+def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
+    """Offsets of the black level for each row or column of the active area: their mean, and what is left, if any."""
     tag = mosaic.tags.get(code)
-    if tag is None or not np.any(values := _numbers(tag)):
-        return ()
+    values: list[float] = [] if tag is None else _numbers(tag).tolist()
     if not np.isfinite(values).all():
         raise ValueError(f"tag {code}: black levels that are not finite")
-    return tuple(values.tolist())
-
-
-def _about_zero(deltas: tuple[float, ...]) -> tuple[float, ...]:
-    """Subtract the mean; empty if nothing is left."""
-    mean = _mean(deltas)
-    return tuple(delta - mean for delta in deltas) if any(delta != mean for delta in deltas) else ()
-
-
-def _mean(values: tuple[float, ...]) -> float:
-    return sum(values) / len(values) if values else 0.0
+    mean = sum(values) / max(1, len(values))
+    left = [value - mean for value in values]
+    return mean, left if any(left) else []
 
 
 def _black(mosaic: Any, more: float) -> tuple[float, float, float, float] | None:
@@ -241,10 +229,10 @@ def _black(mosaic: Any, more: float) -> tuple[float, float, float, float] | None
 
 def _gain_maps(mosaic: Any) -> tuple[GainMap, ...]:
     found: tuple[GainMap, ...] = ()
-    for code in (_OPCODE_LIST_2, _OPCODE_LIST_3):
+    for number, code in ((2, OPCODE_LIST_2), (3, OPCODE_LIST_3)):
         opcodes = mosaic.tags.valueof(code)
         try:
-            found += parse_gain_maps(opcodes, code == _OPCODE_LIST_2) if opcodes else ()
+            found += parse_gain_maps(opcodes, on_mosaic=number == 2) if opcodes else ()
         except ValueError as error:
-            raise ValueError(f"OpcodeList{2 if code == _OPCODE_LIST_2 else 3}: {error}") from None
+            raise ValueError(f"OpcodeList{number}: {error}") from None
     return found

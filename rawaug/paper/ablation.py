@@ -23,7 +23,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data import PictureFolder, open_pairs, open_pictures
-from rawaug.data.demo.pairs import FRAME
+from rawaug.data.demo import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data import DemoCamera, Pair
-from rawaug.data.demo.pairs import FRAME
+from rawaug.data.demo import FRAME
 from rawaug.io import decode_srgb, encode_srgb
 from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.dictionary import plausible

@@ -146,9 +146,7 @@ class RawAugment(nn.Module):
             raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
         self.noise = noise_for(self.isp, noise)
         if self.pattern is not None and self.noise.by_plane:
-            raise ValueError(
-                f"this noise differs between the planes R, Gr, Gb, B, which {self.pattern.name} does not have"
-            )
+            raise ValueError(f"this noise is one of planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self.sampling, self.strength, self.seed, self.exposure = sampling, strength, seed, exposure
         self.cameras = self.isp.camera_sampler(sampling == "convex", light)
         self.light = light
@@ -216,17 +214,15 @@ class RawAugment(nn.Module):
         if self.sampling in ("convex", "independent"):
             if self.cameras is None:
                 return self.isp.draw_setting(len(srgb), generator)
-            return self._toned(self.cameras.sample(len(srgb), generator, self.device))
+            setting = self.cameras.sample(len(srgb), generator, self.device)
+            if self.tone is None:
+                return setting
+            return setting._replace(tone_weights=self.tone.to(setting.tone_weights).expand_as(setting.tone_weights))
         chosen = self.baked.choose(srgb)
         if self.sampling == "chosen":
             return chosen
         weights = [w for w in (chosen.colour_weights, chosen.gain_weights, chosen.tone_weights) if w.shape[1]]
         return self.isp.params_from_weights(*(perturb(w, self.strength, generator) for w in weights))
-
-    def _toned(self, setting: ISPParams) -> ISPParams:
-        if self.tone is None:
-            return setting
-        return setting._replace(tone_weights=self.tone.to(setting.tone_weights).expand_as(setting.tone_weights))
 
     def _expose(self, setting: ISPParams, generator: torch.Generator) -> ISPParams:
         """An exposure of e stops divides the gains of the forward direction by 2^e."""
@@ -355,7 +351,6 @@ class RawAugment(nn.Module):
 
     @property
     def cfa(self) -> str:
-        """The name of the RAW's pattern."""
         return str(self.isp.cfa) if self.pattern is None else self.pattern.name
 
     def mosaic(self, raw: Tensor) -> Tensor:
@@ -364,7 +359,6 @@ class RawAugment(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """The device of the module."""
         return self.isp.gain.log_gains.device
 
     def _batch(self, pictures: Any) -> Tensor:
@@ -377,9 +371,7 @@ class RawAugment(nn.Module):
 
     def _require_here(self, srgb: Tensor) -> None:
         if srgb.device != self.device:
-            raise ValueError(
-                f"the pictures are on {srgb.device} but the augmentation is on {self.device}; call augment.to(...)"
-            )
+            raise ValueError(f"pictures on {srgb.device}, but augmentation on {self.device}; call augment.to(...)")
 
     def _own_generator(self) -> torch.Generator:
         """A new one for each call, worker and process."""

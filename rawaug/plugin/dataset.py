@@ -10,6 +10,7 @@ The epoch advances by itself: it is the number of times that picture i was asked
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -123,18 +124,8 @@ class RawPairs(Dataset[Any]):
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> Any:
-        index = self._checked(index)
+        index = range(len(self))[operator.index(index)]  # an IndexError ends iteration
         return self.draw(index, self._generator(*self._epochs.key(index)))
-
-    def _checked(self, index: int) -> int:
-        if not isinstance(index, SupportsIndex):
-            raise TypeError(
-                f"the index must be an integer, got {type(index).__name__}; for slices use torch.utils.data.Subset"
-            )
-        try:
-            return range(len(self))[index]
-        except IndexError:  # ends iteration
-            raise IndexError(f"there is no picture {index}: the dataset has {len(self)}") from None
 
     def draw(self, index: int, generator: torch.Generator) -> Any:
         """The pair of picture ``index``, drawn from ``generator``; counts no epoch."""
@@ -250,10 +241,7 @@ def augmentation(augment: RawAugment | DictionaryISP | str | Path) -> RawAugment
         return augment
     if isinstance(augment, (DictionaryISP, str, Path)):
         return RawAugment.from_pretrained(augment)
-    raise TypeError(
-        "augment must be a RawAugment, a DictionaryISP, or the name or path of an ISP, such as 'universal'; "
-        f"got {type(augment).__name__}"
-    )
+    raise TypeError(f"augment must be a RawAugment, or an ISP, its name or path; got {type(augment).__name__}")
 
 
 def crop_size(crop: int | Sequence[int] | None) -> tuple[int, int] | None:

@@ -29,7 +29,6 @@ from rawaug.seeding import rank_key
 
 
 def world_size() -> int:
-    """Number of distributed processes."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     return torch.distributed.get_world_size() if distributed else 1
 
@@ -61,8 +60,7 @@ def _chose_its_order(loader: DataLoader[Any]) -> bool:
 
 
 _COUNTED = -1  # in place of a pinned epoch
-MAX_WORKERS = 128
-MAX_COUNTED = 2**30  # pictures
+MAX_WORKERS = 512
 
 
 def checked_epoch(epoch: SupportsIndex) -> int:
@@ -77,8 +75,6 @@ class _Epochs:
 
     def __init__(self, *shape: int) -> None:
         self._pinned = torch.full((1,), _COUNTED).share_memory_()
-        if math.prod(shape) > MAX_COUNTED:
-            raise ValueError(f"visits of at most {MAX_COUNTED} pictures can be counted, the dataset has {shape[0]}")
         self._counts = torch.zeros(shape, dtype=torch.int32).share_memory_()
         self._rank: tuple[int, ...] = ()
 
@@ -89,7 +85,6 @@ class _Epochs:
         return None if epoch == _COUNTED else epoch
 
     def pin(self, epoch: int) -> None:
-        """All draws belong to ``epoch`` from now on."""
         self._pinned[0] = checked_epoch(epoch)
 
     def rank(self) -> tuple[int, ...]:
@@ -105,10 +100,8 @@ class _Epochs:
             if isinstance(value, Tensor):
                 value.share_memory_()  # an unpickled copy is not shared with its own workers; in a worker it is already
 
-    def _check(self, state: dict[str, Any], *names: str) -> None:
-        if set(state) != {"epoch", *names}:
-            raise ValueError(f"a state has epoch, {', '.join(names)}; got {', '.join(map(str, state)) or 'nothing'}")
-        self._pinned[0] = _COUNTED if state["epoch"] is None else checked_epoch(state["epoch"])
+    def _resume(self, epoch: int | None) -> None:
+        self._pinned[0] = _COUNTED if epoch is None else checked_epoch(epoch)
 
 
 class Visits(_Epochs):
@@ -127,9 +120,7 @@ class Visits(_Epochs):
         if self.pinned is not None:
             return (self.pinned, index)
         if index >= len(self._counts):
-            raise ValueError(
-                f"the dataset has grown from {len(self._counts)} pictures since RawPairs was created; create it again"
-            )
+            raise ValueError(f"the dataset has grown from {len(self._counts)} pictures; create RawPairs again")
         visit = int(self._counts[index])
         self._counts[index] = visit + 1
         return (visit, index, *self.rank())
@@ -140,10 +131,10 @@ class Visits(_Epochs):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from ``state``; ValueError if it is not one of as many pictures."""
-        visits = torch.as_tensor(state.get("visits", ()))
-        if "visits" in state and visits.shape != self._counts.shape:
+        visits = torch.as_tensor(state["visits"])
+        if visits.shape != self._counts.shape:
             raise ValueError(f"the state is that of {len(visits)} pictures, the dataset has {len(self._counts)}")
-        self._check(state, "visits")
+        self._resume(state["epoch"])
         self._counts.copy_(visits)
 
     @staticmethod
@@ -169,8 +160,6 @@ class Passes(_Epochs):
 
     def begin(self, workers: int, worker: int) -> tuple[int, int]:
         """Count a pass of a worker; return its epoch and the number of the first sample."""
-        if workers > MAX_WORKERS:
-            raise ValueError(f"a stream counts the passes of at most {MAX_WORKERS} workers, got {workers}")
         # Other rows alone: a sibling may be counting the same pass in this one.
         others = self._counts[:workers, 0].sum() + self._counts[workers + 1 :, 0].sum()
         started = int(self._counts[workers, worker] + others)
@@ -186,7 +175,6 @@ class Passes(_Epochs):
             self._running = (self._running[0], number)
 
     def end(self) -> None:
-        """The pass of this process is over."""
         self._running = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -198,8 +186,7 @@ class Passes(_Epochs):
         return {"epoch": self.pinned, "passes": started, "position": position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``."""
-        self._check(state, "passes", "position")
+        self._resume(state["epoch"])
         self._counts.zero_()
         self._counts[0, 0] = state["passes"]
         self._resumed.copy_(torch.tensor([state["passes"], state["position"]]))

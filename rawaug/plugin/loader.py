@@ -104,12 +104,7 @@ class WrappedLoader:
         A wrapped loader with a ``load_state_dict`` of its own goes on by itself; of any other the first batches are
         loaded again and passed over. Their order is the same if it is sequential, drawn from the loader's own
         ``generator``, or that of a distributed run; what a script shuffles from PyTorch's global state it restores.
-
-        Raises:
-            ValueError: if it is no state of a wrapped loader.
         """
-        if missing := {"epoch", "batch"} - set(state):
-            raise ValueError(f"not the state of a wrapped loader: {', '.join(sorted(missing))} missing")
         goes_on = "loader" in state and hasattr(self.loader, "load_state_dict")
         self._next = self._at = Position(state["epoch"], state["batch"], 0 if goes_on else state["batch"])
         if goes_on:

@@ -46,7 +46,6 @@ class AugmentParams(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[AugmentParams]) -> AugmentParams:
-        """Those of several batches as one batch."""
         flat = [params.tensors() for params in parts]
         return cls.from_tensors({name: torch.cat([tensors[name] for tensors in flat]) for name in flat[0]})
 

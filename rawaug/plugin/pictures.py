@@ -56,9 +56,7 @@ def to_rgb_batch(pictures: Any) -> Tensor:
         return stacked([to_rgb_tensor(picture) for picture in pictures])
     image = _as_tensor(pictures)
     if image.ndim != 4:
-        raise ValueError(
-            f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list of pictures, got {_described(pictures)}"
-        )
+        raise ValueError(f"a batch must be (B, 3, H, W), (B, H, W, 3) or a list, got {_described(pictures)}")
     return _rgb(image, pictures)
 
 
@@ -67,9 +65,7 @@ def stacked(images: Sequence[Tensor]) -> Tensor:
     sizes = sorted({tuple(image.shape[-2:]) for image in images})
     if len(sizes) != 1:
         named = ", ".join(f"{height} x {width}" for height, width in sizes) or "no pictures"
-        raise ValueError(
-            f"all pictures of a batch must have one size, got {named}; crop them, for example with wrap(..., crop=256)"
-        )
+        raise ValueError(f"pictures of a batch must have one size, got {named}; crop them, as wrap(..., crop=256) does")
     if len({image.dtype for image in images}) > 1:
         images = [as_float(image) for image in images]
     return torch.stack(list(images))

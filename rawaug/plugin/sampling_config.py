@@ -81,11 +81,9 @@ class SamplingConfig:
         return {**self._given("camera", "cfa"), **self.draws(), **self.form()}
 
     def make(self) -> RawAugment:
-        """The augmentation."""
         return RawAugment.from_pretrained(self.isp, **self.arguments())
 
     def stored(self) -> dict[str, Any]:
-        """What was given, as JSON."""
         given = self._given(*vars(self))
         return {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
 

@@ -21,7 +21,7 @@ from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Readable, left_out
 from rawaug.data.pairs import Pair, shared_frame
 from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.io import read_raw
+from rawaug.io import RawFrame, read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_noise, from_dark_frames, plot_noise
@@ -34,23 +34,11 @@ MOST_FRAMES = 32
 _UNKNOWN = "unknown"
 
 
-class MeasuredFrame(NamedTuple):
-    """A mosaic, its pattern, and the camera and ISO that the file names."""
-
-    mosaic: Tensor
-    cfa: CFA
-    camera: str
-    iso: float | None
-
-
 class CameraNoise(NamedTuple):
-    """What was measured."""
-
     law: MeasuredLevels
     estimates: dict[float | None, NoiseEstimate]
 
     def plot(self, path: str | Path) -> None:
-        """Draw the points and lines of each ISO, see :func:`noise_figures`."""
         for file, (iso, estimate) in zip(noise_figures(path, self.law), self.estimates.items(), strict=True):
             plot_noise(estimate, file, title=self.law.camera if iso is None else f"{self.law.camera}, ISO {iso:g}")
 
@@ -66,7 +54,7 @@ def measure_camera_noise(pairs: Sequence[Pair], dark: str | Path | None = None) 
 
 
 def _measured(
-    iso: float | None, frames: Sequence[MeasuredFrame], dark: dict[float | None, list[MeasuredFrame]] | None
+    iso: float | None, frames: Sequence[RawFrame], dark: dict[float | None, list[RawFrame]] | None
 ) -> NoiseEstimate:
     """The line of the frames of one ISO."""
     where = "" if iso is None else f" at ISO {iso:g}"
@@ -86,25 +74,21 @@ def _measured(
     return estimate
 
 
-def _by_iso(frames: Sequence[MeasuredFrame]) -> dict[float | None, list[MeasuredFrame]]:
+def _by_iso(frames: Sequence[RawFrame]) -> dict[float | None, list[RawFrame]]:
     """The frames by ISO, ascending; those of two cameras do not share a law."""
     cameras = dict.fromkeys(frame.camera for frame in frames if frame.camera != _UNKNOWN)
     if len(cameras) > 1:
         counted = ", ".join(f"{name} ({sum(f.camera == name for f in frames)})" for name in cameras)
-        raise ValueError(
-            f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each camera separately"
-        )
-    by_iso: dict[float | None, list[MeasuredFrame]] = defaultdict(list)
+        raise ValueError(f"noise: the frames are from {len(cameras)} cameras, {counted}; measure each separately")
+    by_iso: dict[float | None, list[RawFrame]] = defaultdict(list)
     for frame in frames:
         by_iso[frame.iso].append(frame)
     if None in by_iso and len(by_iso) > 1:
-        raise ValueError(
-            f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; omit them, or measure them separately"
-        )
+        raise ValueError(f"noise: {len(by_iso[None])} of {len(frames)} frames have no ISO; measure them separately")
     return dict(sorted(by_iso.items(), key=lambda item: item[0] or 0.0))
 
 
-def _frames(pairs: Sequence[Pair]) -> list[MeasuredFrame]:
+def _frames(pairs: Sequence[Pair]) -> list[RawFrame]:
     """Frames spread over ``pairs``; of :class:`Readable` ones those that can be read. RAW files are not developed."""
     last = len(pairs) - 1
     spread = [round(k * last / (MOST_FRAMES - 1)) for k in range(MOST_FRAMES)]
@@ -118,16 +102,14 @@ def _frames(pairs: Sequence[Pair]) -> list[MeasuredFrame]:
     return frames
 
 
-def _frame(pairs: Sequence[Pair], index: int) -> MeasuredFrame:
+def _frame(pairs: Sequence[Pair], index: int) -> RawFrame:
     if isinstance(pairs, RawFolder):
-        frame = read_raw(pairs.files[index])
-        return MeasuredFrame(frame.mosaic, frame.cfa, frame.camera, frame.iso)
+        return read_raw(pairs.files[index])
     pair = pairs[index]
-    return MeasuredFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, pair.camera, pair.iso)
+    return RawFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, camera=pair.camera, iso=pair.iso)
 
 
-def _aligned(frames: Sequence[MeasuredFrame]) -> tuple[list[Tensor], CFA]:
-    """The mosaics, brought to the pattern of the first."""
+def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], CFA]:
     cfa = frames[0].cfa
     return [aligned(frame.mosaic, frame.cfa, cfa) for frame in frames], cfa
 
@@ -257,9 +239,7 @@ def _pairs(
             raise ValueError(f"{', '.join(mosaics)} can only be given for pairs:PATH; each Pair has its own")
         return source  # type: ignore[return-value]
     if not isinstance(source[0], (str, Path)):
-        raise ValueError(
-            f"a fit takes files, folders or rawaug.data.Pair, got {type(source[0]).__name__}; see docs/fit.md"
-        )
+        raise ValueError(f"a fit takes files, folders or Pairs, got {type(source[0]).__name__}; see docs/fit.md")
     opened = [open_pairs(str(item), split="train", as_clean=False, **mosaics) for item in source]
     if len(opened) == 1 and not isinstance(opened[0], RawFolder):
         return opened[0]

@@ -33,20 +33,8 @@ LEAST_ERROR = 1.0 / 255.0
 """Of a picture with hardly any noise: the step of an 8-bit file."""
 
 
-@LOSSES.register("l1")
-class L1(nn.Module):
-    """The mean of ``|a - b|``."""
-
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        return nn.functional.l1_loss(a, b)
-
-
-@LOSSES.register("l2")
-class L2(nn.Module):
-    """The mean of ``(a - b)^2``."""
-
-    def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        return nn.functional.mse_loss(a, b)
+LOSSES.register("l1")(nn.L1Loss)
+LOSSES.register("l2")(nn.MSELoss)
 
 
 @LOSSES.register("charbonnier")
@@ -65,25 +53,17 @@ class Charbonnier(nn.Module):
         return ((a - b) ** 2 + self.epsilon**2).sqrt().mean()
 
 
-def linear(loss: Criterion, sample: Sample) -> Criterion:
-    """``loss`` as it is."""
-    return loss
-
-
 def normalised(loss: Criterion, sample: Sample) -> Criterion:
-    """``loss`` in units of the noise's deviation at each pixel."""
     deviation = sample.variance.sqrt().clamp_min(1e-6)
     return lambda denoised, clean: loss(denoised / deviation, clean / deviation)
 
 
 def stabilised(loss: Criterion, sample: Sample) -> Criterion:
-    """``loss`` where the noise has deviation 1 in shadow and light alike."""
     levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
     return lambda denoised, clean: loss(*(root.forward(y, *levels) for y in (denoised, clean)))
 
 
 def mixed(loss: Criterion, sample: Sample) -> Criterion:
-    """The mean of ``stabilised`` and ``loss`` in units of the noise's mean deviation."""
     in_root = stabilised(loss, sample)
     deviation = sample.variance.sqrt().mean((1, 2, 3), keepdim=True).clamp_min(1e-12)
     return lambda denoised, clean: 0.5 * (in_root(denoised, clean) + loss(denoised / deviation, clean / deviation))
@@ -96,7 +76,7 @@ def relative(loss: Criterion, sample: Sample) -> Criterion:
 
 
 WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
-    "linear": linear,
+    "linear": lambda loss, sample: loss,
     "normalised": normalised,
     "stabilised": stabilised,
     "mixed": mixed,
@@ -105,9 +85,5 @@ WEIGHINGS: dict[str, Callable[[Criterion, Sample], Criterion]] = {
 
 
 def weighed(loss: Criterion, weigh: str, sample: Sample) -> Criterion:
-    """``loss`` with light and shade weighed as ``weigh`` says, for the noise of ``sample``'s pictures ``(B, 4, h,
-    w)``.
-    """
-    if weigh not in WEIGHINGS:
-        raise ValueError(f"train.weigh {weigh!r} is unknown; use one of {', '.join(WEIGHINGS)}")
+    """``loss`` with light and shade weighed for the noise of ``sample``'s pictures ``(B, 4, h, w)``."""
     return WEIGHINGS[weigh](loss, sample)

@@ -78,7 +78,6 @@ class Journal:
                 self.writer.add_image(f"noisy_denoised_clean/{k}", panels(net, frame), step)
 
     def close(self) -> None:
-        """Write what is left."""
         self.writer.close()
 
 

@@ -25,14 +25,14 @@ from denoisers.classical import NonLocalMeans, Stabilised
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed
-from rawaug.data.pairs import Pair, Sample
+from rawaug.data.pairs import Lazy, Pair, Sample
 from rawaug.noise import ShotReadModel, anscombe, camera_law
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided, to_rgb_tensor
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 from rawaug.training.estimators import R2R, NoisyCrop, SelfSupervised
-from rawaug.training.stream import turned_crop
+from rawaug.training.stream import packed_crop
 
 
 def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -> Tensor:
@@ -45,7 +45,6 @@ def signal_estimate(noisy: Tensor, shot_var: float, read_var: float, cfa: CFA) -
 
 
 CACHED = 64
-"""Pictures whose frames are kept: more than this and frames are made when asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,26 +94,20 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
-    """A real noisy frame, with its noise as :func:`noise_of` finds it."""
     return NoisyFrame(pair.name, pair.raw, *noise_of(pair, camera), pair.cfa)
 
 
-class FrozenPictures(Sequence[NoisyFrame]):
-    """sRGB pictures as noisy RAW frames that never change."""
+class FrozenPictures(Lazy[NoisyFrame]):
+    """sRGB pictures as noisy RAW frames that never change; up to :data:`CACHED` of them stay in memory."""
 
     def __init__(self, pictures: Any, augment: RawAugment, seed: int, shots: int = 1) -> None:
         if not isinstance(augment.noise, ShotReadModel):
             raise ValueError("self-supervised training needs noise with known shot_var and read_var, such as a preset")
         self.pictures, self.augment, self.seed, self.shots = pictures, augment, seed, shots
         self._kept: dict[int, NoisyFrame] = {}
+        super().__init__([f"picture {index}" for index in range(len(pictures))])
 
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        index = range(len(self))[index]
+    def read(self, index: int) -> NoisyFrame:
         frame = self._kept.get(index) or self._made(index)
         if len(self._kept) < CACHED:
             self._kept[index] = frame
@@ -130,7 +123,7 @@ class FrozenPictures(Sequence[NoisyFrame]):
             shots.append(bayer.unpack(pair.noisy, self.augment.isp.cfa)[0])
         clean = bayer.unpack(pair.clean, self.augment.isp.cfa)[0]
         shot_var, read_var = (params.noise[name].item() for name in ("shot_var", "read_var"))
-        return NoisyFrame(f"picture {index}", torch.cat(shots), shot_var, read_var, self.augment.isp.cfa, clean)
+        return NoisyFrame(self.names[index], torch.cat(shots), shot_var, read_var, self.augment.isp.cfa, clean)
 
 
 class NoisyCrops:
@@ -146,17 +139,12 @@ class NoisyCrops:
                 _ = frame.signal
 
     def draw(self, generator: torch.Generator) -> Any:
-        """One crop of a random frame."""
         frame = self.frames[int(torch.randint(len(self.frames), (), generator=generator))]
         if len(frame.shots) < self.estimator.shots:
             name, count = type(self.estimator).__name__, len(frame.shots)
             raise ValueError(f"{frame.name}: {name} needs {self.estimator.shots} shots of a scene, got {count}")
-        if min(frame.shots.shape[-2:]) < self.crop + 6:
-            size = f"{frame.shots.shape[-2]} x {frame.shots.shape[-1]}"
-            raise ValueError(f"{frame.name}: a frame of {size} is too small for train.crop={self.crop}")
-        signal = frame.signal if self.estimator.adds_noise else frame.shots[:1]
-        mosaics = [aligned(mosaic, frame.cfa, self.cfa) for mosaic in (frame.shots, signal)]
-        packed = bayer.pack(turned_crop(mosaics, self.crop, self.cfa, generator)[:, None], self.cfa)
+        mosaics = [frame.shots, frame.signal if self.estimator.adds_noise else frame.shots[:1]]
+        packed = packed_crop(frame.name, mosaics, frame.cfa, self.crop, self.cfa, generator)
         drawn = self.estimator.sample(packed.shape[1:], generator)
         return self.estimator.apply(NoisyCrop(packed[:-1], packed[-1], frame.shot_var, frame.read_var), drawn)
 

@@ -132,7 +132,6 @@ class NoisyPictures:
         self.pictures, self.noise, self.crop, self.zoom = pictures, noise, crop_size(crop), zoom
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """One crop of a random picture; zeros stand for the variance."""
         drawn = self.pictures[int(torch.randint(len(self.pictures), (), generator=generator))]
         picture = even_sided(to_rgb_tensor(drawn))
         place = random_place(picture, self.crop, True, generator, self.zoom)

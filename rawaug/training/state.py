@@ -109,7 +109,6 @@ class TrainingState:
             partial.write_bytes(content.getbuffer())
 
     def place(self, fabric: Any) -> Any:
-        """Move it to Fabric's device."""
         placed = fabric.setup(self.net.to(memory_format=self.layout), self.optimiser)  # type: ignore[call-overload]
         self.fabric, (self.model, self.optimiser) = fabric, placed
         self.average.to(fabric.device)
@@ -117,7 +116,6 @@ class TrainingState:
         return torch.compile(self.model) if self.config.compile else self.model
 
     def update(self, loss: Tensor) -> float:
-        """Take a step down the gradient of ``loss``."""
         self.optimiser.zero_grad(set_to_none=True)
         self.fabric.backward(loss)
         if self.config.clip_norm:
@@ -134,7 +132,6 @@ class TrainingState:
         return learning_rate
 
     def mean_loss(self) -> float:
-        """Of the steps since it was last asked."""
         mean = float(self.losses[0] / self.losses[1])
         self.losses = torch.zeros_like(self.losses)
         return mean

@@ -35,18 +35,11 @@ class RealCrops:
     def __init__(self, pairs: Sequence[Pair], noise: NoiseModel, crop: int, cfa: CFA) -> None:
         self.pairs = [pair.with_levels() for pair in pairs]
         self.noise, self.crop, self.cfa = noise, crop, cfa
-        for pair in self.pairs:
-            if min(pair.raw.shape[-2:]) < crop + 6:
-                size = f"{pair.raw.shape[-2]} x {pair.raw.shape[-1]}"
-                raise ValueError(f"{pair.name}: a frame of {size} is too small for train.crop={crop}")
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """One crop of a random frame."""
         pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
         mosaics = [pair.raw] if pair.noisy is None else [pair.raw, pair.noisy]
-        mosaics = [bayer.aligned(mosaic, pair.cfa, self.cfa) for mosaic in mosaics]
-        images = turned_crop(mosaics, self.crop, self.cfa, generator)
-        packed = bayer.pack(images[:, None], self.cfa)
+        packed = packed_crop(pair.name, mosaics, pair.cfa, self.crop, self.cfa, generator)
         params = self.noise.sample(1, generator)
         if pair.noisy is not None:
             params = {"shot_var": torch.tensor([pair.shot_var]), "read_var": torch.tensor([pair.read_var])}
@@ -67,7 +60,6 @@ class PictureCrops:
         self.pairs = pairs
 
     def draw(self, generator: torch.Generator) -> Sample:
-        """One crop of a random picture."""
         return self.draw_batch([generator])[0]
 
     def draw_batch(self, generators: Sequence[torch.Generator]) -> list[Sample]:
@@ -78,21 +70,23 @@ class PictureCrops:
         return [Sample(*tensors) for tensors in zip(pair.noisy, pair.clean, variance, strict=True)]
 
 
-def turned_crop(mosaics: Sequence[Tensor], crop: int, cfa: CFA, generator: torch.Generator) -> Tensor:
-    """The same random place of mosaics ``(C, H, W)``, one after the other, in a random one of eight turns.
+def packed_crop(
+    name: str, mosaics: Sequence[Tensor], own: CFA, crop: int, cfa: CFA, generator: torch.Generator
+) -> Tensor:
+    """One random place of mosaics ``(C, H, W)`` of pattern ``own``, in one of eight turns, packed in that of ``cfa``.
 
-    The pattern is kept: ``(C + ..., crop, crop)``.
-
-    A larger crop is turned, then cut to size, so that lines lost to the CFA do not show.
+    Returns ``(sum of C, 4, crop / 2, crop / 2)``.
     """
-    side = crop + 4
     height, width = mosaics[0].shape[-2:]
-    top = 2 * int(torch.randint((height - side) // 2 + 1, (), generator=generator))
-    left = 2 * int(torch.randint((width - side) // 2 + 1, (), generator=generator))
+    if min(height, width) < crop + 6:
+        raise ValueError(f"{name}: a frame of {height} x {width} is too small for train.crop={crop}")
+    mosaics = [bayer.aligned(mosaic, own, cfa) for mosaic in mosaics]
+    side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not show
+    top, left = (2 * int(torch.randint((n - side) // 2 + 1, (), generator=generator)) for n in mosaics[0].shape[-2:])
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))
     images = torch.cat([bayer.crop(mosaic, top, left, side, side) for mosaic in mosaics])
     turned = bayer.turn_keeping_cfa(images, cfa, view)
-    return bayer.crop(turned, 0, 0, crop, crop)
+    return bayer.pack(bayer.crop(turned, 0, 0, crop, crop)[:, None], cfa)
 
 
 class TrainingStream(Dataset[Any]):
@@ -115,7 +109,6 @@ class TrainingStream(Dataset[Any]):
         return source.draw(self._generator(index))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
-        """The samples of a step, as a DataLoader asks for them."""
         made: dict[int, Any] = {}
         if isinstance(self.pictures, PictureCrops) and (pictured := [*filter(self._pictured, indices)]):
             made = dict(zip(pictured, self.pictures.draw_batch([*map(self._generator, pictured)]), strict=True))

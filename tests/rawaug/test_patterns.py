@@ -157,5 +157,5 @@ def test_another_bayer_pattern_is_packed_as_ever_and_leaves_the_isp_alone(isp: D
 
 
 def test_noise_of_the_four_planes_is_refused_without_them(isp: DictionaryISP) -> None:
-    with pytest.raises(ValueError, match="differs between the planes R, Gr, Gb, B, which XTRANS does not have"):
+    with pytest.raises(ValueError, match="is one of planes R, Gr, Gb, B, which XTRANS does not have"):
         RawAugment(isp, noise=ColourBias(1e-3), cfa="XTRANS")

@@ -126,7 +126,7 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
 
 def test_two_cameras_are_not_pooled_nor_frames_without_an_iso_with_others(noisy_pair: Pair) -> None:
     for other, said in (
-        (at_iso(noisy_pair, 100, 2e-4, "Other 2"), r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each camera"),
+        (at_iso(noisy_pair, 100, 2e-4, "Other 2"), r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each"),
         (at_iso(noisy_pair, None, 2e-4), "1 of 2 frames have no ISO"),
     ):
         with pytest.raises(ValueError, match=said):

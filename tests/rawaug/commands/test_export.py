@@ -14,8 +14,8 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands.export import errors_only, export
 from rawaug.commands.frame_denoisers import frame_denoiser
-from rawaug.data.pairs import NoisyBlock
 from rawaug.evaluation.contestants import session_of
+from rawaug.io import RawFrame
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_any_size_gives_pytorch_s_numbers(weights: Path, tmp_path: Path, capsys:
     assert main(["export", str(weights), str(out)]) == 0
     assert "largest difference from PyTorch" in capsys.readouterr().out
     session, model = session_of(out), denoisers.from_pretrained(weights)
-    frame = NoisyBlock("block", torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
+    frame = RawFrame(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
     both = [frame_denoiser(file, self_ensemble=True)(frame, (1e-3, 1e-5)) for file in (weights, out)]
     assert (both[0] - frame.mosaic).abs().max() > 1e-3
     assert (both[0] - both[1]).abs().max() < 1e-4
@@ -58,7 +58,7 @@ def test_full_colour_is_exported_as_well(tmp_path: Path) -> None:
     model.initialise(seed=1, gain=0.5)
     denoisers.save(model, files[0], {"cfa": "RGGB"})
     export(*files)
-    frame = NoisyBlock("block", torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
+    frame = RawFrame(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
     both = [frame_denoiser(file, linear=True)(frame, (1e-3, 1e-5)) for file in files]
     assert both[0].shape == (3, 130, 94) and both[0].std() > 0.01
     assert (both[0] - both[1]).abs().max() < 1e-4

@@ -15,7 +15,7 @@ from scipy.io import savemat
 from rawaug.cli import main
 from rawaug.data import PictureFolder, RawFolder, check
 from rawaug.data.folders import files_below
-from rawaug.data.sidd.frames import HELD_BACK
+from rawaug.data.sidd import HELD_BACK
 from rawaug.io import write_picture
 
 Writer = Callable[[Path, dict[str, Any]], Path]

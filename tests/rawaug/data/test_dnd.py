@@ -54,7 +54,7 @@ def test_boxes_are_cut_where_the_kit_cuts_them(folder: Path) -> None:
         crop = dnd[index]
         assert crop.name == f"{k + 1:04d}_{b + 1:02d}" and crop.mosaic.shape == (1, 6, 8)
         assert np.array_equal(crop.mosaic[0].numpy(), frame(k)[top - 1 : bottom, left - 1 : right])
-        assert crop.levels == pytest.approx((1e-3 * (k + 1), 1e-6))
+        assert crop.noise_profile == pytest.approx((1e-3 * (k + 1), 1e-6))
         assert crop.white_balance == pytest.approx((2, 1, 1.25))
 
 
@@ -95,13 +95,13 @@ def test_wrong_submissions_are_refused(folder: Path, tmp_path: Path) -> None:
     dnd = Dnd(folder)
     with pytest.raises(ValueError, match="a submission must have 1000 boxes, got 3"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8)] * 3)
-    with pytest.raises(ValueError, match="box 1: a denoised box must be finite"):
+    with pytest.raises(ValueError, match="box 1: must be finite"):
         write_dnd_submission(tmp_path / "a", [torch.zeros(1, 6, 8), torch.full((1, 6, 8), torch.nan)])
     write_dnd_submission(tmp_path / "a", [torch.zeros(1, 8, 6)] * 1000)
     with pytest.raises(ValueError, match=r"0001\.mat: box 1 must be float32 \(6, 8\), got float32 \(8, 6\)"):
         check_dnd_submission(tmp_path / "a", dnd)
     write_dnd_submission(tmp_path / "a", [torch.full((1, 6, 8), 1.5)] * 1000)
-    with pytest.raises(ValueError, match=r"box 1 has values from 1\.5 to 1\.5; clip it"):
+    with pytest.raises(ValueError, match=r"box 1 has values from 1\.5 to 1\.5; clip them"):
         check_dnd_submission(tmp_path / "a", dnd)
     (tmp_path / "a" / "0050.mat").unlink()
     write_dnd_submission(tmp_path / "b", [crop.mosaic for crop in dnd])

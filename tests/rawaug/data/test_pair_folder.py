@@ -221,7 +221,7 @@ def test_a_sequence_of_pairs_is_taken_as_it_is() -> None:
     pairs = [Pair("a", torch.zeros(3, 4, 4, dtype=torch.uint8), torch.zeros(1, 4, 4), CFA.RGGB)]
     assert open_pairs(pairs) is pairs
     for wrong in ([], [1], 5):
-        with pytest.raises(ValueError, match=r"sequence of rawaug\.data\.Pair"):
+        with pytest.raises(ValueError, match=r"list of Pair"):
             open_pairs(wrong)  # type: ignore[arg-type]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 from typing import Any
 
@@ -39,15 +38,6 @@ def pair(**changes: Any) -> Pair:
         "color_matrix": torch.eye(3),
     }
     return Pair(**{**fields, **changes})
-
-
-def test_a_pair_holds_what_it_was_given() -> None:
-    noisy = torch.ones(1, 6, 8)
-    shot = pair(noisy=noisy, shot_var=1e-3, read_var=1e-6)
-    assert shot.noisy is noisy and shot.registered and shot.camera == "unknown"
-    assert pair().noisy is None
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        shot.name = "other"  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
@@ -127,13 +117,10 @@ def test_scenes_are_whole() -> None:
         selected(Shots(), 18, 5, "scenes")
 
 
-def test_names_are_of_frames_or_of_their_folders() -> None:
+def test_names_are_of_frames_or_of_their_folders_and_what_is_held_out_is_not_chosen() -> None:
     assert selected(Shots(), 18, None, ["0004_001_IP_010", "0017_002_S6"]) == [4, 17]
     with pytest.raises(ValueError, match=r"data\.select: 0099 is none of the 18 frames, such as 0000_001_GP_010"):
         selected(Shots(), 18, None, ["0099"])
-
-
-def test_what_is_held_out_is_not_chosen() -> None:
     assert selected(Shots(), 4, None) == [0, 1, 2, 3]
     assert max(selected(Shots(), 9, 3, "phones")) < 9 and selected(Shots(), 9, 9, "scenes") == list(range(9))
     with pytest.raises(ValueError, match="0017_002_S6 is none of the 9 frames"):

@@ -30,7 +30,7 @@ def test_every_split_is_read_and_states_what_is_known() -> None:
 
 
 def test_they_stay_small_and_have_their_licence() -> None:
-    folder = Path(str(FRAMES))
+    folder = FRAMES
     assert sum(file.stat().st_size for file in folder.iterdir()) < 5e6
     assert "CC0 1.0" in (folder / "LICENCE.md").read_text()
 
@@ -42,9 +42,9 @@ def test_the_maker_makes_them_of_the_camera_files(camera_files: Path, tmp_path: 
         file = camera_files / name
         assert name in SPLITS[split]
         frame = read_raw(file)
-        assert np.array_equal(np.array(Image.open(Path(str(FRAMES)) / f"{file.stem}.png")), numbers_of(frame))
+        assert np.array_equal(np.array(Image.open(FRAMES / f"{file.stem}.png")), numbers_of(frame))
         said = json.loads(json.dumps(described(file, frame, split)))
-        kept = json.loads((Path(str(FRAMES)) / "frames.json").read_text())[file.stem]
+        kept = json.loads((FRAMES / "frames.json").read_text())[file.stem]
         assert said.pop("own_noise") == pytest.approx(kept.pop("own_noise"), rel=1e-3) and said == kept
 
 

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from rawaug.data import Shapes, open_pictures
-from rawaug.data.demo.drawn import KINDS
+from rawaug.data.drawn import KINDS
 from rawaug.data.folders import Cached, reports
 
 

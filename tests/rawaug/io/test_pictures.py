@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-import tifffile
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -46,11 +44,6 @@ def test_lossy_formats_are_close(tmp_path: Path, extension: str) -> None:
     assert (read_picture(tmp_path / f"picture.{extension}").int() - smooth.int()).abs().max() <= 4
 
 
-def test_floats_are_rounded_to_the_nearest_level(tmp_path: Path) -> None:
-    write_picture(tmp_path / "a.png", SRGB.double() / 255 + 0.4 / 255 * (SRGB < 255))
-    assert torch.equal(read_picture(tmp_path / "a.png"), SRGB)
-
-
 def test_16_bits_become_8_by_rounding(tmp_path: Path) -> None:
     numbers = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1).repeat(3, -1)
     write_with_oiio(tmp_path / "a.png", numbers, "uint16")
@@ -58,15 +51,13 @@ def test_16_bits_become_8_by_rounding(tmp_path: Path) -> None:
     assert np.array_equal(read_picture(tmp_path / "a.png")[1].numpy(), expected)
 
 
-def test_display_referred_floats_are_taken_as_they_are(tmp_path: Path) -> None:
+def test_floats_become_the_nearest_level_and_linear_ones_go_through_the_srgb_transfer(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", SRGB.double() / 255 + 0.4 / 255 * (SRGB < 255))
     write_with_oiio(tmp_path / "a.tif", (PIXELS / 255).astype(np.float32), "float")
-    assert torch.equal(read_picture(tmp_path / "a.tif"), SRGB)
-
-
-def test_linear_exr_goes_through_the_srgb_transfer(tmp_path: Path) -> None:
     linear = decode_srgb(SRGB.double() / 255).permute(1, 2, 0).float().contiguous().numpy()
     write_with_oiio(tmp_path / "a.exr", linear, "float")
-    assert torch.equal(read_picture(tmp_path / "a.exr"), SRGB)
+    for name in ("a.png", "a.tif", "a.exr"):
+        assert torch.equal(read_picture(tmp_path / name), SRGB)
 
 
 def test_values_outside_the_unit_range_are_refused(tmp_path: Path) -> None:
@@ -105,12 +96,6 @@ def test_cmyk_is_refused(tmp_path: Path, extension: str) -> None:
         read_picture(path)
 
 
-def test_five_channels_are_refused(tmp_path: Path) -> None:
-    write_with_oiio(tmp_path / "layers.tif", np.zeros((4, 4, 5), np.uint8), "uint8")
-    with pytest.raises(ValueError, match=r"layers\.tif: has channels R, G, B, A,"):
-        read_picture(tmp_path / "layers.tif")
-
-
 @pytest.mark.parametrize("extension", ["gif", "webp"])
 @pytest.mark.parametrize("settings", [{}, {"duration": 100}], ids=["frames", "timed"])
 def test_animations_are_refused_and_stills_are_not(tmp_path: Path, extension: str, settings: dict[str, Any]) -> None:
@@ -127,6 +112,11 @@ def test_more_pixels_than_the_limit_are_refused_by_the_header(tmp_path: Path) ->
     assert read_picture(tmp_path / "a.png", max_pixels=24 * 37).shape == SRGB.shape
     with pytest.raises(ValueError, match=r"a\.png: declares 24 x 37 pixels, above the limit of 887"):
         read_picture(tmp_path / "a.png", max_pixels=24 * 37 - 1)
+    write_with_oiio(tmp_path / "layers.tif", np.zeros((20, 20, 5), np.uint8), "uint8")
+    with pytest.raises(ValueError, match="declares 20 x 20 pixels of 5 channels, above the limit of 450"):
+        read_picture(tmp_path / "layers.tif", max_pixels=450)
+    with pytest.raises(ValueError, match=r"layers\.tif: has channels R, G, B, A,"):
+        read_picture(tmp_path / "layers.tif")
 
 
 def s15_fixed16(*values: float) -> bytes:
@@ -229,18 +219,6 @@ def test_the_srgb_transfer_has_its_published_values() -> None:
     assert decode_srgb(torch.tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx([0, 0.2140411, 1], abs=1e-6)
 
 
-def test_a_picture_bomb_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
-    side = struct.pack(">II", 16384, 16384)
-    chunks = [(b"IHDR", side + bytes((8, 2, 0, 0, 0))), (b"IDAT", zlib.compress(bytes(100))), (b"IEND", b"")]
-    parts = [struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks]
-    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
-    with pytest.raises(ValueError, match=r"declares 16384 x 16384 pixels, above the limit of 67108864"):
-        read_picture(tmp_path / "bomb.png")
-    tifffile.imwrite(tmp_path / "wide.tif", np.zeros((20, 20, 8), np.uint8), photometric="rgb")
-    with pytest.raises(ValueError, match="declares 20 x 20 pixels of 8 channels, above the limit of 500"):
-        read_picture(tmp_path / "wide.tif", max_pixels=500)
-
-
 def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width() -> None:
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, 6, 8, generator=generator)
@@ -253,10 +231,3 @@ def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width()
     stripes = torch.tensor([[255, 0], [0, 0], [0, 255]], dtype=torch.uint8)[:, None].repeat(1, 32, 16)
     fine, turned = (through_jpeg(x, 90).float() - x for x in (stripes, stripes.mT))
     assert fine.square().mean() > 2 * turned.square().mean(), "columns of colour are lost, rows are not"
-
-
-def test_what_is_no_picture_or_quality_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"uint8 \(3, H, W\), got torch.float32"):
-        through_jpeg(torch.zeros(3, 8, 8), 90)
-    with pytest.raises(ValueError, match="quality must be 1 to 100, got 0"):
-        through_jpeg(torch.zeros(3, 8, 8, dtype=torch.uint8), 0)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rawaug.data.demo.pairs import demo_photographs
+from rawaug.data.demo import demo_photographs
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -37,3 +40,30 @@ def as_rank(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], None]:
             monkeypatch.setattr(torch.distributed, question, lambda answer=answer: answer)
 
     return become
+
+
+@pytest.fixture
+def lightning_run() -> Callable[..., tuple[list[Tensor], Any]]:
+    """Train a layer by Lightning on RAW pairs, from a checkpoint if one is given: what it saw, and its trainer."""
+    lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
+
+    class Layer(lightning.LightningModule):  # type: ignore[name-defined]
+        def __init__(self) -> None:
+            super().__init__()
+            self.network, self.seen = torch.nn.Conv2d(4, 4, 1), list[Tensor]()
+
+        def training_step(self, pair: Any, index: int) -> Tensor:
+            self.seen.append(pair.noisy)
+            return (self.network(pair.noisy) - pair.clean).abs().mean()
+
+        def configure_optimizers(self) -> torch.optim.Optimizer:
+            return torch.optim.SGD(self.parameters(), lr=0.1)
+
+    def run(data: Any, checkpoint: Path | None = None, **length: int) -> tuple[list[Tensor], Any]:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = lightning.Trainer(accelerator="cpu", enable_model_summary=False, **quiet, **length)
+        layer = Layer()
+        trainer.fit(layer, data, ckpt_path=checkpoint)
+        return layer.seen, trainer
+
+    return run

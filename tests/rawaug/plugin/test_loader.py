@@ -9,10 +9,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor
 from torch.utils.data import DataLoader, TensorDataset
 
@@ -100,11 +98,6 @@ def test_what_makes_no_batch_is_refused(augment: RawAugment) -> None:
         wrap([], augment, crop=15)
 
 
-def test_odd_sides_and_grey(augment: RawAugment) -> None:
-    grey = np.zeros((2, 9, 11, 1), np.uint8)
-    assert next(iter(wrap([grey], augment))).noisy.shape == (2, 4, 4, 5)
-
-
 def test_a_wrapped_loader_can_be_copied_and_pickled(augment: RawAugment, srgb: Tensor) -> None:
     wrapped = wrap([srgb], augment)
     for again in (copy.copy(wrapped), pickle.loads(pickle.dumps(wrapped))):
@@ -125,12 +118,6 @@ def test_a_device_that_is_not_there_is_said_at_once(augment: RawAugment, device:
     assert wrap([], augment, device="auto").device.type == "cpu"
 
 
-def test_fabric_sets_up_the_loader_that_is_wrapped(augment: RawAugment, srgb: Tensor) -> None:
-    fabric = Fabric(accelerator="cpu", devices=1)
-    loader = fabric.setup_dataloaders(batches_of(srgb, 3))
-    assert noisy(wrap(loader, augment, device=fabric.device)).shape == (6, 4, 8, 10)
-
-
 @pytest.mark.gpu
 def test_pinned_pictures_become_pairs_on_the_gpu(srgb: Tensor) -> None:
     augment = RawAugment(DictionaryISP())
@@ -147,9 +134,9 @@ def test_a_loader_of_single_pictures_makes_single_crops(augment: RawAugment) -> 
 
 @pytest.mark.parametrize("batch", [1, 3, 4, 5])
 def test_a_batch_of_grey_pictures_is_no_colour_picture(augment: RawAugment, batch: int) -> None:
-    grey = torch.rand(batch, 8, 10)
+    grey = torch.rand(batch, 9, 11)  # odd sides lose a line
     (pair,) = wrap(DataLoader(grey, batch_size=batch), augment)  # type: ignore[arg-type]
-    (expected,) = wrap([grey[:, None].expand(-1, 3, -1, -1)], augment)
+    (expected,) = wrap([grey[:, None, :8, :10].expand(-1, 3, -1, -1)], augment)
     assert torch.equal(pair.noisy, expected.noisy) and len(pair.noisy) == batch
 
 
@@ -171,8 +158,7 @@ def shuffled(srgb: Tensor, workers: int = 0) -> DataLoader[Any]:
     return batches_of(srgb, 2, shuffle=True, generator=generator, num_workers=workers)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("done", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize(("done", "workers"), [(0, 0), (1, 0), (2, 2), (3, 0), (4, 2)])
 def test_a_state_goes_on_where_it_was_taken(augment: RawAugment, srgb: Tensor, done: int, workers: int) -> None:
     straight = wrap(shuffled(srgb), augment)
     expected = [pair.noisy for _ in range(3) for pair in straight]
@@ -192,8 +178,6 @@ def test_a_loop_that_stops_at_the_last_batch_has_ended_the_pass(augment: RawAugm
     wrapped = wrap(batches_of(srgb, 2), augment)
     list(islice(wrapped, len(wrapped)))
     assert wrapped.state_dict() == {"epoch": 1, "batch": 0}
-    with pytest.raises(ValueError, match="not the state of a wrapped loader: batch missing"):
-        wrapped.load_state_dict({"epoch": 1})
 
 
 class Resumable(list[Tensor]):
@@ -222,34 +206,19 @@ def test_a_loader_that_resumes_itself_passes_nothing_over(augment: RawAugment, s
     assert torch.equal(noisy(resumed), expected[2:])
 
 
-def test_lightning_resumes_in_the_middle_of_an_epoch(augment: RawAugment, srgb: Tensor, tmp_path: Path) -> None:
-    lightning = pytest.importorskip("pytorch_lightning", reason="Lightning resumes: pip install rawaug[test]")
-
-    class Denoiser(lightning.LightningModule):  # type: ignore[name-defined]
-        def __init__(self) -> None:
-            super().__init__()
-            self.network, self.seen = torch.nn.Conv2d(4, 4, 1), list[float]()
-
-        def training_step(self, pair: RawPair, index: int) -> Tensor:
-            self.seen.append(float(pair.noisy.sum()))
-            return (self.network(pair.noisy) - pair.clean).abs().mean()
-
-        def configure_optimizers(self) -> torch.optim.Optimizer:
-            return torch.optim.SGD(self.parameters(), lr=0.1)
-
-    def train(steps: int, checkpoint: Path | None = None) -> tuple[list[float], Any]:
-        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
-        trainer = lightning.Trainer(max_steps=steps, accelerator="cpu", enable_model_summary=False, **quiet)
-        denoiser = Denoiser()
-        trainer.fit(denoiser, wrap(shuffled(srgb), augment), ckpt_path=checkpoint)
-        return denoiser.seen, trainer
+def test_lightning_resumes_in_the_middle_of_an_epoch(
+    augment: RawAugment, srgb: Tensor, tmp_path: Path, lightning_run: Callable[..., Any]
+) -> None:
+    def train(steps: int, checkpoint: Path | None = None) -> tuple[list[Tensor], Any]:
+        seen: tuple[list[Tensor], Any] = lightning_run(wrap(shuffled(srgb), augment), checkpoint, max_steps=steps)
+        return seen
 
     expected, _ = train(7)
-    assert len(set(expected)) == 7
+    assert len({float(noisy.sum()) for noisy in expected}) == 7
     begun, trainer = train(4)
     trainer.save_checkpoint(tmp_path / "at4.ckpt")
     rest, _ = train(7, tmp_path / "at4.ckpt")
-    assert begun + rest == expected
+    assert all(map(torch.equal, begun + rest, expected))
 
 
 @pytest.mark.parametrize("crop", [(4, 8), [4, 8]])

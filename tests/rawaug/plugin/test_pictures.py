@@ -88,9 +88,6 @@ def test_a_narrow_tensor_is_read_channels_first() -> None:
 def test_what_is_no_picture_is_refused(bad: Any) -> None:
     with pytest.raises(ValueError, match=r"a picture must be .*, got"):
         to_rgb_tensor(bad)
-
-
-def test_integers_other_than_bytes_are_refused() -> None:
     with pytest.raises(ValueError, match="int32"):
         to_rgb_tensor(np.zeros((4, 4, 3), np.int32))
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, distributed, nn
-from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, RandomSampler, SequentialSampler
 
-from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs, RawPairStream
@@ -108,48 +104,20 @@ def test_counted_draws_of_processes_differ(augment: RawAugment, tmp_path: Path) 
     assert first[2] == second[2] == first[0]
 
 
-def read(urls: list[str]) -> dict[str, Tensor]:
-    """By key, the noisy RAW of the samples of this process."""
-    wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
-    shards = wds.WebDataset(urls, shardshuffle=False, nodesplitter=wds.split_by_node).decode("pil")
-    augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)), noise=(0.01, 0.01), sampling="chosen")
-    pairs = RawPairStream(shards, augment, crop=8, key="png", identity="__key__")
-    return {sample["__key__"]: sample["png"].noisy for sample in pairs}
+def test_samples_with_an_identity_draw_alike_in_every_process(
+    augment: RawAugment, as_rank: Callable[[int, int], None]
+) -> None:
+    noisy_camera = RawAugment(augment.isp, noise=(0.01, 0.01))
 
+    def drawn(identity: str | None) -> Tensor:
+        samples = iter([{"__key__": "a", "png": pictures()[3]}])
+        (sample,) = RawPairStream(samples, noisy_camera, crop=4, key="png", identity=identity)
+        noisy: Tensor = sample["png"].noisy
+        return noisy
 
-def read_in_a_group(urls: list[str], folder: Path) -> None:
-    distributed.init_process_group("gloo")
-    torch.save(read(urls), folder / f"{distributed.get_rank()}.pt")
-    distributed.destroy_process_group()
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_torchrun_on_two_nodes_reads_every_sample_of_the_shards_once(tmp_path: Path) -> None:
-    """torchrun's launchers, two on one machine with a process each, forked, for importing torch takes seconds."""
-    wds = pytest.importorskip("webdataset", reason="pip install rawaug[test]")
-    urls = [str(tmp_path / f"pictures-{k}.tar") for k in range(3)]
-    for k, url in enumerate(urls):
-        with wds.TarWriter(url) as tar:
-            for i in range(3):
-                tar.write({"__key__": f"{k}-{i}", "png": np.full((16, 16, 3), 60 * k + 20 * i, np.uint8)})
-    alone = read(urls)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"127.0.0.1:{free.getsockname()[1]}"
-    nodes = LaunchConfig(
-        2, 2, 1, rdzv_backend="c10d", rdzv_endpoint=endpoint, run_id="shards", max_restarts=0, start_method="fork"
-    )
-    launch = elastic_launch(nodes, read_in_a_group)
-    started = [multiprocessing.get_context("fork").Process(target=launch, args=(urls, tmp_path)) for _ in range(2)]
-    for process in started:
-        process.start()
-    for process in started:
-        process.join(400)
-    assert [process.exitcode for process in started] == [0, 0]
-    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
-    assert [len(first), len(second), len(alone)] == [6, 3, 9]
-    assert first.keys() | second.keys() == alone.keys()
-    assert all(torch.equal(noisy, alone[key]) for own in (first, second) for key, noisy in own.items())
+    alone, counted = drawn("__key__"), drawn(None)
+    as_rank(1, 2)
+    assert torch.equal(drawn("__key__"), alone) and not torch.equal(drawn(None), counted)
 
 
 @pytest.mark.parametrize("drop_last", [False, True])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import pytest
@@ -8,7 +7,7 @@ import torch
 
 from rawaug.bayer import CFA, pack
 from rawaug.data import DemoCamera
-from rawaug.data.demo.camera import BLACK, NOISE_LEVELS, WHITE, Shot, _shading, _tone
+from rawaug.data.demo import BLACK, NOISE_LEVELS, WHITE, Shot, _shading, _tone
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -35,7 +34,7 @@ def test_capture_is_sample_and_apply_and_replays_bit_for_bit() -> None:
 @pytest.mark.parametrize("iso", NOISE_LEVELS)
 @pytest.mark.parametrize("level", [0, 60, 255])
 def test_noise_has_the_variance_of_its_levels_and_no_bias(iso: int, level: int) -> None:
-    pair = DemoCamera().apply(flat(level), dataclasses.replace(DAYLIGHT, iso=iso))
+    pair = DemoCamera().apply(flat(level), DAYLIGHT._replace(iso=iso))
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     noise = (pair.noisy - pair.raw).double()
     step = 1 / (WHITE - BLACK)
@@ -92,7 +91,7 @@ def test_a_saturated_primary_lights_its_own_sites_most(cfa: CFA) -> None:
     for channel, sites in ((0, (0,)), (1, (1, 2)), (2, (3,))):
         picture = torch.zeros(3, 32, 32, dtype=torch.uint8)
         picture[channel] = 255
-        shot = dataclasses.replace(DAYLIGHT, white_balance=(1.0, 1.0, 1.0))
+        shot = DAYLIGHT._replace(white_balance=(1.0, 1.0, 1.0))
         pair = DemoCamera(cfa).apply(picture, shot)
         means = pack(pair.raw, cfa).mean((-2, -1))
         assert set(means.topk(len(sites)).indices.tolist()) == set(sites)

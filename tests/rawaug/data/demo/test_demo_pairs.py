@@ -7,7 +7,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs, demo_photographs, demo_pictures, open_pairs, open_pictures
-from rawaug.data.demo.pairs import FRAME, PAIRS, PHOTOGRAPHS, PICTURES_ONLY, _leaves, _pair
+from rawaug.data.demo import FRAME, PAIRS, PHOTOGRAPHS, PICTURES_ONLY, _leaves, _pair
 
 
 def forget() -> None:
@@ -41,7 +41,7 @@ def test_dead_leaves_of_a_split_are_textured_from_no_other(split: str, monkeypat
         used.extend(sources)
         return torch.zeros(3, height, width, dtype=torch.uint8)
 
-    monkeypatch.setattr("rawaug.data.demo.pairs.dead_leaves", record)
+    monkeypatch.setattr("rawaug.data.demo.dead_leaves", record)
     demo_pairs(split)
     if split == "train":
         assert len(open_pictures("demo:")) == 32

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from rawaug.bayer import turn
 from rawaug.commands.evaluate import run as evaluate
-from rawaug.data.sidd import blocks as sidd_blocks
-from rawaug.data.sidd.blocks import SiddBlocks, SiddPlusBlocks
-from rawaug.data.sidd.frames import SiddScene
+from rawaug.data import sidd
+from rawaug.data.sidd import SiddBlocks, SiddPlusBlocks, SiddScene
 from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -37,7 +36,7 @@ def camera() -> DictionaryISP:
 @pytest.fixture
 def pictures(monkeypatch: pytest.MonkeyPatch) -> Tensor:
     """uint8 ``(2, 32, 3, SIDE, SIDE)`` of two frames: SIDD would have forty."""
-    monkeypatch.setattr(sidd_blocks, "HELD_BACK", SCENES)
+    monkeypatch.setattr(sidd, "HELD_BACK", SCENES)
     coarse = torch.rand(64, 3, 4, 4, generator=torch.Generator().manual_seed(0))
     smooth = torch.nn.functional.interpolate(coarse, (SIDE, SIDE), mode="bilinear").mul(0.7).add(0.1)
     return (255 * smooth).round().to(torch.uint8).unflatten(0, (2, 32))
@@ -89,8 +88,11 @@ def test_without_pictures_or_metadata_psnr_r_is_refused(
     shot.mkdir()
     tags = {"AsShotNeutral": [(0.5, 1.0, 0.8)], "ColorMatrix2": np.eye(3).reshape(1, 9) + 0.1}
     savemat(shot / "0009_METADATA_RAW_010.MAT", {"metadata": tags})
+    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
+    (tmp_path / "noise_level_functions.csv").write_text(f"{header}\n{SCENES[0]}, 0.01, 1e-4, 0.01, 1e-4, 0.01, 1e-4\n")
     pairs = SiddBlocks(tmp_path)
-    assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0
+    assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0 and pairs[0].white_balance == (2.0, 1.0, 1.25)
+    assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean and pairs[32].white_balance == (1, 1, 1)
     with pytest.raises(ValueError, match=f"{SCENES[1]}_00: has no sRGB picture"):
         psnr_r(camera, pairs[32])
 
@@ -102,18 +104,6 @@ def test_pictures_of_something_else_are_refused(tmp_path: Path, camera: Dictiona
     write_blocks(tmp_path, raw_of(camera, pictures), pictures[..., :8, :8])
     with pytest.raises(ValueError, match=r"the mosaics need uint8 \(2, 32, 16, 16, 3\)"):
         SiddBlocks(tmp_path)[0]
-
-
-def test_levels_that_were_measured_against_clean_blocks_are_flagged(
-    tmp_path: Path, camera: DictionaryISP, pictures: Tensor
-) -> None:
-    write_blocks(tmp_path, raw_of(camera, pictures), pictures)
-    assert SiddBlocks(tmp_path)[0].levels_from_clean
-    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
-    row = f"{SCENES[0]}, 0.01, 1e-4, 0.01, 1e-4, 0.01, 1e-4"
-    (tmp_path / "noise_level_functions.csv").write_text(f"{header}\n{row}\n")
-    pairs = SiddBlocks(tmp_path)
-    assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean
 
 
 def test_sidd_plus_reads_its_pictures(tmp_path: Path, camera: DictionaryISP, pictures: Tensor) -> None:

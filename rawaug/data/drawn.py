@@ -59,9 +59,8 @@ def dead_leaves(
     """
     for source in sources:
         if source.ndim != 3 or source.shape[0] != 3 or source.dtype != torch.uint8 or min(source.shape[1:]) < 32:
-            raise ValueError(
-                f"a source must be uint8 (3, h, w) with sides of at least 32, got {source.dtype} {tuple(source.shape)}"
-            )
+            got = f"{source.dtype} {tuple(source.shape)}"
+            raise ValueError(f"a source must be uint8 (3, h, w) with sides of at least 32, got {got}")
     if not sources or smallest_radius <= 0.5 or min(height, width) < 8:
         raise ValueError(f"dead leaves need sources ({len(sources)}), r_min > 0.5 and sides >= 8 ({height} x {width})")
     photographs = [source.permute(1, 2, 0).contiguous().numpy() for source in sources]
@@ -69,7 +68,7 @@ def dead_leaves(
     radii = (_OVERSAMPLING * smallest_radius, min(fits, _OVERSAMPLING * max(height, width) / 3))
     if radii[0] >= radii[1]:
         raise ValueError(
-            f"smallest_radius {smallest_radius} is too large: the sources allow at most {fits / _OVERSAMPLING}"
+            f"smallest_radius must be below {fits / _OVERSAMPLING} for these sources, got {smallest_radius}"
         )
     fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
     n = _OVERSAMPLING

@@ -1,55 +1,217 @@
-"""SIDD's blocks of 256 x 256: validation, benchmark and its submission, and those of SIDD+ (NTIRE 2020).
+"""SIDD: full frames of five phones, noisy and clean, with their pictures; blocks of 256 x 256; and the blocks of SIDD+.
 
-``ValidationNoisyBlocksRaw.mat``, ``ValidationGtBlocksRaw.mat`` and ``BenchmarkNoisyBlocksRaw.mat`` hold an array of the
-same name, (40 scene instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of
-:data:`rawaug.data.sidd.frames.HELD_BACK`. SIDD+ holds (1024, rows, columns), 32 blocks a frame, with the pattern of
-each frame in a line of ``siddplus_*bayer_patterns.csv``.
+*Frames.* A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are
+MATLAB files of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black;
+METADATA are of version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not. The pattern
+goes by phone (the dataset's ``bayer_patterns.csv``). The S6's is GRBG; it looks like GBRG to those who read the files
+of version 7.3 without exchanging the axes.
 
-Pictures are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
+*Blocks.* ``ValidationNoisyBlocksRaw.mat`` and ``ValidationGtBlocksRaw.mat`` hold an array of the same name, (40 scene
+instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of :data:`HELD_BACK`. SIDD+
+(NTIRE 2020) holds (1024, rows, columns), 32 blocks a frame, with the pattern of each frame in a line of
+``siddplus_*bayer_patterns.csv``.
+
+Pictures of blocks are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
 ``siddplus_valid_gt_srgb.mat``), uint8 (scene instances, blocks, rows, columns, RGB), where these are below the same
-folder. SIDD turns its pictures upright and not its mosaics, and these files do not say how: of the eight turns, a
-frame's blocks take the one in which their green agrees best with the green of the mosaics. Gains and colour matrix are
-those of METADATA files. Where there is neither, the gains are 1, the matrix is the identity, the picture shows camera
-colour, and the pair says so (``rendered`` is False): it can test a denoiser, but no ISP.
+folder. These files do not say how they were turned upright: of the eight turns, a frame's blocks take the one in which
+their green agrees best with the green of the mosaics. Gains and colour matrix are those of METADATA files. Where there
+is neither, the gains are 1, the matrix is the identity, the picture shows camera colour, and the pair says so
+(``rendered`` is False): it can test a denoiser, but no ISP.
 
-A submission is a CSV with the columns ID (0 to 1279, block by block, frame by frame) and BLOCK (the bytes of the
-float32 block, row by row, in base64), or ``SubmitRaw.mat`` of version 5 with the array ``SubmitRaw`` (40, 32, 256,
-256). Source: the example code of the dataset's first author, ``sidd_kaggle_submit``.
+Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
+the dataset's ``noise_level_functions.csv``.
 """
 
 from __future__ import annotations
 
-import base64
 import csv
-import sys
+import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.bayer import CFA
-from rawaug.data.development import develop_mosaic
+from rawaug.bayer import CFA, turn_back
+from rawaug.data.development import UNKNOWN_COLOUR, color_matrix, develop_mosaic, white_balance
 from rawaug.data.folders import files_below
-from rawaug.data.mat import normalised, read_array
-from rawaug.data.pairs import Lazy, LazyPairs, NoisyBlock, Pair, captured_noise
-from rawaug.data.sidd.frames import (
-    HELD_BACK,
-    Colour,
-    SiddFrames,
-    SiddScene,
-    colour_of,
-    indexed,
-    noise_level_functions,
-)
+from rawaug.data.mat import normalised, read_array, read_value
+from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
+from rawaug.io import read_picture
+from rawaug.io.pictures import view_of_orientation
 from rawaug.registry import DATASETS
+
+T = TypeVar("T")
+
+PHONES = {
+    "GP": ("Google Pixel", CFA.BGGR),
+    "IP": ("Apple iPhone 7", CFA.RGGB),
+    "S6": ("Samsung Galaxy S6 Edge", CFA.GRBG),
+    "N6": ("Motorola Nexus 6", CFA.BGGR),
+    "G4": ("LG G4", CFA.BGGR),
+}
+"""Code in the folder's name: the phone, and the pattern of its frames."""
+
+_NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
+
+
+class SiddScene(NamedTuple):
+    """A scene instance: the name of its folder, and the physical scene, phone and ISO that it states."""
+
+    name: str
+    scene: str
+    phone: str
+    iso: int
+
+    @classmethod
+    def parse(cls, name: str) -> SiddScene:
+        found = _NAME.fullmatch(name)
+        if found is None or found[2] not in PHONES:
+            raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
+        return cls(name, found[1], found[2], int(found[3]))
+
+    @property
+    def cfa(self) -> CFA:
+        return PHONES[self.phone][1]
+
+    @property
+    def camera(self) -> str:
+        return PHONES[self.phone][0]
+
+
+def is_scene(name: str) -> bool:
+    return _NAME.fullmatch(name) is not None
+
+
+HELD_BACK = tuple(Path(__file__).with_name("sidd.txt").read_text(encoding="ascii").split())
+"""The scene instances of the blocks of validation and benchmark, in their order; none is among those for training."""
+
+_FILE = re.compile(r"(?:\d{4}_)?(GT_RAW|NOISY_RAW|METADATA_RAW|GT_SRGB|NOISY_SRGB)_(\d{3})\.(?:mat|png)", re.IGNORECASE)
+
+
+class SiddFrames(LazyPairs):
+    """The full frames below a folder: SIDD Small or Medium, RAW, and the sRGB set if present.
+
+    Noise levels are those of a ``noise_level_functions.csv`` where there is one, else measured against the clean frame,
+    which the pair says (``levels_from_clean``). Where a frame's ``GT_SRGB`` picture is not there, the clean frame is
+    developed as the dataset's makers did; its ``NOISY_SRGB`` picture is read where there is one. Scene instances in
+    ``left_out`` are not taken.
+    """
+
+    def __init__(self, path: str | Path, left_out: Sequence[str] = HELD_BACK) -> None:
+        self.path = Path(path)
+        self.shots = [
+            (SiddScene.parse(scene), number, files)
+            for (scene, number), files in sorted(indexed(self.path).items())
+            if "NOISY_RAW" in files and scene not in left_out
+        ]
+        for _, number, files in self.shots:
+            missing = {"GT_RAW", "METADATA_RAW"} - set(files)
+            if missing:
+                raise ValueError(f"{files['NOISY_RAW']}: its {min(missing)}_{number} is missing; download it too")
+        if not self.shots:
+            raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
+        self.levels = noise_level_functions(self.path)
+        self.labels = [FrameLabel(scene.scene, scene.phone, scene.iso) for scene, *_ in self.shots]
+        super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
+
+    def read(self, index: int) -> Pair:
+        scene, _, files = self.shots[index]
+        clean, noisy = (mosaic_of(files[kind]) for kind in ("GT_RAW", "NOISY_RAW"))
+        if clean.shape != noisy.shape:
+            sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
+            raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
+        gains, matrix, view = colour_of(files["METADATA_RAW"])
+        pictures = {
+            kind: _turned_back(files[kind], view, self.max_pixels)
+            for kind in ("GT_SRGB", "NOISY_SRGB")
+            if kind in files
+        }
+        known = self.levels.get(scene.name)
+        shot_var, read_var = known or measured_levels(clean, noisy)
+        return Pair(
+            name=self.names[index],
+            srgb=pictures["GT_SRGB"] if "GT_SRGB" in pictures else develop_mosaic(clean, scene.cfa, gains, matrix),
+            raw=clean,
+            cfa=scene.cfa,
+            white_balance=gains,
+            color_matrix=matrix,
+            noisy=noisy,
+            shot_var=shot_var,
+            read_var=read_var,
+            camera=scene.camera,
+            noisy_srgb=pictures.get("NOISY_SRGB"),
+            levels_from_clean=known is None,
+        )
+
+
+def mosaic_of(file: Path) -> Tensor:
+    """The mosaic ``x`` of a frame, float32 ``(1, H, W)``; of an odd side the last line is left out."""
+    return _even(normalised(read_array(file, "x"), 2, file))
+
+
+def noise_level_functions(path: Path) -> dict[str, tuple[float, float]]:
+    """(shot_var, read_var) by scene instance, the mean over a mosaic's sites, from the CSV below ``path``, if any."""
+    file = min(files_below(path, ("noise_level_functions.csv",)), default=None)
+    if file is None:
+        return {}
+    with file.open(encoding="utf-8-sig", newline="") as stream:
+        rows = list(csv.DictReader(stream, skipinitialspace=True))
+    levels = {}
+    for row in rows:
+        try:
+            shot, read = (sum(float(row[f"beta{k}_{colour}"]) for colour in "rggb") / 4 for k in (1, 2))
+            levels[row["scene_instance_id"]] = max(shot, 0.0), max(read, 0.0)
+        except (KeyError, TypeError, ValueError) as error:
+            columns = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
+            raise ValueError(f"{file}: each row has the columns {columns}; {error!r} is wrong") from error
+    return levels
+
+
+def indexed(path: Path) -> dict[tuple[str, str], dict[str, Path]]:
+    """Files below ``path`` by (scene instance, number), and by kind: GT_RAW, NOISY_RAW, METADATA_RAW, GT_SRGB,
+    NOISY_SRGB."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder of SIDD")
+    index: dict[tuple[str, str], dict[str, Path]] = {}
+    for file in files_below(path):
+        scene = file.parent.name
+        if is_scene(scene) and (found := _FILE.fullmatch(file.name)):
+            index.setdefault((scene, found[2]), {})[found[1].upper()] = file
+    return index
+
+
+class Colour(NamedTuple):
+    """Gains, colour matrix and upright view from a METADATA file."""
+
+    white_balance: tuple[float, float, float]
+    matrix: Tensor
+    upright_view: int
+
+
+def colour_of(file: Path) -> Colour:
+    tags: dict[str, Any] = read_value(file, "metadata")
+    try:
+        gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
+        return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error
+
+
+def _turned_back(file: Path, view: int, max_pixels: int) -> Tensor:
+    """The upright picture in ``file`` as the sensor saw it."""
+    return _even(turn_back(read_picture(file, max_pixels), view)).contiguous()
+
+
+def _even(image: Tensor) -> Tensor:
+    height, width = (side // 2 * 2 for side in image.shape[-2:])
+    return image[..., :height, :width]
+
 
 LEAST_LIKENESS = 0.8
 """Correlation of the greens below which pictures do not show the blocks of the mosaics."""
@@ -81,29 +243,25 @@ BLOCKS = 32
 MOST_FRAMES = 1000
 """Of SIDD+, which has 32."""
 
-T = TypeVar("T")
-
-_NO_COLOUR = Colour((1.0, 1.0, 1.0), torch.eye(3), 0)
+_NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
 
 class Once(Generic[T]):
-    """Calls ``read`` once and keeps its value or its error."""
+    """Calls ``read`` once; its value, or its error, is that of every call."""
 
     def __init__(self, read: Callable[[], T]) -> None:
         self.read = read
-        self.value: T | None = None
-        self.fault: Exception | None = None
+        self._outcome: T | Exception | None = None
 
     def __call__(self) -> T:
-        if self.fault is not None:
-            raise self.fault.with_traceback(None)
-        if self.value is None:
+        if self._outcome is None:
             try:
-                self.value = self.read()
+                self._outcome = self.read()
             except (OSError, ValueError) as error:
-                self.fault = error
-                raise
-        return self.value
+                self._outcome = error
+        if isinstance(self._outcome, Exception):
+            raise self._outcome.with_traceback(None)
+        return self._outcome
 
 
 class _Known(NamedTuple):
@@ -169,9 +327,6 @@ class SiddBlocks(_Blocks):
 
     Noise levels are those of a ``noise_level_functions.csv`` if there is one below the folder with the scene
     instance, else measured on the 32 blocks of a frame against the clean ones.
-
-    Args:
-        path: contains ``ValidationNoisyBlocksRaw.mat`` and ``ValidationGtBlocksRaw.mat``, at any depth.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -183,7 +338,7 @@ class SiddBlocks(_Blocks):
         return _Known(shot.name, shot.cfa, shot.camera, self._levels.get(shot.name), self._colours.get(shot.name))
 
     def _read_all(self) -> dict[str, Tensor]:
-        clean, noisy = (_blocks_of_scenes(file) for file in self.files)
+        clean, noisy = (blocks_of_scenes(file) for file in self.files)
         _require_same_shape(clean, noisy, self.files[1])
         self._levels = noise_level_functions(self.path)
         self._colours = _colours(self.path)
@@ -191,16 +346,11 @@ class SiddBlocks(_Blocks):
         return {"raw": clean, "noisy": noisy, **pictures}
 
 
+@DATASETS.register("siddplus")
 class SiddPlusBlocks(_Blocks):
-    """The validation blocks of SIDD+, 1,024 pairs; noise levels are measured as for :class:`SiddBlocks`.
+    """The validation blocks of SIDD+, 1,024 pairs, whatever the split; noise is measured as for :class:`SiddBlocks`."""
 
-    Args:
-        path: contains ``siddplus_valid_noisy_raw.mat``, ``siddplus_valid_gt_raw.mat`` and a
-            ``siddplus_*bayer_patterns.csv`` with a pattern for each frame of 32 blocks, at any depth; pictures in
-            ``siddplus_valid_gt_srgb.mat`` and ``siddplus_valid_noisy_srgb.mat``, if there are any.
-    """
-
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, split: str = "test") -> None:
         self.files = [find_file(Path(path), f"siddplus_valid_{kind}_raw.mat") for kind in ("gt", "noisy")]
         self.cfas = _patterns(find_file(Path(path), "siddplus_*bayer_patterns.csv"))
         super().__init__(Path(path), [f"siddplus_{k:02d}" for k in range(len(self.cfas))])
@@ -216,31 +366,6 @@ class SiddPlusBlocks(_Blocks):
         pictures = _pictures(self.path, "siddplus_valid_{}_srgb.mat", ("gt", "noisy"), clean)
         images = {"raw": clean, "noisy": noisy, **pictures}
         return {key: every.unflatten(0, (-1, BLOCKS)) for key, every in images.items()}
-
-
-class SiddBenchmark(Lazy[NoisyBlock]):
-    """The benchmark's noisy blocks, whose clean ones are not public; results go to :func:`write_submission`.
-
-    Args:
-        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth, and ``noise_level_functions.csv`` if there is one.
-
-    Raises:
-        FileNotFoundError: if the blocks are not there.
-
-    Example:
-        >>> blocks = SiddBenchmark("SIDD_Benchmark")  # doctest: +SKIP
-        >>> write_submission("SubmitRaw.csv", (denoise(b.mosaic, b.cfa) for b in blocks))  # doctest: +SKIP
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.levels = noise_level_functions(Path(path))
-        self._all = Once(partial(_blocks_of_scenes, find_file(Path(path), "BenchmarkNoisyBlocksRaw.mat")))
-        super().__init__([f"{scene}_{block:02d}" for scene in HELD_BACK for block in range(BLOCKS)])
-
-    def read(self, index: int) -> NoisyBlock:
-        scene, block = divmod(index, BLOCKS)
-        cfa, levels = SiddScene.parse(HELD_BACK[scene]).cfa, self.levels.get(HELD_BACK[scene])
-        return NoisyBlock(self.names[index], self._all()[scene, block], cfa, levels)
 
 
 @DATASETS.register("sidd")
@@ -267,21 +392,13 @@ def sidd_cc_pairs(path: str, split: str) -> Sequence[Pair]:
     return SiddFrames(path, left_out=())
 
 
-@DATASETS.register("siddplus")
-def siddplus_pairs(path: str, split: str) -> Sequence[Pair]:
-    """The validation blocks of SIDD+, whatever the split."""
-    return SiddPlusBlocks(path)
-
-
 def find_file(path: Path, pattern: str) -> Path:
     """The one file of this name below ``path``, or ``path`` itself."""
     found = [path] if path.is_file() and path.match(pattern) else _matching(path, pattern)
     if not found:
         raise FileNotFoundError(f"{path}: contains no {pattern}; docs/datasets.md says where to get it")
     if len(found) > 1:
-        raise ValueError(
-            f"{path}: contains {len(found)} files {pattern}, such as {found[0]} and {found[1]}; give a folder with one"
-        )
+        raise ValueError(f"{path}: contains {len(found)} files {pattern}, such as {found[0]}; give a folder with one")
     return found[0]
 
 
@@ -304,7 +421,6 @@ def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -
 
 
 def _patterns(file: Path) -> list[CFA]:
-    """A pattern for each frame of 32 blocks."""
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
             names = [row[0].strip().upper() for row in csv.reader(stream) if row]
@@ -315,7 +431,7 @@ def _patterns(file: Path) -> list[CFA]:
         raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
 
 
-def _blocks_of_scenes(file: Path) -> Tensor:
+def blocks_of_scenes(file: Path) -> Tensor:
     """``(40, 32, 1, H, W)``."""
     blocks = normalised(read_array(file, file.stem), 4, file)
     if blocks.shape[:2] != (len(HELD_BACK), BLOCKS):
@@ -331,81 +447,3 @@ def _colours(path: Path) -> dict[str, Colour]:
 def _require_same_shape(clean: Tensor, noisy: Tensor, file: Path) -> None:
     if clean.shape != noisy.shape:
         raise ValueError(f"{file}: holds {tuple(noisy.shape)}, its clean counterpart {tuple(clean.shape)}")
-
-
-SIDE = 256
-COUNT = len(HELD_BACK) * BLOCKS
-
-
-def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SIDE) -> None:
-    """Write denoised mosaics, in the order of :class:`rawaug.data.SiddBenchmark`, as ``.csv`` or ``.mat``.
-
-    Args:
-        path: ``SubmitRaw.csv`` or ``SubmitRaw.mat``.
-        blocks: 1,280 tensors ``(1, H, W)``, in the pattern that they came in. Values are written as they are.
-        side: of the blocks.
-
-    Raises:
-        ValueError: if the extension is another, a block has the wrong shape or a value that is not finite, or there are
-            not 1,280.
-    """
-    path = Path(path)
-    if path.suffix not in (".csv", ".mat"):
-        raise ValueError(f"{path}: a SIDD submission must be a .csv or .mat file")
-    arrays = [_checked(block, k, side) for k, block in enumerate(blocks)]
-    if len(arrays) != COUNT:
-        raise ValueError(f"{path}: a submission must have {COUNT} blocks, got {len(arrays)}")
-    if path.suffix == ".mat":
-        from scipy.io import savemat
-
-        savemat(path, {"SubmitRaw": np.stack(arrays).reshape(len(HELD_BACK), BLOCKS, side, side)})
-        return
-    with path.open("w", encoding="ascii", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(["ID", "BLOCK"])
-        table.writerows((k, base64.b64encode(array.tobytes()).decode()) for k, array in enumerate(arrays))
-
-
-def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
-    """Read a submission back as ``(1280, 1, side, side)``.
-
-    Raises:
-        FileNotFoundError, OSError: if there is no such file, or it is damaged.
-        ValueError: in one line, if the benchmark would refuse it, or values leave [0, 1] (which it would not notice).
-    """
-    path = Path(path)
-    blocks = _from_mat(path, side) if path.suffix == ".mat" else _from_csv(path, side)
-    if not np.isfinite(blocks).all() or blocks.min() < 0 or blocks.max() > 1:
-        raise ValueError(f"{path}: has values from {blocks.min():.4g} to {blocks.max():.4g}; clip them to [0, 1]")
-    return torch.from_numpy(blocks)[:, None]
-
-
-def _checked(block: Tensor, index: int, side: int) -> np.ndarray:
-    if tuple(block.shape) != (1, side, side):
-        raise ValueError(f"block {index}: must have shape (1, {side}, {side}), got {tuple(block.shape)}")
-    if not block.isfinite().all():
-        raise ValueError(f"block {index}: has values that are not finite")
-    return block[0].detach().cpu().numpy().astype("<f4", order="C")
-
-
-def _from_mat(path: Path, side: int) -> np.ndarray:
-    array = read_array(path, "SubmitRaw")
-    if array.shape != (len(HELD_BACK), BLOCKS, side, side) or array.dtype != np.float32:
-        expected = (len(HELD_BACK), BLOCKS, side, side)
-        raise ValueError(f"{path}: SubmitRaw must be float32 {expected}, got {array.dtype} {array.shape}")
-    return np.ascontiguousarray(array).reshape(COUNT, side, side)
-
-
-def _from_csv(path: Path, side: int) -> np.ndarray:
-    csv.field_size_limit(sys.maxsize)
-    with path.open(encoding="ascii", newline="") as file:
-        rows = list(csv.reader(file))
-    if rows[:1] != [["ID", "BLOCK"]] or [row[0] for row in rows[1:]] != [str(k) for k in range(COUNT)]:
-        raise ValueError(f"{path}: must have the columns ID and BLOCK, with IDs 0 to {COUNT - 1} in order")
-    blocks = np.empty((COUNT, side, side), np.float32)
-    for k, row in enumerate(rows[1:]):
-        data = base64.b64decode(row[1])
-        if len(data) != 4 * side * side:
-            raise ValueError(f"{path}: block {k} has {len(data)} bytes, expected {4 * side * side} (float32)")
-        blocks[k] = np.frombuffer(data, "<f4").reshape(side, side)
-    return blocks

@@ -1,1 +1,0 @@
-"""The Smartphone Image Denoising Dataset: frames, blocks and submissions."""
