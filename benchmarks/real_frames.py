@@ -19,10 +19,11 @@ import numpy as np
 from PIL import Image
 
 from rawaug.bayer import bin_mosaic, binned_variance, pack
-from rawaug.data.real import BLACK, FACTOR, FRAMES, WHITE
+from rawaug.data.published import REAL_BLACK, REAL_FRAMES, REAL_WHITE
 from rawaug.io import RawFrame, read_raw
 from rawaug.noise import estimate_noise
 
+BINNED = 4
 SPLITS = {
     "train": ("raw/canon/s40_0101.crw", "raw/canon/s40_0104.crw", "raw/canon/s40_0112.crw"),
     "validation": ("raw/canon/g2_0304.crw", "raw/canon/g2_0313.crw"),
@@ -36,11 +37,11 @@ SPLITS = {
 
 def numbers_of(frame: RawFrame) -> np.ndarray:
     """The binned planes as digital numbers, uint16 ``(4 h, w)``."""
-    height, width = (side // (2 * FACTOR) * 2 * FACTOR for side in frame.mosaic.shape[-2:])
-    binned = bin_mosaic(frame.mosaic[:, :height, :width].double(), frame.cfa, FACTOR)
-    planes = pack(binned * (WHITE - BLACK) + BLACK, frame.cfa).round()
-    if not 0 <= planes.min() <= planes.max() <= WHITE:
-        raise ValueError(f"{frame.name}: has numbers from {planes.min():g} to {planes.max():g}, outside 0 to {WHITE}")
+    height, width = (side // (2 * BINNED) * 2 * BINNED for side in frame.mosaic.shape[-2:])
+    binned = bin_mosaic(frame.mosaic[:, :height, :width].double(), frame.cfa, BINNED)
+    planes = pack(binned * (REAL_WHITE - REAL_BLACK) + REAL_BLACK, frame.cfa).round()
+    if not 0 <= planes.min() <= planes.max() <= REAL_WHITE:
+        raise ValueError(f"{frame.name}: {planes.min():g} to {planes.max():g} leave 0 to {REAL_WHITE}")
     return planes.reshape(-1, planes.shape[-1]).numpy().astype(np.uint16)
 
 
@@ -54,7 +55,7 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
         "cfa": str(frame.cfa),
         "white_balance": frame.white_balance,
         "color_matrix": frame.color_matrix.tolist(),
-        "own_noise": [level * binned_variance(FACTOR) for level in (estimate.shot_var, estimate.read_var)],
+        "own_noise": [level * binned_variance(BINNED) for level in (estimate.shot_var, estimate.read_var)],
         "source": file.name,
         "source_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
     }
@@ -63,7 +64,7 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("camera_files", type=Path)
-    parser.add_argument("--out", type=Path, default=FRAMES)
+    parser.add_argument("--out", type=Path, default=REAL_FRAMES)
     args = parser.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     frames = {}

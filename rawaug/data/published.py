@@ -1,4 +1,4 @@
-r"""Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich RAW to RGB and RawBench.
+r"""Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich, RawBench, and the package's own.
 
 *FiveK* (Canon EOS 5D and Nikon D700, split as for InvISP): each DNG is developed by LibRaw with the camera's white
 balance and without automatic brightness. ``fivek.json`` beside this file lists the numbers of the splits: 650 and 127
@@ -29,6 +29,13 @@ ICCV 2021.
 
 *RawBench*: 15 scenes at ISO 200 to 51,200 with shots at ISO 100, CC BY-SA 4.0. Source:
 <https://huggingface.co/datasets/AyedaOk/rawbench-dataset>.
+
+``real:`` has nine frames of three cameras: references, and a fit's first material. They are photographs of colour
+charts, a printed strip and a product's box by a Canon PowerShot S40 and G2 and a GoPro HERO7, binned 4 x 4 by colour
+site (``python -m benchmarks.real_frames`` makes them). ``train`` has three scenes of the S40, ``validation`` the G2,
+``test`` two other scenes of the S40 and the HERO7: no scene of a camera is in two splits. There is no noisy frame, so
+that noise is added; the picture of a pair is a plain development, without the camera's tone curve.
+``real_frames/LICENCE.md`` names source and licence (CC0).
 """
 
 from __future__ import annotations
@@ -37,7 +44,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -280,3 +287,56 @@ class RawBench(LazyPairs):
         clean_frame = replace(noisy, mosaic=raw)
         known = {"noisy": noisy.mosaic, "color_known": noisy.color_known}
         return Pair.of_frame(self.names[index], clean_frame, srgb, **known)
+
+
+REAL_FRAMES = Path(__file__).with_name("real_frames")
+REAL_BLACK, REAL_WHITE = 512, 16383
+"""Of the PNGs. Below black lies what is left of the noise there."""
+
+
+@DATASETS.register("real")
+class RealFrames(LazyPairs):
+    """The frames of a split; ``own_noise`` of each pair is what is left of the noise of its reference.
+
+    Args:
+        path: the split, as in ``real:train``; by default ``split``.
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+
+    Raises:
+        ValueError: if there is no such split.
+
+    Example:
+        >>> pair = RealFrames(split="test")[0]
+        >>> pair.name, pair.camera, pair.raw.shape
+        ('s40_0117', 'Canon PowerShot S40', torch.Size([1, 430, 578]))
+    """
+
+    def __init__(self, path: str = "", split: str = "test") -> None:
+        split = path or split
+        require_split("real", split, ("train", "validation", "test"))
+        super().__init__([name for name, frame in _real_frames().items() if frame["split"] == split])
+
+    def read(self, index: int) -> Pair:
+        name = self.names[index]
+        known = _real_frames()[name]
+        cfa, gains, matrix = CFA(known["cfa"]), tuple(known["white_balance"]), torch.tensor(known["color_matrix"])
+        numbers = read_plane(REAL_FRAMES / f"{name}.png").astype(np.float32)
+        planes = torch.from_numpy((numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)).reshape(4, -1, numbers.shape[-1])
+        raw = unpack(planes, cfa)
+        return Pair(
+            name=name,
+            srgb=develop_mosaic(raw, cfa, gains, matrix),
+            raw=raw,
+            cfa=cfa,
+            white_balance=gains,
+            color_matrix=matrix,
+            camera=known["camera"],
+            iso=known["iso"],
+            own_noise=tuple(known["own_noise"]),
+        )
+
+
+@cache
+def _real_frames() -> dict[str, dict[str, Any]]:
+    frames: dict[str, dict[str, Any]] = json.loads((REAL_FRAMES / "frames.json").read_text(encoding="utf-8"))
+    return frames

@@ -90,7 +90,7 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SID
     with path.open("w", encoding="ascii", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["ID", "BLOCK"])
-        table.writerows((k, base64.b64encode(array.astype("<f4")).decode()) for k, array in enumerate(arrays))
+        table.writerows((k, base64.b64encode(array.astype("<f4").tobytes()).decode()) for k, array in enumerate(arrays))
 
 
 def check_submission(path: str | Path, side: int = SIDE) -> Tensor:

@@ -100,7 +100,7 @@ def write_dng(
         tags |= _tags_of_the_mosaic(frame)
     else:
         tags = {code: tag for code, tag in tags.items() if code not in _OF_MOSAICS} | _tags_of_full_colour(frame)
-    extra_tags = [(code, *tag, True) for code, tag in sorted(tags.items())]
+    extra_tags: list[tuple[Any, ...]] = [(code, *tag, True) for code, tag in sorted(tags.items())]
     extra_tags += [(name, LONG, 1, 0, True) for name in directories]
     with replacing(path) as partial:
         with tag_damage(Path(source)) if source is not None else nullcontext():
@@ -291,7 +291,7 @@ class Entry(NamedTuple):
 
     code: int
     dtype: int
-    count: int
+    values: int
     data: bytes
 
 
@@ -375,7 +375,7 @@ def append_directory(path: Path, name: str, entries: list[Entry]) -> None:
         for entry in sorted(entries, key=lambda entry: entry.code):
             inside = len(entry.data) <= 4
             place = entry.data.ljust(4, b"\0") if inside else struct.pack(order + "I", beyond + len(values))
-            table += struct.pack(order + "HHI", entry.code, entry.dtype, entry.count) + place
+            table += struct.pack(order + "HHI", entry.code, entry.dtype, entry.values) + place
             values += b"" if inside else entry.data + bytes(len(entry.data) % 2)
         file.seek(start)
         file.write(table + bytes(4) + values)

@@ -136,14 +136,14 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
         pixels = source.read_image(kind(spec))
     except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
         raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
-    error = source.geterror()  # also set where a decoder padded a truncated file
+    fault = source.geterror()  # also set where a decoder padded a truncated file
     # a GIF is marked as animated only if its frames have a duration
     moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
     source.close()
     if moves:
         raise ValueError(f"{path}: is an animation; save a single frame")
-    if pixels is None or error:
-        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(error)})")
+    if pixels is None or fault:
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(fault)})")
     return pixels, spec
 
 

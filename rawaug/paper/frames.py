@@ -53,7 +53,7 @@ def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, n
     least = min(red, green, blue)
     to_srgb = torch.linalg.inv(colour_matrix(xyz_to_camera)).tolist()
     camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))
-    shot = replace(camera.sample(generator, iso=100), white_balance=(red / least, green / least, blue / least))
+    shot = camera.sample(generator, iso=100)._replace(white_balance=(red / least, green / least, blue / least))
     return camera.apply(_scene(picture, generator, name), shot, name)
 
 

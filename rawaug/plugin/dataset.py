@@ -138,9 +138,8 @@ class RawPairs(Dataset[Any]):
         """
         drawn, patches = [], []
         for index, generator in zip(indices, generators, strict=True):
-            picture = even_sided(to_rgb_tensor(self.dataset[index]))
-            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
-            patches.append(placed(picture, place, self.crop)[None])
+            patch, place = random_patch(self.dataset[index], self.crop, self.turns, generator, self.zoom)
+            patches.append(patch[None])
             drawn.append(self.augment.sample(patches[-1], generator, place[None]))
         pair: RawPair = self.augment.apply(torch.cat(patches), AugmentParams.joined(drawn))
         return pair
@@ -158,9 +157,8 @@ class RawPairs(Dataset[Any]):
     def _paired(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
         where = find_picture(sample, self.key)
         try:
-            picture = even_sided(to_rgb_tensor(picked(sample, where)))
-            place = random_place(picture, self.crop, self.turns, generator, self.zoom)
-            batch = self.augment.make(placed(picture, place, self.crop)[None], generator, place[None])
+            patch, place = random_patch(picked(sample, where), self.crop, self.turns, generator, self.zoom)
+            batch = self.augment.make(patch[None], generator, place[None])
         except ValueError as error:
             raise ValueError(f"picture {name}: {error}") from error
         pair = batch.map(lambda t: t[0])
@@ -269,6 +267,15 @@ def random_place(
     turn = bayer.RandomTurn(bayer.CFA.RGGB, quarter=size[0] == size[1])
     view = turn.sample(generator) if turns else torch.tensor(0)
     return torch.cat([corner, torch.tensor([height, width]), view[None]])
+
+
+def random_patch(
+    picture: Any, crop: tuple[int, int] | None, turns: bool, generator: torch.Generator, zoom: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """A crop of a picture in any form, ``(3, H, W)``, and its place."""
+    whole = even_sided(to_rgb_tensor(picture))
+    place = random_place(whole, crop, turns, generator, zoom)
+    return placed(whole, place, crop), place
 
 
 def placed(picture: Tensor, place: Tensor, crop: tuple[int, int] | None) -> Tensor:

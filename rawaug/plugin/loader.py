@@ -20,19 +20,10 @@ from torch.utils.data import IterableDataset
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import augmentation, crop_size, placed, random_place
+from rawaug.plugin.dataset import augmentation, crop_size, random_patch
 from rawaug.plugin.epochs import checked_epoch, own_share, world_size
 from rawaug.plugin.params import RawPair, require_keys
-from rawaug.plugin.pictures import (
-    even_sided,
-    find_picture,
-    is_picture,
-    picked,
-    replaced,
-    stacked,
-    to_rgb_batch,
-    to_rgb_tensor,
-)
+from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, stacked, to_rgb_batch
 from rawaug.seeding import keyed_generator, rank_key
 
 
@@ -159,10 +150,8 @@ class WrappedLoader:
     def _crops(self, pictures: Any, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """One crop of each picture ``(B, 3, crop, crop)``, and their places ``(B, 5)``."""
         listed = [pictures] if is_picture(pictures) else pictures
-        whole = [even_sided(to_rgb_tensor(picture)) for picture in listed]
-        places = [random_place(picture, self.crop, False, generator) for picture in whole]
-        patches = [placed(picture, place, self.crop) for picture, place in zip(whole, places, strict=True)]
-        return stacked(patches), torch.stack(places)
+        drawn = [random_patch(picture, self.crop, False, generator) for picture in listed]
+        return stacked([patch for patch, _ in drawn]), torch.stack([place for _, place in drawn])
 
     def __getattr__(self, name: str) -> Any:
         if "_share" not in self.__dict__:  # asked for before anything is set, by copy and pickle
