@@ -190,12 +190,7 @@ FRAME = (288, 448)
 
 
 def demo_photographs(split: str) -> dict[str, Tensor]:
-    """The split's photographs by name, uint8 ``(3, H, W)``.
-
-    Raises:
-        ValueError: if there is no such split.
-        FileNotFoundError: if scikit-image's installation lacks them.
-    """
+    """The photographs of a split by name, uint8 ``(3, H, W)``; ValueError if there is no such split."""
     require_split("demo", split, PHOTOGRAPHS)
     return dict(_read(PHOTOGRAPHS[split]))
 
@@ -233,9 +228,6 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
     """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
 
     The photographs are those of the training pairs and five others, none of validation or test.
-
-    Raises:
-        ValueError: if ``count`` is not positive.
     """
     if count < 1:
         raise ValueError(f"demo: count must be at least 1, got {count}")

@@ -53,16 +53,10 @@ def developed(
     exposure: float = 1.0,
     least: float | None = 0.0,
 ) -> Tensor:
-    """A mosaic as a picture, sRGB ``(3, H, W)`` in [0, 1]; no tone curve but sRGB's.
+    """A mosaic ``(1, H, W)`` as a picture, sRGB ``(3, H, W)`` in [0, 1]; no tone curve but sRGB's.
 
-    Args:
-        raw: ``(1, H, W)``, black 0, white 1.
-        cfa: its pattern.
-        gains: multipliers of R, G, B.
-        matrix: ``(3, 3)``, white-balanced camera colour to linear sRGB.
-        demosaicing: of :func:`rawaug.bayer.demosaic`.
-        exposure: a factor on all colours.
-        least: camera colour is clipped at; None keeps the zero-mean noise of shadows until it is sRGB.
+    ``exposure`` is a factor on all colours, ``least`` what camera colour is clipped at: None keeps the zero-mean noise
+    of shadows until it is sRGB.
 
     Example:
         >>> developed(torch.full((1, 8, 8), 0.5), "RGGB", (1, 1, 1), torch.eye(3)).mean().item()  # doctest: +ELLIPSIS

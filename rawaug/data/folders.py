@@ -62,12 +62,7 @@ def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iter
 
 
 def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
-    """:func:`files_below`, sorted, or ``path`` itself where it is a file.
-
-    Raises:
-        FileNotFoundError: if there is neither.
-        ValueError: if the folder contains no such file.
-    """
+    """:func:`files_below`, sorted, or ``path`` itself where it is a file; one of them at least."""
     path = Path(path)
     if path.is_file():
         return [path]
@@ -136,11 +131,7 @@ class PictureFolder(Dataset[Tensor]):
         return self.path / os.fsdecode(self._names[index])
 
     def read(self, index: int) -> Tensor:
-        """The picture of one file, not replaced by another.
-
-        Raises:
-            FileNotFoundError, OSError, ValueError: if it cannot be used.
-        """
+        """The picture of one file, not replaced by another; OSError or ValueError if it cannot be used."""
         picture = read_picture(self.file(index), self.max_pixels)
         if min(picture.shape[1:]) < self.min_side:
             size = f"{picture.shape[1]} x {picture.shape[2]}"

@@ -296,20 +296,7 @@ REAL_BLACK, REAL_WHITE = 512, 16383
 
 @DATASETS.register("real")
 class RealFrames(LazyPairs):
-    """The frames of a split; ``own_noise`` of each pair is what is left of the noise of its reference.
-
-    Args:
-        path: the split, as in ``real:train``; by default ``split``.
-        split: ``"train"``, ``"validation"`` or ``"test"``.
-
-    Raises:
-        ValueError: if there is no such split.
-
-    Example:
-        >>> pair = RealFrames(split="test")[0]
-        >>> pair.name, pair.camera, pair.raw.shape
-        ('s40_0117', 'Canon PowerShot S40', torch.Size([1, 430, 578]))
-    """
+    """The frames of a split, ``real:train``; ``own_noise`` of each pair is what is left of its reference's noise."""
 
     def __init__(self, path: str = "", split: str = "test") -> None:
         split = path or split

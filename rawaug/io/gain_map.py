@@ -98,14 +98,11 @@ def opcode_list(maps: Iterable[GainMap]) -> bytes:
 
 
 def of_planes(m: GainMap, cfa: CFA | str) -> list[GainMap]:
-    """A map of a mosaic's sites as maps of the planes R, G, B of the demosaiced picture.
-
-    Both greens have a map each, and a plane would be multiplied by both: the square root of either is taken.
-    """
+    """A map of a mosaic's sites as maps of the planes R, G, B of the demosaiced picture."""
     if m.pitch != (2, 2):
         return [replace(m, planes=(0, 3))]
     colour = CFA(cfa).channels[m.area[0] % 2][m.area[1] % 2]
-    gains = m.gains.sqrt() if colour == 1 else m.gains
+    gains = m.gains.sqrt() if colour == 1 else m.gains  # both greens have a map, and the plane is multiplied by both
     return [replace(m, area=(0, 0, *m.area[2:]), pitch=(1, 1), planes=(colour, 1), gains=gains)]
 
 

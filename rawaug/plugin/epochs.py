@@ -9,9 +9,6 @@ A DataLoader does not tell its Dataset that a new pass begins. So draws are coun
 The counts lie in shared memory, where workers of every start method find them, persistent ones too. A cell is written
 by the one worker that has the picture, so no lock is needed. ``pin`` replaces the count by a fixed epoch: a draw is
 then a pure function of (seed, epoch, index).
-
-PyTorch does not divide a loader by itself, and Lightning and Fabric divide only a DataLoader, which a wrapped one is
-not. :func:`own_share` gives a loader that chose its own order, sequential or shuffled, a ``DistributedSampler``.
 """
 
 from __future__ import annotations
@@ -34,7 +31,10 @@ def world_size() -> int:
 
 
 def own_share(loader: Any, seed: int) -> Any:
-    """The loader over this process's pictures; the loader itself if its sampler was chosen or it is no DataLoader."""
+    """The loader over this process's pictures; the loader itself if its sampler was chosen or it is no DataLoader.
+
+    Lightning and Fabric divide only a DataLoader, which a wrapped one is not.
+    """
     if world_size() == 1 or not isinstance(loader, DataLoader) or not _chose_its_order(loader):
         return loader
     shuffle = isinstance(loader.sampler, RandomSampler)

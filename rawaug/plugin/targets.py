@@ -24,17 +24,7 @@ Target = Literal["raw", "rgb", "srgb"]
 
 
 class Targets:
-    """The target of a :class:`rawaug.RawAugment`, and what is drawn for it.
-
-    Args:
-        target: ``"raw"``, ``"rgb"`` or ``"srgb"``.
-        demosaicing: of ``"srgb"``: names of :data:`rawaug.bayer.STENCILS` to draw from; all by default.
-        jpeg: of ``"srgb"``: lowest and highest quality that the noisy picture is compressed with; None for no JPEG.
-        pattern: of the RAW.
-
-    Raises:
-        ValueError: if a setting is unknown, out of range, or without meaning for the target.
-    """
+    """The target of a :class:`rawaug.RawAugment`, whose settings these are, and what is drawn for it."""
 
     def __init__(
         self, target: Target, demosaicing: str | Sequence[str] | None, jpeg: tuple[int, int] | None, pattern: str
@@ -71,10 +61,7 @@ class Targets:
 
 
 def reaching_white(setting: ISPParams) -> ISPParams:
-    """The setting with gains of at least 1: RAW exposed above its picture is left as bright as it is.
-
-    Darkened to the picture's brightness, the sensor's white would be grey.
-    """
+    """The setting with gains of at least 1: with RAW darkened to its picture, the sensor's white would be grey."""
     return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
 
 

@@ -127,14 +127,11 @@ class FrozenPictures(Lazy[NoisyFrame]):
 
 
 class NoisyCrops:
-    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples.
-
-    Where the estimator adds noise, the signal of real frames is estimated here, before processes share them.
-    """
+    """Crops of noisy frames, in eight turns that keep the CFA, as an estimator's training samples."""
 
     def __init__(self, frames: Sequence[NoisyFrame], estimator: SelfSupervised, crop: int, cfa: CFA) -> None:
         self.frames, self.estimator, self.crop, self.cfa = frames, estimator, crop, cfa
-        if estimator.adds_noise and not isinstance(frames, FrozenPictures):
+        if estimator.adds_noise and not isinstance(frames, FrozenPictures):  # before processes share them
             for frame in progress(frames, label="signal of noisy frames", unit="frame"):
                 _ = frame.signal
 

@@ -26,12 +26,7 @@ from rawaug.training.config import DenoiserConfig, TrainConfig
 
 
 class Start(NamedTuple):
-    """The file that a training continues from.
-
-    Args:
-        sha256: of the file.
-        cfa: the pattern that its network was trained for.
-    """
+    """The hash of the file that a training continues from, and the pattern of its network."""
 
     sha256: str
     cfa: CFA

@@ -51,10 +51,7 @@ class RealCrops:
 
 
 class PictureCrops:
-    """Pairs from sRGB pictures, with noise drawn anew: the samples of :class:`rawaug.RawPairs`, in any target.
-
-    Those without a noise map, of sRGB, have zeros in its place, for networks that read none.
-    """
+    """Samples of :class:`rawaug.RawPairs` in any target; zeros stand for the noise map where there is none."""
 
     def __init__(self, pairs: RawPairs) -> None:
         self.pairs = pairs

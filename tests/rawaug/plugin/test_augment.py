@@ -76,6 +76,8 @@ def test_exposure_darkens_by_its_stops_and_replays(isp: DictionaryISP) -> None:
 
 
 def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
+    with pytest.raises(ValueError, match="order"):
+        RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
     with pytest.raises(ValueError, match="convex, independent, perturb, chosen"):
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
@@ -85,20 +87,6 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
 def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:
     with pytest.raises(ValueError, match="3 pictures, but the batch has 2"):
         augment.apply(srgb[:2], augment.sample(srgb))
-
-
-@pytest.mark.parametrize("form", ["nhwc", "numpy", "list", "pil list"])
-def test_a_batch_of_any_form_is_the_same(augment: RawAugment, srgb: Tensor, form: str) -> None:
-    nhwc = srgb.permute(0, 2, 3, 1)
-    forms: dict[str, Any] = {
-        "nhwc": nhwc,
-        "numpy": nhwc.numpy(),
-        "list": list(srgb),
-        "pil list": [Image.fromarray(picture.numpy()) for picture in nhwc],
-    }
-    generator = torch.Generator()
-    expected = augment(srgb, generator.manual_seed(1))
-    assert_same(augment(forms[form], generator.manual_seed(1)), expected)
 
 
 def test_fields_pass_and_keys_name_the_pictures(augment: RawAugment, srgb: Tensor) -> None:
@@ -174,11 +162,6 @@ def test_a_network_in_bfloat16_leaves_it_in_float32(isp: DictionaryISP, srgb: Te
     assert whole[1].weight.dtype == torch.bfloat16
     expected = RawAugment(isp, seed=3)(srgb)
     assert torch.equal(augment(srgb).noisy, expected.noisy)
-
-
-def test_another_order_of_stages_is_refused() -> None:
-    with pytest.raises(ValueError, match="order"):
-        RawAugment(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))
 
 
 def test_the_caller_s_isp_stays_as_it_is() -> None:

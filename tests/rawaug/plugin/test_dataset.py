@@ -24,6 +24,7 @@ from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs, RawPairStream, random_place
+from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
 COUNT = 12
@@ -172,6 +173,7 @@ def test_flat_keys_are_where_a_script_looks(augment: RawAugment) -> None:
 
 def test_what_makes_pairs_may_be_a_name(pictures: list[Tensor]) -> None:
     assert RawPairs(pictures, "universal", crop=16)[0].noisy.shape == (4, 8, 8)
+    assert next(iter(wrap([pictures[0][None]], "universal"))).noisy.shape == (1, 4, 10, 17)
     assert RawPairs(pictures, "universal", crop=None)[0].noisy.shape == (4, 10, 17), "whole, without the odd line"
     with pytest.raises(TypeError, match="or an ISP, its name or path; got int"):
         RawPairs(pictures, 3)  # type: ignore[arg-type]

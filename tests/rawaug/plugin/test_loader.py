@@ -226,9 +226,3 @@ def test_flat_keys_and_oblong_crops(augment: RawAugment, srgb: Tensor, crop: Any
     loader = [{"image": srgb, "id": 3}]
     (batch,) = wrap(loader, augment, key="image", crop=crop, keys=("lq", "gt"))
     assert list(batch) == ["id", "lq", "gt"] and batch["gt"].shape == (6, 4, 2, 4)
-
-
-def test_an_isp_or_its_name_makes_the_augmentation(augment: RawAugment, srgb: Tensor) -> None:
-    assert torch.equal(noisy(wrap([srgb], augment.isp)), noisy(wrap([srgb], augment)))
-    with pytest.raises(FileNotFoundError, match="nosuch"):
-        wrap([srgb], "nosuch")

@@ -35,13 +35,6 @@ def test_saved_with_a_batch_they_replay_every_pair(pairs: RawPairs, tmp_path: Pa
             assert torch.equal(getattr(again, name), getattr(batch, name)[i])
 
 
-def test_a_flat_dict_is_the_same(pairs: RawPairs) -> None:
-    pair = pairs[1]
-    again = AugmentParams.from_tensors(pair.params.tensors())
-    assert again.noise.keys() == pair.params.noise.keys() and again.isp._fields == pair.params.isp._fields
-    assert torch.equal(pairs.replay(1, again).noisy, pair.noisy)
-
-
 def test_replay_refuses_another_picture(pairs: RawPairs) -> None:
     with pytest.raises(ValueError, match="picture of 22 x 26"):
         pairs.replay(3, pairs[1].params)

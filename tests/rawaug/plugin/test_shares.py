@@ -14,7 +14,7 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler, Rando
 
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
-from rawaug.plugin.dataset import RawPairs, RawPairStream
+from rawaug.plugin.dataset import RawPairStream
 from rawaug.plugin.loader import wrap
 from rawaug.plugin.params import RawPair
 
@@ -89,19 +89,6 @@ def test_each_process_has_its_share_of_a_wrapped_loader(augment: RawAugment, tmp
     for one, other in zip(first, second, strict=True):
         assert sorted(one + other) == pytest.approx(sorted(everything))
     assert (first[0] != first[1]) == shuffle
-
-
-def test_counted_draws_of_processes_differ(augment: RawAugment, tmp_path: Path) -> None:
-    def draws() -> list[float]:
-        pairs = RawPairs(pictures(), RawAugment(augment.isp, noise=(0.01, 0.01)), crop=4)
-        counted = float(pairs[7].noisy.sum())
-        in_a_worker = [float(pair.noisy.sum()) for pair in DataLoader(pairs, sampler=[7], num_workers=1)]
-        pairs.set_epoch(0)
-        return [counted, *in_a_worker, float(pairs[7].noisy.sum())]
-
-    first, second = in_two_processes(draws, tmp_path)
-    assert len({*first[:2], *second[:2]}) == 4
-    assert first[2] == second[2] == first[0]
 
 
 def test_samples_with_an_identity_draw_alike_in_every_process(
