@@ -227,13 +227,15 @@ def _cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tenso
     return raw[..., top : top + height, left : left + width]
 
 
-def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int) -> Tensor:
+def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False) -> Tensor:
     """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides, each site the mean of its colour around its place.
 
     The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
     the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
     of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
     independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
+
+    With ``together`` the four sites of a new cell are means over the same area, as a pixel of full colour needs them.
 
     Raises:
         ValueError: if the CFA is not Bayer's (X-Trans), or a side is not a multiple of 2 ``factor``.
@@ -245,8 +247,9 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int) -> Tensor:
     if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
     CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
-    rows = [_window_means(raw[..., i::2, :], -2, factor, i) for i in (0, 1)]
-    sites = [[_window_means(row[..., j::2], -1, factor, j) for j in (0, 1)] for row in rows]
+    move = 0.0 if together else (factor - 1) / 4
+    rows = [_window_means(raw[..., i::2, :], -2, factor, move * (2 * i - 1)) for i in (0, 1)]
+    sites = [[_window_means(row[..., j::2], -1, factor, move * (2 * j - 1)) for j in (0, 1)] for row in rows]
     return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
 
 
@@ -256,9 +259,8 @@ def binned_variance(factor: int) -> float:
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
 
 
-def _window_means(plane: Tensor, axis: int, factor: int, odd: int) -> Tensor:
-    """Means over ``factor`` sites of one colour, in an axis of which it has the even or the odd sites."""
-    move = (factor - 1) / 4 * (1 if odd else -1)
+def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
+    """Means over ``factor`` sites of one colour, of windows moved by so many of its sites."""
     first, part = math.floor(move), move % 1
     sites = torch.arange(plane.shape[axis], device=plane.device)
     near, far = (

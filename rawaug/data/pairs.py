@@ -135,10 +135,10 @@ class Pair:
         rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
         return self._window(rows, columns, self.cfa)
 
-    def binned(self, factor: int) -> Pair:
+    def binned(self, factor: int, together: bool = False) -> Pair:
         """The frame at 1 / ``factor`` of its sides, whose noise has about 1 / ``factor``^2 of the variance.
 
-        RAW by :func:`rawaug.bayer.bin_mosaic`; pictures are averaged in linear light.
+        RAW by :func:`rawaug.bayer.bin_mosaic`, which explains ``together``; pictures are averaged in linear light.
 
         Raises:
             ValueError: if a side is shorter than two of the new cell's.
@@ -149,13 +149,13 @@ class Pair:
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
         changed: dict[str, Any] = {}
-        left = binned_variance(factor)
+        left = factor**-2 if together else binned_variance(factor)
         for key in ("raw", "noisy", "srgb", "noisy_srgb"):
             image = getattr(self, key)
             if image is None:
                 continue
             cut = image[:, :height, :width]
-            changed[key] = bin_mosaic(cut, self.cfa, factor) if len(cut) == 1 else _bin_picture(cut, factor)
+            changed[key] = bin_mosaic(cut, self.cfa, factor, together) if len(cut) == 1 else _bin_picture(cut, factor)
         if self.shot_var is not None and self.read_var is not None:
             changed |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
         if self.own_noise is not None:
@@ -324,6 +324,7 @@ class Binned(SomePairs):
     Args:
         pairs: the sequence.
         factor: the mean of factor x factor sites of a colour is one site.
+        together: see :func:`rawaug.bayer.bin_mosaic`.
 
     Raises:
         ValueError: if the factor is below 1.
@@ -334,17 +335,17 @@ class Binned(SomePairs):
         torch.Size([1, 72, 112])
     """
 
-    def __init__(self, pairs: Sequence[Pair], factor: int) -> None:
+    def __init__(self, pairs: Sequence[Pair], factor: int, together: bool = False) -> None:
         if factor < 1:
             raise ValueError(f"bin must be at least 1, got {factor}")
         super().__init__(pairs)
-        self.factor = factor
+        self.factor, self.together = factor, together
 
     def read(self, index: int) -> Pair:
-        return super().read(index).binned(self.factor)
+        return super().read(index).binned(self.factor, self.together)
 
     def stamp(self, index: int) -> str:
-        return f"{super().stamp(index)} binned by {self.factor}"
+        return f"{super().stamp(index)} binned by {self.factor}{', together' * self.together}"
 
 
 OWN_PICTURES = "pairs"

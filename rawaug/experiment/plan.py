@@ -139,10 +139,11 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
     if pictures is None:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
+    together = recipe.target == "rgb"
     return Plan(
         pairs=chosen,
-        validation=some(validation, data.validation_count, data.validation_crop, data.bin),
-        test=some(test, data.test_count, data.test_crop, data.bin),
+        validation=some(validation, data.validation_count, data.validation_crop, data.bin, together),
+        test=some(test, data.test_count, data.test_crop, data.bin, together),
         references=test,
         pictures=Cached(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
@@ -150,10 +151,12 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     )
 
 
-def some(pairs: Sequence[Pair], count: int | None, crop: int | None, factor: int = 1) -> Sequence[Pair]:
+def some(
+    pairs: Sequence[Pair], count: int | None, crop: int | None, factor: int = 1, together: bool = False
+) -> Sequence[Pair]:
     """The first ``count`` pairs, binned by ``factor``, the middle of each; None for all of them, or whole frames."""
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
-    binned = chosen if factor == 1 else Binned(chosen, factor)
+    binned = chosen if factor == 1 else Binned(chosen, factor, together)
     return binned if crop is None else Middles(binned, crop)
 
 

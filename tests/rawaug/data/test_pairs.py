@@ -160,6 +160,8 @@ def test_binned_sites_lie_where_a_sensor_s_lie(factor: int) -> None:
     side = 1600 // (2 * factor) * 2 * factor
     left = bin_mosaic(noise[..., :side, :side], "GRBG", factor)[..., 4:-4, 4:-4].var().item()
     assert left == pytest.approx(binned_variance(factor), rel=0.03)
+    cells = bin_mosaic(ramp, "GRBG", factor, together=True)[0, 2:4, 2:4]
+    assert cells[1, 1] - cells[0, 0] == pytest.approx(4.0)
     assert binned_variance(factor) == pytest.approx(factor**-2, rel=0.35)
 
 

@@ -12,7 +12,6 @@ from PIL import Image
 from rawaug.data import open_pairs
 from rawaug.data.published import REAL_FRAMES
 from rawaug.io import read_raw
-from rawaug.noise import own_noise
 
 
 def test_every_split_is_read_and_states_what_is_known() -> None:
@@ -46,14 +45,3 @@ def test_the_maker_makes_them_of_the_camera_files(camera_files: Path, tmp_path: 
         said = json.loads(json.dumps(described(file, frame, split)))
         kept = json.loads((REAL_FRAMES / "frames.json").read_text())[file.stem]
         assert said.pop("own_noise") == pytest.approx(kept.pop("own_noise"), rel=1e-3) and said == kept
-
-
-def test_binning_leaves_a_sixteenth_of_the_noise(camera_files: Path) -> None:
-    """Measured on what is left: the difference of the two greens of a flat part of a chart."""
-    (pair,) = (pair for pair in open_pairs("real:train") if pair.name == "s40_0101")
-    levels = own_noise([pair], 0)
-    assert levels is not None
-    flat = pair.raw[0, 380:396, 250:300]  # of the patch of neutral grey
-    gr, gb = flat[0::2, 1::2], flat[1::2, 0::2]
-    expected = levels[0] * flat.mean().item() + levels[1]
-    assert ((gr - gb).var() / 2).item() == pytest.approx(expected, rel=0.5)
