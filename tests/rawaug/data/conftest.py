@@ -65,3 +65,9 @@ def _references(file: h5py.File, values: list[Any]) -> np.ndarray:
 @pytest.fixture(scope="session")
 def mat73() -> Callable[[Path, dict[str, Any]], Path]:
     return write_mat73
+
+
+@pytest.fixture(autouse=True)
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are read in this process: a helper, which takes a second to start, is for tests of crashes and hangs."""
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")

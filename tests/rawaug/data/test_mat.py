@@ -48,7 +48,10 @@ def test_the_version_is_that_of_the_header(tmp_path: Path, mat73: Writer) -> Non
         mat_version(tmp_path / "none.mat")
 
 
-def test_arrays_keep_matlabs_axes_and_type(written: Callable[[dict[str, Any]], Path]) -> None:
+def test_arrays_keep_matlabs_axes_and_type_through_the_helper(
+    written: Callable[[dict[str, Any]], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "60")
     array = read_array(written({"x": ARRAY, "y": np.arange(6).reshape(2, 3)}), "x")
     assert array.dtype == np.float32 and np.array_equal(array, ARRAY)
     assert array.flags["C_CONTIGUOUS"] or array.flags["F_CONTIGUOUS"]
@@ -91,6 +94,7 @@ def _crash(path: Path, name: str, plain: bool) -> None:
 def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     savemat(tmp_path / "a.mat", {"x": ARRAY})
     monkeypatch.setattr("rawaug.data.mat._read", _crash)
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "60")
     with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(SIGSEGV"):
         read_array(tmp_path / "a.mat", "x")
 

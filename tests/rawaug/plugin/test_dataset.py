@@ -50,10 +50,8 @@ def expected(augment: RawAugment, pictures: list[Tensor]) -> Tensor:
     [
         (0, 1, None, 0),
         (0, 5, None, 5),
-        (1, 3, "fork", 0),
-        (4, 2, "fork", 0),
-        (4, 5, "fork", 7),
-        (2, 2, "forkserver", 3),
+        (3, 2, "fork", 0),
+        (2, 5, "forkserver", 7),
     ],
 )
 def test_pairs_are_the_same_however_they_are_loaded(
@@ -276,7 +274,7 @@ for path in sys.argv[1:]:
         pictures.append(torch.from_numpy(raw.postprocess().copy()))
 pairs = RawPairs(pictures, RawAugment(DictionaryISP()), crop=128)
 list(pairs)  # the parent's threads have worked too
-for run in range(5):
+for run in range(3):
     loader = DataLoader(pairs, num_workers=2, multiprocessing_context="fork")
     assert sum(pair.noisy.numel() for pair in loader) == len(pictures) * 4 * 64 * 64
 print("done")

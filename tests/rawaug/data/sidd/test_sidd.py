@@ -302,7 +302,6 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
         reads.append(file)
         return read_array(file, name)
 
-    monkeypatch.setenv("RAWAUG_READ_SECONDS", "0")  # in this process, where reads are counted
     monkeypatch.setattr(sidd, "read_array", counted)
     (part,) = check(tmp_path).parts
     assert part.items == 1024 and len(reads) == 2
