@@ -13,6 +13,7 @@ interpolation, which treats all denoisers alike.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,6 +77,15 @@ def rendered(
 def develop_mosaic(raw: Tensor, cfa: CFA, gains: tuple[float, float, float], matrix: Tensor) -> Tensor:
     """A mosaic ``(1, H, W)`` as the picture of a pair, uint8 ``(3, H, W)``."""
     return (developed(raw, cfa, gains, matrix) * 255).round_().to(torch.uint8)
+
+
+def developed_pair(
+    name: str, raw: Tensor, cfa: CFA, white_balance: tuple[float, float, float], color_matrix: Tensor, **known: Any
+) -> Pair:
+    """A pair whose picture, unless one is ``known``, is a plain development of its RAW."""
+    if "srgb" not in known:
+        known["srgb"] = develop_mosaic(raw, cfa, white_balance, color_matrix)
+    return Pair(name, raw=raw, cfa=cfa, white_balance=white_balance, color_matrix=color_matrix, **known)
 
 
 def develop_packed(packed: Tensor, cfa: CFA, pair: Pair, exposure: float = 1.0) -> Tensor:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from rawaug.data.development import UNKNOWN_COLOUR, develop_mosaic
+from rawaug.data.development import UNKNOWN_COLOUR, developed_pair
 from rawaug.data.folders import RawFolder, files_below
 from rawaug.data.formats import READABLE, TWO_IN_ONE, parsed, read_mosaic
 from rawaug.data.pairs import LazyPairs, Pair
@@ -120,22 +120,11 @@ class PairFolder(LazyPairs):
             if one != other:
                 raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
         stated = [(frame.white_balance, frame.color_matrix) for frame in (clean, noisy) if frame.color_known]
-        gains, matrix = stated[0] if stated else UNKNOWN_COLOUR
+        colour = stated[0] if stated else UNKNOWN_COLOUR
         shot_var, read_var = noisy.noise_profile or (None, None)
-        return Pair(
-            name=name,
-            srgb=develop_mosaic(clean.mosaic, clean.cfa, gains, matrix),
-            raw=clean.mosaic,
-            cfa=clean.cfa,
-            white_balance=gains,
-            color_matrix=matrix,
-            noisy=noisy.mosaic,
-            shot_var=shot_var,
-            read_var=read_var,
-            camera=noisy.camera,
-            color_known=bool(stated),
-            iso=noisy.iso,
-        )
+        known = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var, "color_known": bool(stated)}
+        shot = {"camera": noisy.camera, "iso": noisy.iso}
+        return developed_pair(name, clean.mosaic, clean.cfa, *colour, **known, **shot)
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:

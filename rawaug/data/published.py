@@ -53,7 +53,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
-from rawaug.data.development import develop_mosaic
+from rawaug.data.development import develop_mosaic, developed_pair
 from rawaug.data.folders import RAW_EXTENSIONS, RawFolder, files_below, files_in
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
@@ -309,18 +309,8 @@ class RealFrames(LazyPairs):
         cfa, gains, matrix = CFA(known["cfa"]), tuple(known["white_balance"]), torch.tensor(known["color_matrix"])
         numbers = read_plane(REAL_FRAMES / f"{name}.png").astype(np.float32)
         planes = torch.from_numpy((numbers - REAL_BLACK) / (REAL_WHITE - REAL_BLACK)).reshape(4, -1, numbers.shape[-1])
-        raw = unpack(planes, cfa)
-        return Pair(
-            name=name,
-            srgb=develop_mosaic(raw, cfa, gains, matrix),
-            raw=raw,
-            cfa=cfa,
-            white_balance=gains,
-            color_matrix=matrix,
-            camera=known["camera"],
-            iso=known["iso"],
-            own_noise=tuple(known["own_noise"]),
-        )
+        shot = {"camera": known["camera"], "iso": known["iso"], "own_noise": tuple(known["own_noise"])}
+        return developed_pair(name, unpack(planes, cfa), cfa, gains, matrix, **shot)
 
 
 @cache

@@ -38,7 +38,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
-from rawaug.data.development import UNKNOWN_COLOUR, color_matrix, develop_mosaic, white_balance
+from rawaug.data.development import UNKNOWN_COLOUR, color_matrix, developed_pair, white_balance
 from rawaug.data.folders import files_below
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
@@ -127,27 +127,14 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-        pictures = {
-            kind: _turned_back(files[kind], view, self.max_pixels)
-            for kind in ("GT_SRGB", "NOISY_SRGB")
-            if kind in files
-        }
-        known = self.levels.get(scene.name)
-        shot_var, read_var = known or measured_levels(clean, noisy)
-        return Pair(
-            name=self.names[index],
-            srgb=pictures["GT_SRGB"] if "GT_SRGB" in pictures else develop_mosaic(clean, scene.cfa, gains, matrix),
-            raw=clean,
-            cfa=scene.cfa,
-            white_balance=gains,
-            color_matrix=matrix,
-            noisy=noisy,
-            shot_var=shot_var,
-            read_var=read_var,
-            camera=scene.camera,
-            noisy_srgb=pictures.get("NOISY_SRGB"),
-            levels_from_clean=known is None,
-        )
+        published = self.levels.get(scene.name)
+        shot_var, read_var = published or measured_levels(clean, noisy)
+        known: dict[str, Any] = {"noisy": noisy, "shot_var": shot_var, "read_var": read_var, "camera": scene.camera}
+        for key, kind in (("srgb", "GT_SRGB"), ("noisy_srgb", "NOISY_SRGB")):
+            if kind in files:
+                known[key] = _turned_back(files[kind], view, self.max_pixels)
+        known["levels_from_clean"] = published is None
+        return developed_pair(self.names[index], clean, scene.cfa, gains, matrix, **known)
 
 
 def mosaic_of(file: Path) -> Tensor:
@@ -296,11 +283,7 @@ class _Blocks(LazyPairs):
         if self._frame is None or self._frame[0] != number:
             self._frame = number, *self._shared(number)
         _, images, shared = self._frame
-        known: dict[str, Any] = {key: image[block] for key, image in images.items()} | shared
-        if "srgb" not in images:
-            colours = known["white_balance"], known["color_matrix"]
-            known["srgb"] = develop_mosaic(known["raw"], known["cfa"], *colours)
-        return Pair(self.names[index], **known)
+        return developed_pair(self.names[index], **{key: image[block] for key, image in images.items()}, **shared)
 
     def _shared(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The images of a frame's blocks, turned alike, and what else of a :class:`Pair` they share."""
