@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rawaug.data.development import UNKNOWN_COLOUR, developed_pair
 from rawaug.data.folders import RawFolder, files_below
@@ -122,9 +122,9 @@ class PairFolder(LazyPairs):
         stated = [(frame.white_balance, frame.color_matrix) for frame in (clean, noisy) if frame.color_known]
         colour = stated[0] if stated else UNKNOWN_COLOUR
         shot_var, read_var = noisy.noise_profile or (None, None)
-        known = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var, "color_known": bool(stated)}
-        shot = {"camera": noisy.camera, "iso": noisy.iso}
-        return developed_pair(name, clean.mosaic, clean.cfa, *colour, **known, **shot)
+        known: dict[str, Any] = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var}
+        known |= {"color_known": bool(stated), "camera": noisy.camera, "iso": noisy.iso}
+        return developed_pair(name, clean.mosaic, clean.cfa, *colour, **known)
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:

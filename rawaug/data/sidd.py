@@ -283,7 +283,8 @@ class _Blocks(LazyPairs):
         if self._frame is None or self._frame[0] != number:
             self._frame = number, *self._shared(number)
         _, images, shared = self._frame
-        return developed_pair(self.names[index], **{key: image[block] for key, image in images.items()}, **shared)
+        known: dict[str, Any] = {key: image[block] for key, image in images.items()} | shared
+        return developed_pair(self.names[index], **known)
 
     def _shared(self, number: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The images of a frame's blocks, turned alike, and what else of a :class:`Pair` they share."""
