@@ -107,7 +107,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file() and path.suffix in (".csv", ".mat"):
-        return DataReport(path, [_part("SIDD submission", partial(check_submission, path), first)])
+        return DataReport(path, [_part("SIDD submission", partial(_submission, path), first)])
     known = list(_datasets(path)) or list(_files(path))
     if not known:
         raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
@@ -170,6 +170,10 @@ class _RawFrames(Lazy[RawFrame]):
 
     def read(self, index: int) -> RawFrame:
         return read_raw(self.files[index])
+
+
+def _submission(path: Path) -> list[Tensor]:
+    return list(check_submission(path))
 
 
 def _part(what: str, open_part: Callable[[], Any], first: int | None) -> PartReport:

@@ -104,6 +104,14 @@ def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
     assert len(report.broken) == 1 and "has values from 2 to 2" in report.broken[0]
 
 
+def test_blocks_of_a_submission_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "SubmitRaw.csv").touch()
+    module = sys.modules["rawaug.data.check"]
+    monkeypatch.setattr(module, "check_submission", lambda path: torch.zeros(6, 1, 8, 8))
+    (part,) = check(tmp_path / "SubmitRaw.csv", first=5).parts
+    assert (part.items, part.examined, dict(part.counts["sizes"])) == (6, 5, {"8 x 8": 5})
+
+
 class Crashing(PictureFolder):
     """Whose second file crashes its decoder, and whose third one hangs it."""
 
