@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, crops, denoise, equal_minutes, measure, networks, sensors, synth
+from benchmarks import augment, binning, crops, denoise, equal_minutes, measure, networks, sensors, synth
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -161,3 +161,11 @@ def test_sensors_scores_flat_patches_frames_and_cells_beside_lights() -> None:
         expected, abs=0.15
     )
     assert sensors.beside_lights(black, [("light", clean)], (1e-6, 1e-9)) == (0.0, 12.04)
+
+
+def test_binning_scores_the_same_noise_on_both_kinds_of_reference(tmp_path: Path) -> None:
+    binning.main(["rawaug-small", "--data", "real:train", "--bin", "2", "--quick", "--json", str(tmp_path / "f.json")])
+    figures = json.loads((tmp_path / "f.json").read_text())
+    squares, around = (figures[way] for way in binning.WAYS)
+    assert squares["noisy"] == pytest.approx(around["noisy"], abs=0.1)
+    assert around["rawaug-small"] > squares["rawaug-small"] + 0.1
