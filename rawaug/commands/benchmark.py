@@ -8,10 +8,10 @@ from typing import Annotated
 
 from rawaug.commands import YAML
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import TOLD, benchmark, crops, shown_of, strengths_of, tables
+from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_of, strengths_of, tables
 from rawaug.evaluation.contestants import Contestant, contestant, shipped_of_mosaics
 from rawaug.evaluation.own_noise import own_noise_note
-from rawaug.evaluation.page import Page, Part
+from rawaug.evaluation.page import Figure, Page, Part, draw_costs
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import require_writable, write_json
 from rawaug.kernels.runtime import find_device
@@ -79,6 +79,8 @@ def run(
     if report:
         page = Page(f"Denoisers on {data}", [Part(texts=notes)])
         page.parts += [Part(title, head=["", *head], rows=cells) for title, head, cells in tables(result)]
+        chart = Figure(draw_costs(costs_of(result)), "PSNR over GMAC", "curve", f"{shown_of(strengths)}, levels told")
+        page.parts.append(Part("Quality and cost", figures=[chart]))
         page.parts.append(Part("Pictures", texts=[f"Noise: {shown_of(strengths)}, levels told; PSNR of RAW."]))
         for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed, strengths):
             page.add_frame(row, cfa)

@@ -219,6 +219,17 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
         yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frame{'s' * (count != 1)}", head, cells
 
 
+def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, float]]:
+    """GMAC a megapixel and the PSNR of RAW and sRGB of each denoiser, at the strength that is shown."""
+    shown = shown_of(result["rows"]["noisy input"]["scores"][TOLD])
+    scored = {name: (row["gmac"], row["scores"][TOLD][shown]) for name, row in result["rows"].items()}
+    return {
+        name: (gmac, scores["psnr"], scores["psnr_srgb"])
+        for name, (gmac, scores) in scored.items()
+        if name != "noisy input"
+    }
+
+
 def _both(scores: Mapping[str, float]) -> str:
     return f"{scores['psnr']:.2f} / {scores['psnr_srgb']:.2f}" if scores["frames"] else "-"
 

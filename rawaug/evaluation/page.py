@@ -222,6 +222,32 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
     axis.locator_params(axis="x", integer=True)
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=8)
+    return _png(figure)
+
+
+def draw_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
+    """PSNR of RAW and of sRGB over the multiplications a megapixel, a PNG file.
+
+    Args:
+        rows: by denoiser GMAC a megapixel and the two PSNR; without GMAC, a filter, it is a dashed line.
+    """
+    with extra("train"):
+        from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    for k, (axis, title) in enumerate(zip(figure.subplots(1, 2), ("RAW", "developed sRGB"), strict=True)):
+        for colour, (name, (gmac, *psnr)) in enumerate(rows.items()):
+            style: dict[str, Any] = {"color": f"C{colour % 10}", "label": name}
+            if gmac is None:
+                axis.axhline(psnr[k], linestyle="--", **style)
+            else:
+                axis.plot(gmac, psnr[k], "o", **style)
+        axis.set(xlabel="GMAC a megapixel", xscale="log", title=f"PSNR, {title} (dB)")
+    axis.legend(fontsize=8)
+    return _png(figure)
+
+
+def _png(figure: Any) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, dpi=130)
     return file.getvalue()
