@@ -199,15 +199,14 @@ def demo_files() -> list[Path]:
     return [_folder() / file for files in (*PHOTOGRAPHS.values(), PICTURES_ONLY) for file in files]
 
 
-def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair]:
+def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
     """Shots by the demo camera, 288 x 448: crops of the split's photographs, and of dead leaves except in training.
 
-    Pair k depends on (split, k, seed) alone; scenes and ISO values take turns.
+    Pair k depends on (split, k) alone; scenes and ISO values take turns.
 
     Args:
         split: ``"train"``, ``"validation"`` or ``"test"``.
         count: number of pairs, by default that of :data:`PAIRS`.
-        seed: another seed gives other crops, illuminants and noise, of the same photographs.
 
     Raises:
         ValueError: if there is no such split, or ``count`` is not positive.
@@ -221,10 +220,10 @@ def demo_pairs(split: str, count: int | None = None, seed: int = 0) -> list[Pair
     count = PAIRS[split] if count is None else count
     if count < 1:
         raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
-    return [_pair(split, k, seed) for k in range(count)]
+    return [_pair(split, k) for k in range(count)]
 
 
-def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
+def demo_pictures(count: int = 32) -> list[Tensor]:
     """The sRGB pictures of a user: photographs whole, then dead leaves of 288 x 448 textured from them.
 
     The photographs are those of the training pairs and five others, none of validation or test.
@@ -232,7 +231,7 @@ def demo_pictures(count: int = 32, seed: int = 0) -> list[Tensor]:
     if count < 1:
         raise ValueError(f"demo: count must be at least 1, got {count}")
     photographs = _users_photographs()
-    leaves = (_leaves(k, seed) for k in range(count - len(photographs)))
+    leaves = (_leaves(k) for k in range(count - len(photographs)))
     return [*photographs[:count], *leaves]
 
 
@@ -254,16 +253,16 @@ def _users_photographs() -> list[Tensor]:
 
 
 @cache
-def _leaves(k: int, seed: int) -> Tensor:
-    return dead_leaves(*FRAME, _users_photographs(), keyed_generator(seed, "demo pictures", k))
+def _leaves(k: int) -> Tensor:
+    return dead_leaves(*FRAME, _users_photographs(), keyed_generator(0, "demo pictures", k))
 
 
 @cache
-def _pair(split: str, k: int, seed: int) -> Pair:
+def _pair(split: str, k: int) -> Pair:
     photographs = demo_photographs(split)
     scenes = list(photographs) if split == "train" else [*photographs, "leaves"]
     scene, turn = scenes[k % len(scenes)], k // len(scenes)
-    generator = keyed_generator(seed, "demo pair", split, k)
+    generator = keyed_generator(0, "demo pair", split, k)
     if scene == "leaves":
         picture = dead_leaves(*FRAME, list(photographs.values()), generator)
     else:

@@ -34,23 +34,22 @@ from rawaug.seeding import derived_seed
 _OVERSAMPLING = 2
 _FLAT_SHARE = 0.25
 _BATCH = 4096
+_LEAST_RADIUS = 4.0
+"""Of a leaf, in pixels of the picture."""
 
 
-def dead_leaves(
-    height: int, width: int, sources: Sequence[Tensor], generator: torch.Generator, smallest_radius: float = 4.0
-) -> Tensor:
+def dead_leaves(height: int, width: int, sources: Sequence[Tensor], generator: torch.Generator) -> Tensor:
     """One dead-leaves picture, uint8 ``(3, height, width)``, anti-aliased (each pixel the mean of 2 x 2).
 
     Args:
-        height, width: in pixels, at least 8.
+        height, width: in pixels, at least 16. Radii are 4 pixels to a third of the longer side, or what fits into a
+            source.
         sources: photographs for colours and textures, uint8 ``(3, h, w)``, sides at least 32; textures are drawn at
             half the photograph's scale.
         generator: the only source of randomness, on the CPU.
-        smallest_radius: r_min in pixels, above 0.5; r_max is what fits into every source, a third of the picture's
-            longer side at most.
 
     Raises:
-        ValueError: if there is no source, or one of another shape or dtype or too small for r_min.
+        ValueError: if there is no source, or one of another shape or dtype, or the picture is too small.
 
     Example:
         >>> source = torch.randint(0, 256, (3, 64, 64), dtype=torch.uint8)
@@ -61,15 +60,11 @@ def dead_leaves(
         if source.ndim != 3 or source.shape[0] != 3 or source.dtype != torch.uint8 or min(source.shape[1:]) < 32:
             got = f"{source.dtype} {tuple(source.shape)}"
             raise ValueError(f"a source must be uint8 (3, h, w) with sides of at least 32, got {got}")
-    if not sources or smallest_radius <= 0.5 or min(height, width) < 8:
-        raise ValueError(f"dead leaves need sources ({len(sources)}), r_min > 0.5 and sides >= 8 ({height} x {width})")
+    if not sources or min(height, width) < 16:
+        raise ValueError(f"dead leaves need sources ({len(sources)}) and sides of at least 16 ({height} x {width})")
     photographs = [source.permute(1, 2, 0).contiguous().numpy() for source in sources]
     fits = min(min(photograph.shape[:2]) for photograph in photographs) / 2 - 1
-    radii = (_OVERSAMPLING * smallest_radius, min(fits, _OVERSAMPLING * max(height, width) / 3))
-    if radii[0] >= radii[1]:
-        raise ValueError(
-            f"smallest_radius must be below {fits / _OVERSAMPLING} for these sources, got {smallest_radius}"
-        )
+    radii = (_OVERSAMPLING * _LEAST_RADIUS, min(fits, _OVERSAMPLING * max(height, width) / 3))
     fine = _fine_picture(_OVERSAMPLING * height, _OVERSAMPLING * width, photographs, radii, generator)
     n = _OVERSAMPLING
     total = sum(fine[i::n, j::n].astype(np.uint16) for i in range(n) for j in range(n))

@@ -60,5 +60,5 @@ def test_what_cannot_be_drawn_is_refused() -> None:
         ValueError, match=r"a source must be uint8 \(3, h, w\) with sides of at least 32, got torch.float32"
     ):
         dead_leaves(64, 64, [torch.rand(3, 64, 64)], generator())
-    with pytest.raises(ValueError, match="smallest_radius must be below"):
-        dead_leaves(64, 64, [WHITE], generator(), smallest_radius=20)
+    with pytest.raises(ValueError, match=r"sides of at least 16 \(64 x 15\)"):
+        dead_leaves(64, 15, [WHITE], generator())
