@@ -31,10 +31,9 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
-from rawaug.plugin.bursts import Burst
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
-from rawaug.plugin.targets import Target, Targets, through_jpeg
+from rawaug.plugin.targets import Burst, Target, Targets, through_jpeg
 from rawaug.registry import nearest
 from rawaug.seeding import keyed_generator, rank_key
 
@@ -73,7 +72,7 @@ class RawAugment(nn.Module):
         burst: number N of noisy frames of the scene that a pair holds, ``(B, N, ...)``; clean is that of the first. By
             default a single one, without the N.
         motion: of a burst: largest shift in pixels and rotation in degrees, (2, 0.5) by default; see
-            :mod:`rawaug.plugin.bursts`.
+            :mod:`rawaug.plugin.targets`.
         stops: of a burst: exposure of each frame in stops, for brackets; all alike by default.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 

@@ -17,7 +17,7 @@ from rawaug.isp.config import ISPConfig
 from rawaug.isp.stages import LensShading
 from rawaug.metrics import psnr
 from rawaug.noise import DefectPixels, RowNoise
-from rawaug.plugin.bursts import moved
+from rawaug.plugin.targets import moved
 
 N = 8
 
