@@ -72,19 +72,11 @@ def named(settings: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("settings", LOADERS, ids=named)
+@pytest.mark.parametrize("form", [list, Strided], ids=["indexed", "stream"])
 def test_every_pass_is_the_next_epoch(
-    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any]
+    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any], form: Any
 ) -> None:
-    loader = DataLoader(RawPairs(pictures, augment, crop=8, seed=3), **settings)
-    for expected in epochs[:2]:
-        assert torch.equal(one_pass(loader), expected)
-
-
-@pytest.mark.parametrize("settings", LOADERS, ids=named)
-def test_every_pass_of_a_stream_is_the_next_epoch(
-    augment: RawAugment, pictures: list[Tensor], epochs: list[Tensor], settings: dict[str, Any]
-) -> None:
-    loader = DataLoader(RawPairs(Strided(pictures), augment, crop=8, seed=3), **settings)
+    loader = DataLoader(RawPairs(form(pictures), augment, crop=8, seed=3), **settings)
     for expected in epochs[:2]:
         assert torch.equal(one_pass(loader), expected)
 

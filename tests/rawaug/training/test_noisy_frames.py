@@ -116,17 +116,6 @@ def test_frames_as_shot_need_measured_levels() -> None:
     assert noisy_frame(pair, {"shot_var": 1e-3, "read_var": 1e-5, "r2": 1.0}).read_var == 1e-5
 
 
-@pytest.mark.parametrize("cfa", list(CFA))
-def test_crops_of_any_sensor_come_in_the_networks_pattern_with_their_signal(cfa: CFA) -> None:
-    rgb = torch.tensor([0.2, 0.5, 0.8])[:, None, None] + 0.1 * torch.rand(3, 40, 48, generator=torch.Generator())
-    mosaic = bayer.mosaic(rgb, cfa)
-    crops = NoisyCrops([NoisyFrame("known", mosaic, 1e-3, 1e-5, cfa, clean=mosaic)], Whole(), 16, CFA.BGGR)
-    for seed in range(16):
-        crop = crops.draw(torch.Generator().manual_seed(seed))
-        assert torch.equal(crop.signal, crop.shots[0]), "cut and turned alike"
-        assert [round(plane.min().item(), 1) for plane in crop.signal] == [0.2, 0.5, 0.5, 0.8]
-
-
 def test_of_pictures_the_signal_is_known(pictures: list[torch.Tensor], augment: RawAugment) -> None:
     frame = FrozenPictures(pictures, augment, seed=3)[0]
     below_white = frame.signal < 0.6
