@@ -34,28 +34,10 @@ _MODULES = {
 """Modules, and the public names that each defines."""
 
 __all__ = [
-    "BM3D",
-    "DENOISERS",
-    "DHDN",
-    "PMRID",
-    "CycleISPDenoiser",
-    "DRUNet",
-    "Denoiser",
-    "DnCNN",
-    "JointDRUNet",
-    "NAFNet",
-    "NonLocalMeans",
-    "SelfEnsemble",
-    "Stabilised",
-    "TotalVariation",
-    "UNet",
-    "Wavelet",
-    "build",
-    "from_pretrained",
-    "load",
-    "save",
-    "tiled",
-]
+    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "JointDRUNet", "NAFNet",
+    "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation", "UNet", "Wavelet", "build", "from_pretrained",
+    "load", "save", "tiled",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -54,11 +54,7 @@ class Classical(ABC):
         """``(h, w, 4)`` with white noise of deviation 1 to the estimate without it, same shape."""
 
     def __call__(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
-        """Denoise ``(B, 4, h, w)``; a picture without noise is returned as it is.
-
-        Args:
-            noisy: packed RAW, float.
-            variance: the noise variance, shape of ``noisy`` or broadcast to it; its mean over each picture is used.
+        """Denoise ``(B, 4, h, w)`` by the mean of each picture's variance; one without noise is returned as it is.
 
         Raises:
             ValueError: if ``variance`` is missing, or ``noisy`` is not packed RAW or too small for the method.
@@ -84,11 +80,7 @@ class Classical(ABC):
         return torch.from_numpy(clean).permute(2, 0, 1).to(image)
 
     def library(self, name: str) -> Any:
-        """The library ``name``, one of :attr:`needs` or a module of one.
-
-        Raises:
-            ImportError: in one line if something is not installed.
-        """
+        """The library ``name``, one of :attr:`needs` or a module of one; ImportError in one line if it is not there."""
         if (reason := self.missing()) is not None:
             raise ImportError(reason)
         return import_module(name)
@@ -117,15 +109,9 @@ class Wavelet(Classical):
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
-        settings = {
-            "sigma": [sigma] * channels,
-            "wavelet": "haar",
-            "method": "VisuShrink",
-            "mode": "hard",
-            "wavelet_levels": min(4, min(height, width).bit_length() - 1),
-            "rescale_sigma": False,
-            "channel_axis": -1,
-        }
+        settings = {"sigma": [sigma] * channels, "wavelet": "haar", "method": "VisuShrink", "mode": "hard"}
+        settings |= {"rescale_sigma": False, "channel_axis": -1}
+        settings["wavelet_levels"] = min(4, min(height, width).bit_length() - 1)
         mean = np.zeros_like(planes)
         for shift in product(range(4), repeat=2):
             shrunk = denoise_wavelet(np.roll(planes, shift, (0, 1)), **settings)
@@ -150,10 +136,7 @@ _HADAMARD = 0.5 * np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1
 
 @FILTERS.register("BM3D")
 class BM3D(Classical):
-    """BM3D (Dabov et al., TIP 2007), blocks matched on the mean of the four planes.
-
-    Its authors' wheel is for non-commercial use only and therefore no requirement: ``pip install 'rawaug[bm3d]'``.
-    """
+    """BM3D (Dabov et al., TIP 2007), blocks matched on the mean of the planes; its wheel is non-commercial."""
 
     smallest = 16
     needs = ("bm3d",)
@@ -169,21 +152,18 @@ class Transform(Protocol):
     """A variance-stabilising transform: after ``forward`` the noise has variance 1; ``inverse`` is free of bias."""
 
     def forward(self, y: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
-        """``(B, 4, h, w)`` RAW with var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
+        """``(B, 4, h, w)`` RAW of var(y) = shot_var y + read_var, both ``(B,)``, to unit variance."""
 
     def inverse(self, z: Tensor, shot_var: Tensor, read_var: Tensor) -> Tensor:
         """The estimate in the transform's domain back to RAW."""
 
 
 class Stabilised:
-    """A denoiser of white noise on RAW with shot noise: ``inverse(denoiser(forward(noisy), 1))``.
-
-    Source: Makitalo and Foi, TIP 2013.
+    """A denoiser of white noise on RAW: ``inverse(denoiser(forward(noisy), 1))`` (Makitalo and Foi 2013).
 
     Args:
         denoiser: one of the classes above, or any ``denoiser(noisy, variance)``.
-        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``: the generalised Anscombe
-            transform with its exact unbiased inverse.
+        transform: what :class:`Transform` says, e.g. the module ``rawaug.noise.anscombe``.
 
     Example:
         >>> from denoisers import TotalVariation
@@ -205,15 +185,9 @@ class Stabilised:
         shot_var: float | Tensor | None = None,
         read_var: float | Tensor | None = None,
     ) -> Tensor:
-        """Denoise ``(B, 4, h, w)``.
+        """Denoise ``(B, 4, h, w)``, given its map ``shot_var max(noisy, 0) + read_var``, or both numbers, or ``(B,)``.
 
-        Args:
-            noisy: packed RAW, float.
-            variance: its map ``shot_var max(noisy, 0) + read_var``, from which both are derived if not given.
-            shot_var, read_var: numbers, or ``(B,)``; without shot noise nothing is transformed.
-
-        Raises:
-            ValueError: if neither is given, or the map is no such line.
+        Without shot noise nothing is transformed. ValueError if neither is given, or the map is no such line.
         """
         if shot_var is None or read_var is None:
             shot_var, read_var = _line(noisy, variance)

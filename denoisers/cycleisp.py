@@ -70,25 +70,17 @@ def conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def load_published(network: nn.Module, path: str | os.PathLike[str], part: str) -> None:
-    """Take the weights of a published checkpoint; nothing in it is run as code.
-
-    Args:
-        network: whose layers they are.
-        path: a file of ``torch.save({"state_dict": ...})``, keys with or without ``module.`` before them.
-        part: what messages call the network.
+    """Take the weights of a published checkpoint; nothing in it is run as code; ``part`` names the network in messages.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not such a file, or its layers are not those of the network.
     """
     state, expected = _own_names(_read_state(Path(path))), network.state_dict()
-    differing = sorted(expected.keys() ^ state.keys())
-    if differing:
-        what = "unknown" if differing[0] in state else "missing"
-        raise ValueError(f"{path}: layer {differing[0]} is {what} for {part} of this size")
-    for key, value in expected.items():
-        if value.shape != state[key].shape:
-            sizes = f"{tuple(state[key].shape)}, {part} needs {tuple(value.shape)}"
+    shapes, needed = ({key: tuple(value.shape) for key, value in found.items()} for found in (state, expected))
+    for key in sorted(needed | shapes):
+        if shapes.get(key) != needed.get(key):
+            sizes = f"{shapes.get(key, 'missing')}, {part} needs {needed.get(key, 'no such layer')}"
             raise ValueError(f"{path}: layer {key} is {sizes}; build the model in the published size")
     network.load_state_dict(state)
 
@@ -173,11 +165,7 @@ class CycleISPDenoiser(Denoiser):
     def from_published(cls, path: str | os.PathLike[str]) -> CycleISPDenoiser:
         """The network with the weights of a published checkpoint (``sidd_denoising_raw.pth``), in eval mode.
 
-        Nothing in the file is run as code. The weights are for RAW in RGGB, clipped to [0, 1].
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is not such a checkpoint.
+        The weights are for RAW in RGGB, clipped to [0, 1]; errors are those of :func:`load_published`.
         """
         model = cls()
         load_published(model.trunk, path, "the denoiser")

@@ -53,12 +53,7 @@ def build(name: str, **config: Any) -> Denoiser:
 
 
 def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) -> None:
-    """Write a network to ``path``: whole or not at all, an older file of this name stays until then.
-
-    Args:
-        model: one of the registered networks, on any device and in any memory format.
-        path: the file, in a folder that exists; usually ``*.safetensors``.
-        info: JSON-serialisable description (data, steps, seed, ...).
+    """Write a registered network and a JSON-serialisable ``info`` to ``path``, whole or not at all.
 
     Raises:
         ValueError: if the class is not registered, or ``info`` is not JSON-serialisable.
@@ -67,8 +62,7 @@ def save(model: Denoiser, path: str | os.PathLike[str], info: dict[str, Any]) ->
     path = Path(path)
     name = DENOISERS.name_of(type(model))
     if name is None:
-        known = ", ".join(DENOISERS)
-        raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {known} can be loaded again")
+        raise ValueError(f"{path}: cannot save a {type(model).__name__}; only {', '.join(DENOISERS)} load again")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: its folder does not exist; create it first")
     try:
@@ -101,8 +95,8 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     metadata, tensors = read_tensors(path, "give one written by rawaug run or denoisers.save, or copy it again")
     if (metadata.get("format"), metadata.get("kind")) != (FORMAT, KIND):
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
-    config, info = (_parse(path, metadata, key) for key in ("config", "info"))
     try:
+        config, info = (parse_object(metadata.get(key, "")) for key in ("config", "info"))
         # On the meta device the network takes no memory before the file's tensors are known to fit.
         with torch.device("meta"):
             model = build(metadata.get("model", ""), **config)
@@ -110,22 +104,13 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
         raise ValueError(f"{path}: {error}") from None
     tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes
     expected = model.state_dict()
-    for key in sorted(expected.keys() | tensors.keys()):
-        if key not in tensors or key not in expected:
-            raise ValueError(f"{path}: tensor {key} is {'unknown' if key in tensors else 'missing'}")
-        shape, dtype = tensors[key].shape, tensors[key].dtype
-        if (shape, dtype) != (expected[key].shape, expected[key].dtype):
-            wanted = f"{tuple(expected[key].shape)} {expected[key].dtype}"
-            raise ValueError(f"{path}: tensor {key} is {tuple(shape)} {dtype}, the network needs {wanted}")
+    held, needed = ({key: f"{tuple(x.shape)} {x.dtype}" for key, x in of.items()} for of in (tensors, expected))
+    for key in sorted(held | needed):
+        if held.get(key) != needed.get(key):
+            text = f"{held.get(key, 'missing')}, the network needs {needed.get(key, 'no such tensor')}"
+            raise ValueError(f"{path}: tensor {key} is {text}")
     model.load_state_dict(tensors, assign=True)
     return model.eval(), info
-
-
-def _parse(path: Path, metadata: dict[str, str], key: str) -> dict[str, Any]:
-    try:
-        return parse_object(metadata.get(key, ""))
-    except ValueError as error:
-        raise ValueError(f"{path}: metadata {key!r}: {error}") from None
 
 
 def shipped() -> list[str]:
@@ -143,10 +128,7 @@ def find(name: str | Path) -> Path:
 
 
 def from_pretrained(name: str | Path = DEFAULT) -> Denoiser:
-    """A trained denoiser, on the CPU in eval mode.
-
-    Args:
-        name: of a shipped one, or a path to a file that ``rawaug run`` or :func:`denoisers.save` wrote.
+    """A trained denoiser by the name of a shipped one or a path, on the CPU in eval mode.
 
     Raises:
         FileNotFoundError: if there is no such denoiser.

@@ -39,13 +39,10 @@ def tiled(
     """Denoise a picture of any size piece by piece, without gradients: ``f(y)[core] = f(y[core + overlap])[core]``.
 
     The equality is exact (to rounding) where the overlap is at least the network's receptive radius: from 17 pixels for
-    a DnCNN of depth 17, 139 for DHDN, 169 for the U-Net. Influence falls off with distance: with a trained U-Net of
-    four scales the largest difference was 0.3 of the noise's deviation at an overlap of 32, and 2e-6 at 64; the default
-    is 96. Tiles start at multiples of the network's stride, so that pooling grids fall on the same pixels as in the
-    whole picture. Nothing is blended: that would hide an overlap that is too small.
-
-    Peak memory is the result plus what the model needs for one ``(B, 4, tile, tile)`` piece, whatever the picture's
-    size; at most ``(tile / (tile - 2 overlap))^2`` times the work of the whole picture at once.
+    a DnCNN of depth 17 to 169 for the U-Net. Influence falls off with distance: with a trained U-Net of four scales the
+    largest difference was 0.3 of the noise's deviation at an overlap of 32, and 2e-6 at 64. Tiles start at multiples of
+    the network's stride, so that pooling grids fall on the same pixels as in the whole picture. Nothing is blended:
+    that would hide an overlap that is too small. Peak memory is the result and one piece.
 
     Args:
         model: ``model(noisy, variance) -> denoised``; its ``stride``, if it has one, aligns the tiles, and its
@@ -57,8 +54,7 @@ def tiled(
         each: iterates over the tiles; may show progress, as ``tqdm`` does.
 
     Raises:
-        ValueError: if the overlap leaves nothing of a tile, tile or overlap are no multiples of the model's stride, or
-            the tile is less than two strides.
+        ValueError: if tile and overlap do not fit each other or the model's stride.
 
     Example:
         >>> from denoisers import DnCNN
@@ -109,11 +105,9 @@ def from_view(image: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
 class SelfEnsemble(nn.Module):
     """A denoiser averaged over views of the mosaic, ``mean of T^-1 f(T y)``: ``views`` times the work.
 
-    T, a flip or quarter turn, turns the *mosaic*, so that neighbours stay neighbours. Where this moves the pattern, one
-    line is added on either side by reflection without repeating the edge (row -1 is row 1, which has its colour), so
-    that the network meets its own pattern again; the line is cropped from the result. What went in as R, Gr, Gb, B
-    comes out there, except that a quarter turn exchanges the two greens. Sources: Timofte et al., CVPR 2016; for
-    mosaics Liu et al., "Learning Raw Image Denoising with Bayer Pattern Unification", CVPRW 2019.
+    T, a flip or quarter turn, turns the *mosaic*. Where this moves the pattern, one line is added on either side by
+    reflection without repeating the edge, so that the network meets its own pattern again, and cropped from the result.
+    Sources: Timofte et al., CVPR 2016; for mosaics Liu et al., CVPRW 2019.
 
     Args:
         model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
@@ -168,17 +162,11 @@ class SelfEnsemble(nn.Module):
 
 
 class Recorrupted(nn.Module):
-    """A denoiser averaged over draws of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
+    """A denoiser averaged over ``draws`` of extra noise, ``mean of f(y + alpha m)``: ``draws + 1`` times the work.
 
     A network that was trained on recorrupted frames gets the input it knows, and the average removes most of what the
-    added noise costs. ``m`` has the noise's variance at ``f(y)``: at ``y`` it would follow the noise. Source: Pang et
-    al., "Recorrupted-to-Recorrupted", CVPR 2021, section 3.3.
-
-    Args:
-        model: ``model(noisy, variance) -> denoised``, packed RAW; a network, or any such callable.
-        alpha: standard deviation of the extra noise over that of the noise, as in training.
-        draws: how many.
-        seed: of the extra noise, which is the same in every call.
+    added noise costs. ``m`` has the noise's variance at ``f(y)``, as at ``y`` it would follow the noise, and is the
+    same in every call; ``alpha`` is its deviation over that of the noise. Source: Pang et al., CVPR 2021, section 3.3.
     """
 
     def __init__(

@@ -91,8 +91,7 @@ def require_bounded(seed: int, **layers: int) -> None:
 def mended(signal: Tensor) -> Tensor:
     """Packed RAW ``(B, 4, h, w)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
 
-    A defect lies beyond all eight neighbours of its colour, by :data:`DEFECT`, while the other colours of its cell show
-    nothing of the kind, as they do of a star or a speck.
+    A defect lies beyond all eight neighbours of its colour by :data:`DEFECT`; the other colours of its cell do not.
     """
     height, width = signal.shape[-2:]
     padded = F.pad(signal, (1, 1, 1, 1), mode="reflect")
@@ -181,14 +180,8 @@ class Denoiser(nn.Module, ABC):
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """Denoise ``(B, channels, h, w)``; the result has the same shape, or :attr:`upscale`'s, and is not clipped.
 
-        Args:
-            noisy: packed RAW.
-            variance: the noise variance of each value, not negative, shape of ``noisy``; a network without a noise map
-                does not read it.
-
-        Raises:
-            ValueError: if a shape or a type is wrong, or the network was made with a noise map and ``variance`` is
-                missing.
+        ``variance``, the noise variance of each value, has the shape of ``noisy``. ValueError if a shape or type is
+        wrong, or the network needs ``variance`` and it is missing.
         """
         name = type(self).__name__
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
@@ -237,10 +230,9 @@ class Denoiser(nn.Module, ABC):
 
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
-        """Draw all convolutions anew (He et al. 2015), biases zero; ``zeros`` become zero altogether.
+        """Draw all convolutions anew (He et al. 2015), deviation ``gain / sqrt(fan in)``, biases and ``zeros`` zero.
 
-        A weight has the standard deviation ``gain / sqrt(fan in)``. The numbers come from a CPU generator of ``seed``:
-        the same on every device, and the global state is untouched.
+        The numbers come from a CPU generator of ``seed``: the same on every device, and the global state is untouched.
         """
         generator = torch.Generator("cpu").manual_seed(seed)
         for module in self.modules():

@@ -17,16 +17,14 @@ Anything in :data:`rawaug.registry.NOISE` goes by its name as well. ``{"name": .
 ``iso`` and ``poisson`` for a name of the table, the keyword arguments of its class for a model. CalibratedNoise needs
 no name: ``{"pair_psnr": 41.18}``.
 
-*Profiles.* darktable has var = a y + b for 374 cameras by ISO. Its red and blue figures differ from the green ones as
-if they contained a white balance, so the green ones serve all channels: photons and electronics are the same behind
-every filter. It measures after demosaicing and on fine details, where noise has been averaged: for four cameras that
-ELD measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All
-are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100
-is then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out.
+*Profiles.* darktable has var = a y + b for 374 cameras by ISO. Its red and blue figures contain a white balance, so the
+green ones serve all channels. It measures after demosaicing, where noise has been averaged: for four cameras that ELD
+measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All are
+multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is
+then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out.
 
 *Measured cameras.* Between the ISO values of a fitted camera's files, the logarithms of both variances are linear in
-that of the ISO: the gain grows with the ISO, in steps where an amplifier is switched, which a table follows better than
-one line. Outside the measured range an ISO is refused. Files without an ISO give one level for every picture.
+that of the ISO. Outside the measured range an ISO is refused. Files without an ISO give one level for every picture.
 
 *Stated PSNR.* A picture of mean signal m has noise of mean square ``shot_var m + read_var`` before the clip at white,
 and a factor s on both variances shifts the PSNR of every pair by ``-10 log10(s)``. So a mean PSNR of P takes the factor
@@ -75,10 +73,9 @@ _LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
 
 class Profiles(NamedTuple):
-    """The usable rows of darktable's N cameras.
+    """The usable rows of darktable's N cameras: logarithms of ISO, shot_var and read_var in ``table`` ``(3, N, R)``.
 
-    ``table`` ``(3, N, R)`` has the logarithms of ISO, shot_var and read_var; a camera has ``rows`` ``(N,)`` of the R,
-    ISO ascending, and infinite in the others.
+    A camera has ``rows`` ``(N,)`` of the R, ISO ascending, and infinite in the others.
     """
 
     names: tuple[str, ...]
@@ -113,11 +110,7 @@ def published_profiles() -> Profiles:
 
 
 class ProfileLevels:
-    """Levels of one camera's profile, or of any, each weighted alike.
-
-    With ``any camera``, whose profiles end at different ISOs, a camera is drawn within its share of the limits; one
-    without a share is not drawn.
-    """
+    """Levels of one camera's profile, or of any, each alike, within its share of the limits of the ISO."""
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
         profiles = published_profiles()
@@ -196,11 +189,7 @@ class MeasuredLevels:
         return None if low is None or high is None else (low, high)
 
     def at(self, iso: float | None) -> tuple[float, float]:
-        """(shot_var, read_var) at an ISO; any ISO, or none, where only one level without was measured.
-
-        Raises:
-            ValueError: if the ISO is unknown or outside the measured range.
-        """
+        """(shot_var, read_var) at an ISO, None where one level was measured; ValueError outside the range."""
         if self.limits is None or (iso is None and len(self.levels) == 1):
             return self.levels[0].shot_var, self.levels[0].read_var
         if iso is None:
@@ -216,8 +205,7 @@ class MeasuredLevels:
         """Levels at ISO values that are log-uniform over the measured range."""
         device = generator.device
         if self.limits is None or len(self.levels) == 1:
-            shot_var, read_var = self.at(None)
-            return torch.full((batch,), shot_var, device=device), torch.full((batch,), read_var, device=device)
+            return FixedLevels(*self.at(None)).sample(batch, generator)
         return interpolated(self.table.to(device), log_uniform(self.limits, batch, generator))
 
     def spec(self) -> dict[str, Any]:
@@ -242,9 +230,6 @@ class MeasuredNoise(ShotReadNoise):
     Args:
         levels: for each ISO ``{iso, shot_var, read_var}``, besides ``r2`` and ``frames`` if known.
         camera: make and model.
-
-    Raises:
-        ValueError: see :class:`MeasuredLevels`; or if a level has an unknown key.
     """
 
     def __init__(self, levels: Sequence[Mapping[str, Any]], camera: str = "unknown") -> None:
@@ -366,14 +351,7 @@ TYPICAL_SIGNAL = 0.06
 
 
 class ScaledLevels:
-    """The levels of a law, both variances times a factor.
-
-    Example:
-        >>> from rawaug.noise import FixedLevels
-        >>> shot_var, read_var = ScaledLevels(FixedLevels(1e-3, 1e-5), 0.5).sample(1, torch.Generator())
-        >>> round(shot_var.item(), 6)
-        0.0005
-    """
+    """The levels of a law, both variances times a factor."""
 
     def __init__(self, law: NoiseLevels, factor: float) -> None:
         self.law, self.factor = law, factor
@@ -404,10 +382,6 @@ class CalibratedNoise(ShotReadNoise):
 
     Raises:
         ValueError: if the PSNR is not finite, a signal is not in (0, 1], or the law has no noise.
-
-    Example:
-        >>> round(CalibratedNoise(41.18, 0.1, (1e-3, 0.0)).levels.factor, 4)
-        0.7621
     """
 
     levels: ScaledLevels

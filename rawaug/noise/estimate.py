@@ -78,10 +78,7 @@ class NoisePoints:
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """What was fitted: the line, its standard errors, R^2 over the used points, and the points themselves.
-
-    ``read_var`` is 0 where it is not measurable: the best line would have been negative at black.
-    """
+    """The fitted line, its standard errors, R^2 over the used points, and these; ``read_var`` 0 if unmeasurable."""
 
     shot_var: float
     read_var: float
@@ -267,9 +264,7 @@ def _r2(points: NoisePoints, shot_var: float, read_var: float) -> float:
 
 
 def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
-    """(shot_var, read_var) of the noise that a reference has itself; None where neither stated nor measurable.
-
-    Binned frames are measured before they are binned, where enough flat blocks are left.
+    """(shot_var, read_var) of a reference's own noise, or of what its binning left; None if not measurable.
 
     Example:
         >>> from rawaug.data import open_pairs
@@ -307,7 +302,7 @@ class DarkNoise:
 
 
 def from_dark_frames(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
-    """The noise without light, the mean over the frames ``(1, H, W)`` or ``(1, 1, H, W)`` of one camera at one ISO.
+    """The noise without light, the mean over the frames ``(1, H, W)`` of one camera at one ISO.
 
     Raises:
         ValueError: if there is no frame, or one is clipped at black.
@@ -347,16 +342,7 @@ _CHANNELS = (("R", "tab:red"), ("Gr", "tab:olive"), ("Gb", "tab:green"), ("B", "
 
 
 def plot_noise(estimate: NoiseEstimate, path: str | Path | None = None, *, title: str = "") -> Figure:
-    """Variance against signal, with linear axes and with logarithmic ones, which show the shadows.
-
-    Args:
-        estimate: of :func:`rawaug.noise.estimate.estimate_noise`.
-        path: where to save it (``.png``, ``.pdf``, ``.svg``), or None.
-        title: above the figure.
-
-    Returns:
-        The matplotlib figure.
-    """
+    """Variance against signal, on linear and logarithmic axes; saved to ``path`` (``.png``, ``.pdf``, ``.svg``)."""
     with extra("train"):
         from matplotlib.figure import Figure
 

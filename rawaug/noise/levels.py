@@ -68,14 +68,7 @@ def log_uniform(limits: tuple[float, float], batch: int, generator: torch.Genera
 
 
 class FixedLevels:
-    """The same levels for every picture: those of one camera at one ISO.
-
-    Raises:
-        ValueError: if a variance is negative or not finite.
-
-    Example:
-        >>> shot_var, read_var = FixedLevels(1e-3, 1e-5).sample(2, torch.Generator())
-    """
+    """The same levels for every picture: those of a camera at one ISO. ValueError if one is negative or not finite."""
 
     def __init__(self, shot_var: float, read_var: float) -> None:
         if not (0 <= shot_var < math.inf and 0 <= read_var < math.inf):
@@ -93,7 +86,7 @@ class FixedLevels:
 
 
 class MixedLevels:
-    """Levels of a random one of several laws, each picture's own; all weighted alike."""
+    """Levels of a random one of several laws, each picture's own."""
 
     def __init__(self, laws: Sequence[NoiseLevels]) -> None:
         if not laws:
@@ -108,11 +101,7 @@ class MixedLevels:
 
 
 class Preset:
-    """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``.
-
-    Raises:
-        ValueError: if the name is unknown.
-    """
+    """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``."""
 
     def __init__(self, name: str) -> None:
         law = _known("noise preset", name, published()["presets"])
@@ -144,9 +133,9 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
 
 
 def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
-    """(shot_var, read_var), each ``(B,)`` float32, at ISO values ``(B,)``, linear in the logarithms.
+    """(shot_var, read_var), each ``(B,)``, at ISO values ``(B,)``, linear in the logarithms.
 
-    ``table`` ``(3, N >= 2)`` float64 has those of ISO, shot_var and read_var, the ISO values ascending.
+    ``table`` ``(3, N >= 2)`` float64 has those of ISO, ascending, shot_var and read_var.
     """
     x, shot, read = table
     at = iso.log().double()
@@ -162,12 +151,6 @@ class SiddLevels:
     Args:
         phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
         iso: one ISO, the limits of a log-uniform draw, or None for all that was tabulated.
-
-    Raises:
-        ValueError: if the phone is unknown, or the ISO outside the table.
-
-    Example:
-        >>> shot_var, read_var = SiddLevels("Google Pixel", iso=1200).sample(2, torch.Generator())
     """
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
@@ -196,8 +179,7 @@ class PmridLevels:
 class EldLevels:
     """One of ELD's cameras: every scale s is log-linear in the gain, log s = slope log K + bias + N(0, sigma^2).
 
-    As levels they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise`, whose arguments these are, is
-    the full model.
+    As levels they give the Gaussian law of read noise; :class:`rawaug.noise.EldNoise` is the full model.
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:

@@ -7,10 +7,9 @@ for single-image raw-data", 2008). Shot noise is the Poisson statistics of photo
 white that one electron makes; read noise is that of the electronics. Noisy RAW is clipped at white, as a sensor does,
 and never at black: zero-mean noise stays zero-mean in the shadows.
 
-Every model splits in ``sample(batch, generator) -> params`` and a pure ``apply(clean, params)``. The parameters hold
-one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever else is in the
-batch and on any number of threads. On a GPU the default noise is that of the CPU within 1e-6 of its standard deviation;
-all other noise, and any noise on a GPU without Triton, has a stream of its own for each kind of device.
+Parameters hold one ``seed`` a picture, from which ``apply`` draws: the same parameters give the same bits, whatever
+else is in the batch and on any number of threads. On a GPU the default noise is that of the CPU within 1e-6 of its
+standard deviation; all other noise, and any without Triton, has a stream of its own for each kind of device.
 """
 
 from __future__ import annotations
@@ -45,8 +44,7 @@ _CACHED = 2**15  # counts that are drawn together on a CPU, to stay in its cache
 class NoiseModel(ABC):
     """Base: ``noisy = model.apply(clean, model.sample(B, generator))``, packed RAW ``(B, 4, h, w)``, black 0, white 1.
 
-    ``stream`` names the model's random stream: models composed on one picture draw from its one seed without
-    correlation.
+    Models composed on one picture draw from its one seed without correlation, each from its own ``stream``.
     """
 
     stream: ClassVar[str]
@@ -59,20 +57,11 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
-        """The noisy RAW before the clip at white: what composed models pass on to one another.
-
-        Args:
-            clean: packed RAW ``(B, 4, h, w)``.
-            params: of :meth:`sample`.
-            out: where the result is written, ``clean`` itself or a tensor like it; a new tensor by default.
-        """
+        """The noisy RAW ``(B, 4, h, w)`` before the clip at white, in ``out``, which may be ``clean``, or anew."""
 
     @abstractmethod
     def variance(self, clean: Tensor, params: Params) -> Tensor:
-        """The variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white.
-
-        At test time only the noisy signal is known, which is what UPI's networks are given (Brooks et al. 2019).
-        """
+        """The variance map ``(B, 4, h, w)`` of the noise on a signal, before the clip at white."""
 
     @eager
     @torch.no_grad()
@@ -128,12 +117,7 @@ def drawn_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor
 
 
 class ShotReadModel(NoiseModel):
-    """The family of var = shot_var y + read_var; its members differ in the shape of the distribution.
-
-    Args:
-        levels: what samples (shot_var, read_var), white = 1, such as ``Preset("cycleisp_sidd")`` or
-            ``FixedLevels(1e-3, 1e-5)``.
-    """
+    """The family of var = shot_var y + read_var, of levels such as ``Preset("upi")`` or ``FixedLevels(1e-3, 1e-5)``."""
 
     stream = "shot_read"
 
@@ -203,10 +187,7 @@ class ShotReadNoise(ShotReadModel):
 
 
 class PoissonGaussianNoise(ShotReadModel):
-    """Exact photon statistics: ``shot_var * Poisson(y / shot_var) + N(0, read_var)``, skewed at low counts as light is.
-
-    Signal below black makes no photons and is kept as it is. See :func:`poisson`.
-    """
+    """Exact photon statistics: ``shot_var * Poisson(y / shot_var) + N(0, read_var)``, skewed at low counts."""
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
@@ -234,9 +215,9 @@ class PoissonGaussianNoise(ShotReadModel):
 def poisson(rate: Tensor, normals: Tensor) -> Tensor:
     """Poisson counts for expected counts ``rate``, written over ``normals``, contiguous standard normal draws.
 
-    A count is the quantile of its draw, without rejection, on any device; ``torch.poisson`` has poor streams on CUDA
-    and fails at high rates. Below :data:`INVERSION_LIMIT` the distribution function is summed; from there on its
-    inverse is Giles' expansion in ``rate**-0.5`` (Algorithm 955, ACM TOMS 2016), rounded down.
+    A count is the quantile of its draw: ``torch.poisson`` has poor streams on CUDA and fails at high rates. Below
+    :data:`INVERSION_LIMIT` the distribution function is summed; from there on its inverse is Giles' expansion in
+    ``rate**-0.5`` (Algorithm 955, ACM TOMS 2016), rounded down.
     """
     piece = _CACHED if rate.device.type == "cpu" else max(rate.numel(), 1)
     for part, out in zip(rate.reshape(-1).split(piece), normals.view(-1).split(piece), strict=True):

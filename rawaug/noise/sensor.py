@@ -67,12 +67,7 @@ def tukey_lambda_variance(shape: float) -> float:
 
 
 class TukeyLambdaNoise(PoissonGaussianNoise):
-    """Photon shot noise with Tukey-lambda read noise of variance ``read_var``: heavier tails than the Gaussian's.
-
-    Args:
-        levels: what samples (shot_var, read_var).
-        shape: lambda, above -0.5, or a range from which it is drawn uniformly. ELD measured -0.24 to 0.2.
-    """
+    """Photon noise with Tukey-lambda read noise: heavier tails, of ``shape`` above -0.5 or uniform in a range."""
 
     def __init__(self, levels: NoiseLevels, shape: float | tuple[float, float]) -> None:
         super().__init__(levels)
@@ -128,20 +123,14 @@ class _Banding(NoiseModel):
 
 
 class RowNoise(_Banding):
-    """Banding: each row of the sensor has a Gaussian offset of this variance, a number or a range, white = 1.
-
-    R and Gr lie in one row of the mosaic and share its offset; Gb and B share that of the next.
-    """
+    """Banding: each row of the sensor has a Gaussian offset of this variance, a number or a range, white = 1."""
 
     stream, key = "row", "row_var"
     across, line_of_plane = -1, [0, 0, 1, 1]
 
 
 class ColumnNoise(_Banding):
-    """Banding: each column of the sensor has a Gaussian offset, as in :class:`RowNoise`.
-
-    R and Gb share the offset of one column, Gr and B that of the next.
-    """
+    """Banding: each column of the sensor has a Gaussian offset, as in :class:`RowNoise`."""
 
     stream, key = "column", "column_var"
     across, line_of_plane = -2, [0, 1, 0, 1]
@@ -182,16 +171,11 @@ class ColourBias(BlackOffset):
 
 
 class DefectPixels(_FixedPattern):
-    """Dead pixels read black; hot ones add a dark current of U(0, 1), so that many reach white.
-
-    ``variance`` leaves them out: they are not noise of a pixel's signal but pixels to be found.
+    """Dead pixels read black; hot ones add a dark current of U(0, 1). ``variance`` leaves them out.
 
     Args:
         dead, hot: the share of pixels, typically 1e-5 to 1e-3, or a range of it.
         clusters: the share of these, 0 to 1, whose whole 2 x 2 cell is defective.
-
-    Raises:
-        ValueError: if a share is negative, or the shares add up to more than 1.
     """
 
     stream = "defects"
@@ -225,13 +209,11 @@ class DefectPixels(_FixedPattern):
 
 
 class Quantisation(NoiseModel):
-    """Rounding to the sensor's digital numbers.
+    """Rounding to the sensor's digital numbers; its variance, a twelfth of a squared step, needs noise of half a step.
 
     Args:
         bits: the sensor's depth, 1 to 16, or several, of which each picture has one.
         black_level: in digital numbers; the grid has 2^bits - 1 - black_level steps from black to white.
-
-    The claimed variance, a twelfth of a squared step, holds where the other noise is at least half a step strong.
     """
 
     stream = "quantisation"
@@ -257,10 +239,7 @@ class Quantisation(NoiseModel):
 
 
 class Compose(NoiseModel):
-    """Several models, applied in order.
-
-    Raises:
-        ValueError: if two of them draw from the same stream, as two kinds of shot and read noise do.
+    """Several models of different streams, applied in order.
 
     Example:
         >>> model = Compose([ShotReadNoise(FixedLevels(1e-3, 1e-5)), RowNoise(1e-6), Quantisation(bits=12)])
@@ -349,18 +328,12 @@ class SensorNoise(Compose):
         models: list[NoiseModel] = [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
         if tukey_lambda is not None:
             models = [TukeyLambdaNoise(levels, tukey_lambda)]
-        if row_var:
-            models.append(RowNoise(row_var))
-        if column_var:
-            models.append(ColumnNoise(column_var))
-        if black_offset_sd:
-            models.append(BlackOffset(black_offset_sd))
-        if colour_bias_sd:
-            models.append(ColourBias(colour_bias_sd))
-        if dead or hot:
-            models.append(DefectPixels(dead, hot, clusters))
-        if bits is not None:
-            models.append(Quantisation(bits, black_level))
+        models += [RowNoise(row_var)] if row_var else []
+        models += [ColumnNoise(column_var)] if column_var else []
+        models += [BlackOffset(black_offset_sd)] if black_offset_sd else []
+        models += [ColourBias(colour_bias_sd)] if colour_bias_sd else []
+        models += [DefectPixels(dead, hot, clusters)] if dead or hot else []
+        models += [] if bits is None else [Quantisation(bits, black_level)]
         super().__init__(models)
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
@@ -388,11 +361,6 @@ class DarkFrames(PoissonGaussianNoise):
         path: a RAW file taken with the lens capped, or a folder of them, of one camera; kept in memory.
         shot_var: of the photons at the frames' ISO, white = 1, or limits that it is drawn between; by default that of
             each file's NoiseProfile tag.
-
-    Raises:
-        FileNotFoundError, OSError: if there is no such file, or it cannot be read.
-        ValueError: if there is no RAW file, one is clipped at black, or ``shot_var`` is negative, or neither given nor
-            in the tags.
 
     Example:
         >>> model = DarkFrames("darks/iso1600", shot_var=2e-3)  # doctest: +SKIP
@@ -435,8 +403,7 @@ class DarkFrames(PoissonGaussianNoise):
 class EldNoise(Compose):
     """ELD's full model of one of its five cameras: photons, Tukey-lambda read noise, banding, colour bias and rounding.
 
-    One gain K is drawn a picture, and the scales of all of them follow it (:class:`rawaug.noise.levels.EldLevels`); the
-    shape of the tails is one of those that were measured (Wei et al. 2020). It matters in deep shadows.
+    One gain K is drawn a picture, and all scales follow it; the shape of the tails is one that was measured.
 
     Args:
         camera: ``CanonEOS5D4``, ``CanonEOS700D``, ``CanonEOS70D``, ``NikonD850`` or ``SonyA7S2``.

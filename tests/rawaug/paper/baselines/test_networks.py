@@ -91,9 +91,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     wrong = state | {"tail.0.bias": torch.rand(4)}
     unknown = state | {"extra.weight": torch.rand(1)}
     for name, content, message in (
-        ("missing", missing, r"layer tail\.0\.bias is missing"),
+        ("missing", missing, r"layer tail\.0\.bias is missing, rgb2raw needs \(3,\)"),
         ("wrong", wrong, r"tail\.0\.bias is \(4,\), rgb2raw needs \(3,\)"),
-        ("unknown", unknown, r"extra\.weight is unknown"),
+        ("unknown", unknown, r"extra\.weight is \(1,\), rgb2raw needs no such layer"),
     ):
         with pytest.raises(ValueError, match=message):
             model.load_published(write(tmp_path / f"{name}.pth", content))
