@@ -1,6 +1,6 @@
 """What the augmentation costs: million sRGB pixels a second, against other ways to the same RAW, and peak memory.
 
-    python -m benchmarks.augment [--device cpu|cuda] [--quick] [--profile] [--json FILE] [--threads N]
+    python -m benchmarks.augment [--device cpu|cuda] [--quick] [--json FILE] [--threads N]
 
 Every method makes clean RAW, noisy RAW and the variance map, packed, of photographs: a training batch of 16 crops, and
 pictures of 12 Mpix. *upi* is Brooks' pipeline as published: picture by picture and operation by operation, from floats,
@@ -151,17 +151,6 @@ def measure(batch: Tensor, repeats: int, gb_s: float) -> dict[str, dict[str, flo
     return rows
 
 
-def profile(batch: Tensor) -> str:
-    """Where the time of ten augmentations goes, by PyTorch's profiler."""
-    augment = augmentations(batch.device)["rawaug"]
-    augment(batch)
-    with torch.profiler.profile() as seen:
-        for _ in range(10):
-            augment(batch)
-    order = "self_device_time_total" if batch.is_cuda else "self_cpu_time_total"
-    return seen.key_averages().table(sort_by=order, row_limit=15, max_name_column_width=50)
-
-
 def child(task: str, args: argparse.Namespace, **environment: str) -> float:
     """Run this file's ``task`` in a process of its own; the number that it prints."""
     command = [sys.executable, "-m", "benchmarks.augment", "--task", task]
@@ -201,7 +190,6 @@ def show(title: str, rows: dict[str, dict[str, float]]) -> None:
 
 def main() -> None:
     parser = arguments(__doc__, repeats=40, quick="few runs, and 3 Mpix instead of 12")
-    parser.add_argument("--profile", action="store_true", help="also print where the time of small batches goes")
     parser.add_argument("--task", choices=["memory", "first"], help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.task:
@@ -223,8 +211,6 @@ def main() -> None:
         title, batch = "x".join(map(str, shape)), pictures(*shape).to(args.device)
         figures[title] = rows = measure(batch, repeats, copied)
         show(title, rows)
-        if args.profile and len(batch) == 16:
-            print(profile(batch))
     finish(figures, args)
 
 

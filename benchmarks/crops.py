@@ -9,7 +9,6 @@ frames of DATA there is ``page``: print in several sizes and colours, shot by th
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 
 import denoisers
+from benchmarks.measure import parser
 from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import DemoCamera, open_pairs
@@ -79,14 +79,14 @@ def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str],
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", help="frames: a folder of RAW files, or kind:path")
-    parser.add_argument("--place", nargs=3, action="append", required=True, metavar=("NAME", "TOP", "LEFT"))
-    parser.add_argument("--denoisers", nargs="+", default=["rawaug-small"], help="shipped ones by name, or files")
-    parser.add_argument("--iso", nargs="+", type=float, default=[1600, 6400, 25600])
-    parser.add_argument("--camera", default="Sony ILCE-7M3")
-    parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args(argv)
+    cli = parser(__doc__)
+    cli.add_argument("data", help="frames: a folder of RAW files, or kind:path")
+    cli.add_argument("--place", nargs=3, action="append", required=True, metavar=("NAME", "TOP", "LEFT"))
+    cli.add_argument("--denoisers", nargs="+", default=["rawaug-small"], help="shipped ones by name, or files")
+    cli.add_argument("--iso", nargs="+", type=float, default=[1600, 6400, 25600])
+    cli.add_argument("--camera", default="Sony ILCE-7M3")
+    cli.add_argument("--out", type=Path, required=True)
+    options = cli.parse_args(argv)
     torch.set_num_threads(1)
     frames = list(open_pairs(options.data, split="test"))
     cfa, pairs = CFA(frames[0].cfa), {pair.name: pair for pair in [page(), *frames]}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -62,17 +63,9 @@ def timed(
 
 def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) -> dict[str, float]:
     """``rawaug denoise``, reading and writing included."""
-    shot = RawFrame(
-        mosaic=bayer.unpack(noisy[0].cpu(), "RGGB"),
-        cfa=bayer.CFA.RGGB,
-        black=(512.0,) * 4,
-        white=16383.0,
-        white_balance=(2.0, 1.0, 1.5),
-        daylight=(2.0, 1.0, 1.5),
-        color_matrix=torch.eye(3),
-        noise_profile=(1e-3, 1e-5),
-        name="noise",
-    )
+    mosaic, gains = bayer.unpack(noisy[0].cpu(), "RGGB"), (2.0, 1.0, 1.5)
+    shot = RawFrame(mosaic, bayer.CFA.RGGB, (512.0,) * 4, 16383.0, gains, gains, torch.eye(3))
+    shot = replace(shot, noise_profile=(1e-3, 1e-5))
     method = frame_denoiser(denoiser, device=str(device))
     with tempfile.TemporaryDirectory() as folder:
         source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")

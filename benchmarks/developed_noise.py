@@ -13,7 +13,6 @@ made from, which is the error of demosaicing, and noisy against clean.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,6 +21,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.demo import demo_photographs
 from rawaug.io import RawFrame, read_raw, write_dng
@@ -127,10 +127,10 @@ def differences(pictures: Sequence[Tensor], method: str) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("frame", type=Path, help="a RAW file with little noise")
-    parser.add_argument("--figure", type=Path, default=None, help="draw to this file")
-    options = parser.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("frame", type=Path, help="a RAW file with little noise")
+    cli.add_argument("--figure", type=Path, default=None, help="draw to this file")
+    options = cli.parse_args()
     found = curves(options.frame)
     for name, seen in found.items():
         by_lag = torch.stack([correlation(*one) for one in seen]).mean(0)

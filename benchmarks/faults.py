@@ -12,8 +12,8 @@ send tensors through it. Exit status 1 if anything differs or ends in more than 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import ctypes
 import json
 import os
 import random
@@ -24,13 +24,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.small_mounts import Skipped, small_file_system, small_shared_memory
+from benchmarks.measure import parser
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 PATIENCE = 600.0
@@ -90,7 +90,7 @@ def make_inputs(folder: Path) -> None:
     (folder / "recipe.yaml").write_text(RECIPE)
 
 
-# -- children ---------------------------------------------------------------------------------------------------------
+# -- children ----------------------------------------------------------------------------------------------------------
 
 
 class Child:
@@ -176,15 +176,11 @@ def fresh(folder: Path) -> Path:
     return folder
 
 
-# -- kills ------------------------------------------------------------------------------------------------------------
+# -- kills -------------------------------------------------------------------------------------------------------------
 
 
 def uninterrupted(folder: Path, name: str) -> tuple[Files, float]:
-    """The files of a run that is left alone, and its seconds.
-
-    Raises:
-        ValueError: if it fails.
-    """
+    """The files of a run that is left alone, and its seconds; ValueError if it fails."""
     child = Child(fresh(folder), COMMANDS[name])
     if status := child.wait():
         raise ValueError(f"{name}: status {status} without any fault: {child.said()}")
@@ -216,7 +212,41 @@ def kills(folder: Path, name: str, count: int, seed: int, whole: Files, seconds:
     return [outcome for outcome in outcomes if outcome]
 
 
-# -- other faults -----------------------------------------------------------------------------------------------------
+# -- small file systems ------------------------------------------------------------------------------------------------
+
+
+class Skipped(Exception):
+    """The fault cannot be made here, or does not concern the command; the text says which."""
+
+
+@contextlib.contextmanager
+def small_file_system(place: Path, kilobytes: int) -> Iterator[None]:
+    """Mount a tmpfs of this size over a folder; Skipped where that is not allowed."""
+    place.mkdir(exist_ok=True)
+    mount(place, kilobytes)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+def mount(place: Path, kilobytes: int) -> None:
+    """Likewise, for as long as nobody unmounts it."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+        raise Skipped("needs the right to mount file systems")
+
+
+def small_shared_memory(kilobytes: int) -> None:
+    """A /dev/shm of this size for this process alone and those that come from it; Skipped likewise."""
+    new_mount_namespace = 0x00020000
+    if ctypes.CDLL(None, use_errno=True).unshare(new_mount_namespace):
+        raise Skipped(f"needs a mount namespace ({os.strerror(ctypes.get_errno())})")
+    subprocess.run(["mount", "--make-rprivate", "/"], check=True, capture_output=True)
+    mount(Path("/dev/shm"), kilobytes)
+
+
+# -- other faults ------------------------------------------------------------------------------------------------------
 
 
 def one_line(child: Child, *said: str) -> str | None:
@@ -332,14 +362,14 @@ FAULTS = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=20, help="of each command")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
-    parser.add_argument("--faults", nargs="*", choices=list(FAULTS), default=list(FAULTS), help="besides the kills")
-    parser.add_argument("--quick", action="store_true", help="one kill of each command")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    args = parser.parse_args(arguments)
+    cli = parser(__doc__)
+    cli.add_argument("--kills", type=int, default=20, help="of each command")
+    cli.add_argument("--seed", type=int, default=0)
+    cli.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    cli.add_argument("--faults", nargs="*", choices=list(FAULTS), default=list(FAULTS), help="besides the kills")
+    cli.add_argument("--quick", action="store_true", help="one kill of each command")
+    cli.add_argument("--json", type=Path, help="write the figures to this file")
+    args = cli.parse_args(arguments)
     torch.set_num_threads(1)
     start, count, results = time.perf_counter(), 1 if args.quick else args.kills, dict[str, Any]()
     with tempfile.TemporaryDirectory() as name:

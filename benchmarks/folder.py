@@ -10,10 +10,7 @@ and late in the epoch, and whether the report names every damaged file and no ot
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import platform
 import sys
 import tempfile
 import time
@@ -26,6 +23,7 @@ import torch
 from PIL import Image
 from torch.utils.data import DataLoader
 
+from benchmarks.measure import arguments, finish, seconds, start
 from rawaug.data import PictureFolder
 from rawaug.io import read_picture
 
@@ -70,7 +68,7 @@ def own_megabytes(processes: list[int]) -> list[float]:
     return sizes
 
 
-def epoch(pictures: PictureFolder, workers: int, start: float) -> dict[str, Any]:
+def epoch(pictures: PictureFolder, workers: int, began: float) -> dict[str, Any]:
     """Read every picture once, shuffled."""
     order = torch.Generator().manual_seed(0)
     loader = DataLoader(pictures, batch_size=50, shuffle=True, generator=order, num_workers=workers)
@@ -79,45 +77,37 @@ def epoch(pictures: PictureFolder, workers: int, start: float) -> dict[str, Any]
     memory, count, first = [], 0, 0.0
     for number, batch in enumerate(batches):
         if number == 0:
-            first = time.perf_counter() - start
+            first = time.perf_counter() - began
         if number in (len(loader) // 10, len(loader) * 9 // 10):
             memory.append(own_megabytes(processes))
         count += len(batch)
-    seconds = time.perf_counter() - start
-    return {"first_batch_s": first, "epoch_s": seconds, "pictures": count, "own_mb_early_late": memory}
+    taken = time.perf_counter() - began
+    return {"first_batch_s": first, "epoch_s": taken, "pictures": count, "own_mb_early_late": memory}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--files", type=int, default=20_000)
-    parser.add_argument("--damaged", type=float, default=0.01, help="share of them")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--quick", action="store_true", help="2,000 files")
-    args = parser.parse_args()
+    cli = arguments(__doc__, repeats=1, quick="2,000 files")
+    cli.add_argument("--files", type=int, default=20_000)
+    cli.add_argument("--damaged", type=float, default=0.01, help="share of them")
+    cli.add_argument("--workers", type=int, default=2)
+    cli.set_defaults(threads=1)
+    args = cli.parse_args()
     args.files = min(args.files, 2000) if args.quick else args.files
-    torch.set_num_threads(1)
+    result = start(args)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         damaged = make_folder(folder, args.files, args.damaged)
         good = [path for path in sorted(folder.rglob("*.jpg"))[:1000] if path.name not in damaged]
-        start = time.perf_counter()
-        for path in good:
-            read_picture(path)
-        alone = len(good) / (time.perf_counter() - start)
-        start = time.perf_counter()
+        alone = len(good) / seconds(lambda: [read_picture(path) for path in good], args.device)
+        began = time.perf_counter()
         pictures = PictureFolder(folder)
-        result: dict[str, Any] = {"start_s": time.perf_counter() - start}
-        result |= epoch(pictures, args.workers, start)
+        result["start_s"] = time.perf_counter() - began
+        result |= epoch(pictures, args.workers, began)
         named = {path.name for path in pictures.skipped}
     rate = result["pictures"] / result["epoch_s"]
     result |= {"pictures_per_s": rate, "ratio_to_reading_alone": rate / alone, "report_is_exact": named == damaged}
-    result["machine"] = (
-        f"{platform.machine()}, {os.cpu_count()} cores, {args.workers} workers, torch {torch.__version__}"
-    )
     print(json.dumps(result, indent=1))
-    if args.json:
-        args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    finish(result, args)
     return 0 if named == damaged else 1
 
 

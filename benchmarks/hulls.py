@@ -13,12 +13,12 @@ the shipped ISPs instead: nothing is chosen for it.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from benchmarks.measure import parser
 from rawaug.io.pictures import decode_srgb, read_picture
 from rawaug.isp.cameras import colour_matrix, published_cameras
 from rawaug.isp.dictionary import DECIBEL, CameraDictionary, colour_coordinates, nearest_in_hull, psnr
@@ -114,13 +114,13 @@ def draw(path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--photographs", type=Path, help="folder of JPEG files; those of the package by default")
-    parser.add_argument("--atoms", type=int, default=10)
-    parser.add_argument("--gains", type=int, default=16)
-    parser.add_argument("--halves", type=int, default=5)
-    parser.add_argument("--figure", type=Path, help="draw this figure, and do nothing else")
-    options = parser.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("--photographs", type=Path, help="folder of JPEG files; those of the package by default")
+    cli.add_argument("--atoms", type=int, default=10)
+    cli.add_argument("--gains", type=int, default=16)
+    cli.add_argument("--halves", type=int, default=5)
+    cli.add_argument("--figure", type=Path, help="draw this figure, and do nothing else")
+    options = cli.parse_args()
     if options.figure is not None:
         draw(options.figure)
         return

@@ -20,15 +20,20 @@ from rawaug.data import demo_pictures
 from rawaug.io import write_picture
 
 
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Whose help is a module's docstring as it is."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
 def arguments(description: str | None, repeats: int, quick: str) -> argparse.ArgumentParser:
     """A parser with the options that every benchmark has; ``quick`` says what ``--quick`` does to this one."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--repeats", type=int, default=repeats, help="runs, of which the fastest counts")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
-    parser.add_argument("--quick", action="store_true", help=quick)
-    return parser
+    options = parser(description)
+    options.add_argument("--device", type=torch.device, default=torch.device("cpu"))
+    options.add_argument("--threads", type=int, default=torch.get_num_threads())
+    options.add_argument("--repeats", type=int, default=repeats, help="runs, of which the fastest counts")
+    options.add_argument("--json", type=Path, help="write all figures to this file")
+    options.add_argument("--quick", action="store_true", help=quick)
+    return options
 
 
 def machine(device: torch.device, threads: int) -> dict[str, object]:

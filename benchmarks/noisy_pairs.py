@@ -8,11 +8,11 @@ levels. ``--data.pairs pairs:OUT`` reads them.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.folders import RawFolder
 from rawaug.evaluation.scores import frozen_levels, frozen_sample
@@ -44,12 +44,12 @@ def write_pair(folder: RawFolder, index: int, noise: NoiseModel, seed: int, out:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", help="a folder of RAW files")
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--noise", default="cycleisp_sidd")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(argv)
+    cli = parser(__doc__)
+    cli.add_argument("data", help="a folder of RAW files")
+    cli.add_argument("out", type=Path)
+    cli.add_argument("--noise", default="cycleisp_sidd")
+    cli.add_argument("--seed", type=int, default=0)
+    options = cli.parse_args(argv)
     options.out.mkdir(parents=True, exist_ok=True)
     folder, noise = RawFolder(options.data, camera_jpeg=False), noise_model(options.noise)
     for index in progress(range(len(folder)), label="pairs", unit="pair"):

@@ -8,7 +8,6 @@ inset, 16 x 16 of its sites, each in its colour.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 import denoisers
 import rawaug
+from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.demo import demo_files
 from rawaug.io import encode_srgb, read_picture
@@ -67,9 +67,9 @@ def panels() -> dict[str, Tensor]:
 def main(argv: list[str] | None = None) -> None:
     from matplotlib.figure import Figure
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    out = parser.parse_args(argv).out
+    cli = parser(__doc__)
+    cli.add_argument("out", type=Path)
+    out = cli.parse_args(argv).out
     shown = panels()
     figure = Figure(figsize=(3.1 * len(shown), 3.4), layout="constrained")
     for axes, (title, image) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):

@@ -14,7 +14,6 @@ started again; another recipe or number of steps needs another OUT.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.measure import parser
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.evaluation.scores import classical_method, score_method
@@ -114,18 +114,18 @@ def named(values: Sequence[str]) -> dict[str, list[str]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pictures", nargs="+", required=True)
-    parser.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
-    parser.add_argument("--bin", type=int, default=1, help="bins the tests K x K by colour site: clean references")
-    parser.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
-    parser.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
-    parser.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
-    parser.add_argument("--recipe", help="a training recipe; its network, loop, noise and crops")
-    parser.add_argument("--steps", type=int, help="in place of the recipe's")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
-    options = parser.parse_args()
+    cli = parser(__doc__)
+    cli.add_argument("--pictures", nargs="+", required=True)
+    cli.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
+    cli.add_argument("--bin", type=int, default=1, help="bins the tests K x K by colour site: clean references")
+    cli.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
+    cli.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
+    cli.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
+    cli.add_argument("--recipe", help="a training recipe; its network, loop, noise and crops")
+    cli.add_argument("--steps", type=int, help="in place of the recipe's")
+    cli.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    cli.add_argument("--out", type=Path, default=Path("runs/psnr_d"))
+    options = cli.parse_args()
     torch.set_num_threads(1)
     config, noise = settings(options.recipe, options.steps)
     config = replace(config, bin=options.bin)

@@ -9,7 +9,6 @@ Gr, Gb, B from top to bottom; ``frames.json`` says what else is known. The own n
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.measure import parser
 from rawaug.bayer import bin_mosaic, binned_variance, pack
 from rawaug.data.published import REAL_BLACK, REAL_FRAMES, REAL_WHITE
 from rawaug.io import RawFrame, read_raw
@@ -62,10 +62,10 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("camera_files", type=Path)
-    parser.add_argument("--out", type=Path, default=REAL_FRAMES)
-    args = parser.parse_args(arguments)
+    cli = parser(__doc__)
+    cli.add_argument("camera_files", type=Path)
+    cli.add_argument("--out", type=Path, default=REAL_FRAMES)
+    args = cli.parse_args(arguments)
     args.out.mkdir(parents=True, exist_ok=True)
     frames = {}
     for split, names in SPLITS.items():

@@ -109,7 +109,12 @@ class Wavelet(Classical):
         height, width, channels = planes.shape
         # VisuShrink cuts at sigma sqrt(2 log n); the factor is taken out, since on photographs it smooths too much.
         sigma = 3 * self.strength / np.sqrt(2 * np.log(height * width))
-        settings = {"sigma": [sigma] * channels, "wavelet": "haar", "method": "VisuShrink", "mode": "hard"}
+        settings: dict[str, Any] = {
+            "sigma": [sigma] * channels,
+            "wavelet": "haar",
+            "method": "VisuShrink",
+            "mode": "hard",
+        }
         settings |= {"rescale_sigma": False, "channel_axis": -1}
         settings["wavelet_levels"] = min(4, min(height, width).bit_length() - 1)
         mean = np.zeros_like(planes)

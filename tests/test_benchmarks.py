@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, equal_minutes, measure, networks, sensors, synth
+from benchmarks import augment, binning, crops, denoise, measure, networks, sensors, synth
 from benchmarks.noisy_pairs import main, write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -74,20 +74,20 @@ def test_pairs_on_disk_and_online_are_compared_with_decoding(tmp_path: Path) -> 
 def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filters(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(equal_minutes, "PROBE", 2)
-    monkeypatch.setattr(equal_minutes, "MIDDLE", 64)
+    monkeypatch.setattr(networks, "PROBE", 2)
+    monkeypatch.setattr(networks, "MIDDLE", 64)
     args = argparse.Namespace(
         pictures="demo:", validation="demo:validation", bin=1, batch=2, crop=32, minutes=0.0, device=CPU,
         precision="32-true", pmrid=None,
     )  # fmt: skip
-    row = equal_minutes.trained("DnCNN", {"width": 4, "depth": 3}, args)
+    row = networks.trained("DnCNN", {"width": 4, "depth": 3}, args)
     assert row["steps"] == 2, "no fewer than the probe's"
-    references = equal_minutes.references(args)
-    frame = equal_minutes.middles(args)[0]
+    references = networks.references(args)
+    frame = networks.middles(args)[0]
     assert frame.raw.shape == (1, 64, 64) and references.keys() == {"NonLocalMeans", "rawaug-small"}
     assert references["NonLocalMeans"]["psnr"] > row["psnr"] > 0, "a network of two steps is below a filter"
     rows = {"DnCNN": row | {"parameters": 100.0, "s/Mpix, 1 thread(s)": 0.5}}
-    equal_minutes.chart(rows, references, tmp_path / "chart.png")
+    networks.chart(rows, references, tmp_path / "chart.png")
     assert read_picture(tmp_path / "chart.png").shape == (3, 480, 1080)
 
 

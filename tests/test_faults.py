@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import denoisers
 from benchmarks import faults
-from benchmarks.small_mounts import small_shared_memory
+from benchmarks.faults import small_shared_memory
 from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands import pair_files, pair_maker
