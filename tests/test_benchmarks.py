@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import augment, binning, crops, denoise, measure, networks, sensors, synth
-from benchmarks.noisy_pairs import main, write_pair
+from benchmarks.noisy_pairs import write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.demo import FRAME
@@ -19,7 +19,7 @@ from rawaug.data.folders import RawFolder
 from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import frozen_levels, frozen_sample
 from rawaug.io import RawFrame, read_picture, write_dng
-from rawaug.noise import Compose, RowNoise, noise_model
+from rawaug.noise import noise_model
 
 CPU = torch.device("cpu")
 
@@ -132,22 +132,6 @@ def test_a_pair_has_the_frozen_noise_and_states_its_levels(shots: RawFolder, tmp
     step = 1 / (65535 - 16384)
     torch.testing.assert_close(again.noisy, sample.noisy, rtol=0, atol=step)
     torch.testing.assert_close(again.clean, sample.clean, rtol=0, atol=step)
-
-
-def test_files_of_the_same_stem_are_kept_apart(shots: RawFolder, tmp_path: Path) -> None:
-    folder = shots.files[0].parent
-    for name in ("a", "b"):
-        (folder / name).mkdir()
-        (folder / name / "shot.dng").write_bytes(shots.files[0].read_bytes())
-    shots.files[0].unlink()
-    main([str(folder), str(tmp_path / "pairs"), "--noise", "cycleisp_sidd"])
-    assert [pair.name for pair in open_pairs(f"pairs:{tmp_path / 'pairs'}")] == ["a_shot.dng", "b_shot.dng"]
-
-
-def test_noise_without_levels_is_refused(shots: RawFolder, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="shot: its pair needs noise with known shot_var"):
-        write_pair(shots, 0, Compose([RowNoise(1e-6)]), 0, tmp_path)
-    assert not list(tmp_path.glob("*.dng"))
 
 
 def test_sensors_scores_flat_patches_frames_and_cells_beside_lights() -> None:

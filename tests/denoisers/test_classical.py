@@ -52,14 +52,6 @@ def test_each_picture_has_its_own_noise_level(method: type[Classical]) -> None:
     assert torch.equal(both[1:], method()(noisy[1:], variance[1:]))
 
 
-@pytest.mark.parametrize("method", OWN)
-def test_strength_smooths_more(method: type[Classical]) -> None:
-    _, noisy = scene()
-    variance = torch.full_like(noisy, SIGMA**2)
-    weak, strong = (mse(method(strength)(noisy, variance), noisy) for strength in (0.3, 1.0))
-    assert weak < strong
-
-
 @pytest.mark.parametrize("method", [*OWN, BM3D])
 def test_small_and_wrong_inputs(method: type[Classical]) -> None:
     least = method.smallest

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from denoisers import DnCNN, SelfEnsemble, UNet, tiled
-from denoisers.inference import Recorrupted, _pieces, from_view, to_view
+from denoisers.inference import Recorrupted, from_view, to_view
 from rawaug import bayer
 
 
@@ -46,13 +46,6 @@ def test_no_seam_at_any_size_around_that_of_a_tile() -> None:
                 assert (pieces - whole).abs().max() < 1e-5, f"a seam at a side of {side}"
 
 
-@pytest.mark.parametrize("side", [383, 384, 385, 387, 400, 513, 640, 2000])
-def test_equal_tiles_are_no_more_than_needed(side: int) -> None:
-    starts, length = _pieces(side, 384, 64, 16)
-    assert len(starts) == max(1, -(-(side - 128) // 256))
-    assert len(starts) == 1 or len(starts) * (length - 128) - (side - 128) < 16 * len(starts)
-
-
 @pytest.mark.parametrize("size", [(100, 61), (64, 128), (35, 30), (63, 65), (80, 81), (129, 127)])
 def test_pooling_grids_fall_together(size: tuple[int, int]) -> None:
     model = awake(UNet(width=4, scales=2))  # receptive radius below 24
@@ -73,14 +66,6 @@ def test_every_piece_is_at_most_a_tile_and_no_gradient_is_kept() -> None:
     noisy, _ = pair(1, 4, 300, 130)
     assert torch.equal(tiled(Note(), noisy.requires_grad_(), tile=64, overlap=8), noisy)
     assert set(sizes) == {(64, 54)}  # seven equal tiles by three
-
-
-def test_tiles_of_an_ensemble_align_with_its_network() -> None:
-    noisy, variance = pair(1, 4, 40, 56)
-    ensemble = SelfEnsemble(UNet(width=4, scales=3), "RGGB")
-    assert torch.equal(tiled(ensemble, noisy, variance, tile=32, overlap=8), noisy)
-    with pytest.raises(ValueError, match="multiples of the model's stride 4"):
-        tiled(ensemble, noisy, variance, tile=32, overlap=6)
 
 
 def test_tiles_that_cannot_be_are_refused() -> None:
@@ -152,34 +137,6 @@ def test_planes_are_never_mixed(cfa: bayer.CFA, size: tuple[int, int]) -> None:
     # A quarter turn makes the green of the red row that of the blue row: half of the eight views use the other's gain.
     expected = torch.tensor([2.0, 4.0, 4.0, 7.0]).reshape(4, 1, 1) * noisy
     torch.testing.assert_close(SelfEnsemble(lambda y, _: gains * y, cfa, 8)(noisy), expected)
-
-
-@pytest.mark.parametrize("cfa", CFAS)
-@pytest.mark.parametrize("views", [4, 8])
-def test_a_place_dependent_model_meets_every_turned_place(cfa: bayer.CFA, views: int) -> None:
-    def ramp(y: Tensor, _: Tensor | None) -> Tensor:  # brighter to the right, in lines of the mosaic from the middle
-        mosaic = bayer.unpack(y, cfa)
-        column = torch.arange(mosaic.shape[-1]) - (mosaic.shape[-1] - 1) / 2
-        return bayer.pack(mosaic * column, cfa)
-
-    noisy = picture(1, 4, 5, 5)
-    once = ramp(noisy, None)
-    # Mirrored views see the column with its sign turned, so the mean over the flips vanishes; so does that over turns.
-    assert once.abs().mean() > 0.5
-    torch.testing.assert_close(SelfEnsemble(ramp, cfa, views)(noisy), torch.zeros_like(noisy), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("cfa", CFAS)
-def test_an_equivariant_model_is_left_unchanged(cfa: bayer.CFA) -> None:
-    def blur(y: Tensor, _: Tensor | None) -> Tensor:  # each site with its four neighbours of the same colour
-        mosaic = nn.functional.pad(bayer.unpack(y, cfa), (2, 2, 2, 2), mode="reflect")
-        cross = mosaic[..., :-4, 2:-2] + mosaic[..., 4:, 2:-2] + mosaic[..., 2:-2, :-4] + mosaic[..., 2:-2, 4:]
-        return bayer.pack(mosaic[..., 2:-2, 2:-2] / 2 + cross / 8, cfa)
-
-    noisy = picture(2, 4, 6, 7)
-    away_from_edges = (..., slice(2, -2), slice(2, -2))
-    mean = SelfEnsemble(blur, cfa)(noisy)
-    torch.testing.assert_close(mean[away_from_edges], blur(noisy, None)[away_from_edges])
 
 
 @pytest.mark.parametrize("cfa", CFAS)

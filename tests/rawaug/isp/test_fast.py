@@ -125,13 +125,6 @@ def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
         baked(torch.zeros(2, 3, 8, 8), params, torch.tensor([[0, 0, 8, 8]]))
 
 
-def test_bytes_and_floats_agree() -> None:
-    isp = curved_isp()
-    srgb = torch.randint(256, (1, 3, 16, 16), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
-    params, baked = isp.choose(srgb), BakedISP(isp)
-    torch.testing.assert_close(baked(srgb, params), baked(srgb / 255.0, params), atol=1e-6, rtol=1e-5)
-
-
 def test_stages_in_another_order_are_refused() -> None:
     with pytest.raises(ValueError, match="usual order, got gamma gains colour; fit it anew"):
         BakedISP(DictionaryISP(ISPConfig(stages=("gamma", "gains", "colour"))))

@@ -5,11 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rawaug import bayer
 from rawaug.isp.cameras import published_cameras
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import CameraDictionary, colour_coordinates, psnr
-from rawaug.isp.fast import BakedISP
+from rawaug.isp.dictionary import CameraDictionary, psnr
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.universal import TONE_AND_CAMERAS, camera_points, held, inverse_gains_in_any_light
 from rawaug.metrics import psnr as image_psnr
@@ -47,22 +45,6 @@ def test_gain_atoms_hold_lights_that_they_were_not_chosen_for(universal: Diction
     assert held(others / 3**0.5, atoms / 3**0.5) > 0.95
 
 
-def test_forward_undoes_reverse(universal: DictionaryISP) -> None:
-    srgb = 0.1 + 0.6 * torch.rand(3, 3, 16, 16, generator=generator())
-    setting = universal.draw_setting(3, generator(1))
-    back = universal.forward_pixels(universal.reverse_pixels(srgb, setting), setting)
-    assert (back - srgb).abs().quantile(0.95) < 1e-3
-
-
-def test_baked_is_the_isp_above_75_db(universal: DictionaryISP) -> None:
-    srgb = torch.randint(256, (4, 3, 32, 48), generator=generator(), dtype=torch.uint8)
-    setting = universal.draw_setting(4, generator(1))
-    expected = bayer.pack(universal.reverse(srgb, setting).raw, universal.cfa)
-    baked = BakedISP(universal)
-    assert image_psnr(baked(srgb, setting), expected).min() > 75
-    assert image_psnr(baked(srgb / 255.0, setting), expected).min() > 75
-
-
 def test_readings_find_tone_and_camera_as_well(universal: DictionaryISP) -> None:
     srgb = torch.rand(1, 3, 32, 32, generator=generator()) * 0.85
     truth = universal.draw_setting(1, generator(3))
@@ -80,8 +62,3 @@ def test_a_curve_stands_in_place_of_tone_and_gamma() -> None:
         DictionaryISP(ISPConfig(stages=("tone", "curve"), tone_atoms=2))
     with pytest.raises(ValueError, match="with the stage curve"):
         ISPConfig(stages=TONE_AND_CAMERAS)
-
-
-def test_points_of_cameras_are_errors_of_colour() -> None:
-    assert camera_points(published_cameras().distinct()[:2]).shape == (2, 9)
-    assert colour_coordinates(torch.eye(3)[None], torch.eye(3)).square().sum().item() == pytest.approx(1.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -62,28 +61,6 @@ def test_a_crop_is_replayed_from_its_generator_alone() -> None:
     again, other = crops.draw(seeded(5)), crops.draw(seeded(6))
     assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
     assert not torch.equal(once.clean, other.clean)
-
-
-def test_every_picture_place_and_turn_is_drawn() -> None:
-    pictures = [torch.randint(0, 256, (3, 18, 20), generator=seeded(k), dtype=torch.uint8) for k in range(2)]
-    crops = made(pictures)
-    drawn = {crops.draw(seeded(seed)).clean.numpy().tobytes() for seed in range(1200)}
-    expected = set()
-    for picture, top, left, view in product(pictures, (0, 2), (0, 2, 4), range(8)):
-        patch = bayer.turn(picture[:, top : top + 16, left : left + 16], view)
-        expected.add(bayer.pack(bayer.mosaic(patch[None] / 255.0, "GRBG"), "GRBG")[0].numpy().tobytes())
-    assert len(expected) == 96 and drawn == expected
-
-
-def test_noise_is_clipped_at_white_but_not_at_black() -> None:
-    black, white = (torch.full((3, 32, 32), value, dtype=torch.uint8) for value in (0, 255))
-    dark, bright = (made([picture], noise=noise_model((0.0, 1e-2)), gain=3.0) for picture in (black, white))
-    shadows, lights = dark.draw(seeded(0)), bright.draw(seeded(0))
-    assert shadows.clean.max() == 0.0 and shadows.noisy.min() < 0.0
-    assert abs(float(shadows.noisy.mean())) < 3 * 0.1 / shadows.noisy.numel() ** 0.5
-    assert float(shadows.noisy.var()) == pytest.approx(1e-2, rel=0.2)
-    assert lights.clean.max() == 1.0 and lights.noisy.max() == 1.0  # 3 times white is white
-    assert torch.allclose(shadows.variance, torch.tensor(1e-2))
 
 
 @pytest.fixture

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,16 +14,13 @@ import torch
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig
 from rawaug.isp.fit.samples import sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.metrics import PATCH
 from rawaug.paper import methods
-from rawaug.paper.baselines import BASELINES, UPI, InvISP, Training, TunedUPI
+from rawaug.paper.baselines import UPI, InvISP, Training, TunedUPI
 from rawaug.paper.baselines.networks import UNetISP
 from rawaug.paper.methods import (
-    FAMILIES,
     ROWS,
     Fitted,
     balanced_psnr,
@@ -33,7 +29,6 @@ from rawaug.paper.methods import (
     fit_family,
     is_method,
     mosaic_only_psnr,
-    oracle,
     score_rows,
     squared_error,
 )
@@ -116,95 +111,9 @@ def test_in_light_that_the_camera_does_not_expect_what_is_known_brings_it_back(
 
 
 @pytest.mark.usefixtures("no_oracle")
-def test_the_places_that_are_read_go_by_the_frames_name(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
-    pair = frame_of("lamps", LAMPS)
-
-    def gains(name: str) -> torch.Tensor:
-        return dictionary_params(known_camera, replace(pair, name=name))["samples"].gains
-
-    torch.manual_seed(0)
-    once = gains("lamps")
-    torch.manual_seed(1)
-    assert torch.equal(gains("lamps"), once)
-    assert not torch.equal(gains("other"), once)
-
-
-@pytest.mark.usefixtures("no_oracle")
-def test_the_speed_counts_every_row_and_every_pixel(
-    known_camera: DictionaryISP, frame_of: FrameOf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair = frame_of("wide", size=(256, 768))
-    for model, rows, patches, pixels in (
-        (UPI(pair.cfa), 2, 2, PATCH**2),
-        (known_camera, 4, None, PATCH**2),
-        (UPI(pair.cfa), 2, 8, 64 * 96),
-    ):
-        frame = pair if pixels == PATCH**2 else frame_of("small", size=(64, 96))
-        ticks = iter((10.0, 12.0))
-        monkeypatch.setattr(methods, "time", SimpleNamespace(perf_counter=lambda ticks=ticks: next(ticks)))
-        windows = min(patches or 3, frame.raw.shape[-1] // PATCH or 1)
-        speed = score_rows(Fitted(model, 0.0, 0), frame, patches)["mpix_s"]
-        assert speed == pytest.approx(rows * windows * pixels / 2.0 / 1e6)
-
-
-@pytest.mark.usefixtures("no_oracle")
 def test_a_frame_smaller_than_a_patch_is_scored_whole(known_camera: DictionaryISP, frame_of: FrameOf) -> None:
     small = frame_of("small", size=(64, 96))
     assert rows_of(known_camera, small, 1)["as-shot"] > 75.0  # its fall-off too is in place
-
-
-@pytest.fixture
-def unfitted(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Fits do nothing but record their arguments."""
-    asked: dict[str, Any] = {}
-
-    def baseline(model: Any, pairs: Sequence[Pair], training: Training) -> Any:
-        asked.update(pairs=pairs, training=training)
-        return model
-
-    def dictionary(pairs: Sequence[Pair], config: FitConfig) -> DictionaryISP:
-        asked.update(pairs=pairs, config=config)
-        return DictionaryISP(ISPConfig(encoders=config.encoders == "on", encoder_widths=(4, 4, 4)))
-
-    monkeypatch.setattr(methods, "fit_baseline", baseline)
-    monkeypatch.setattr(methods, "fit_isp", dictionary)
-    return asked
-
-
-def test_every_seed_starts_from_weights_of_its_own(frame_of: FrameOf, unfitted: dict[str, Any]) -> None:
-    pairs, before = [frame_of("a")], torch.get_rng_state()
-
-    def start(seed: int) -> torch.Tensor:
-        fitted = fit_family("invgrey", pairs, FitConfig(), replace(TRAINING, seed=seed))
-        assert fitted.parameters == 741_123
-        return torch.cat([p.detach().flatten() for p in fitted.model.parameters()])
-
-    assert torch.equal(start(1), start(1)) and not torch.equal(start(1), start(2))
-    assert unfitted["training"] == Training(7.0, crop=32, batch=3, seed=2)
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-@pytest.mark.parametrize("family", ["upi", "upi-tuned"])
-def test_a_method_without_parameters_takes_the_pattern_of_the_frames(
-    family: str, frame_of: FrameOf, unfitted: dict[str, Any]
-) -> None:
-    fitted = fit_family(family, [frame_of("a")], FitConfig(), TRAINING)
-    assert type(fitted.model) is BASELINES[family] and fitted.model.cfa == bayer.CFA.GRBG
-    assert fitted.parameters == sum(p.numel() for p in fitted.model.parameters())
-
-
-def test_encoders_are_on_in_one_family_and_count_only_there(frame_of: FrameOf, unfitted: dict[str, Any]) -> None:
-    counts = {}
-    for family, encoders in (("dictionary", "off"), ("dictionary-encoders", "on")):
-        fitted = fit_family(family, [frame_of("a")], FitConfig(steps=3), replace(TRAINING, seed=5))
-        assert unfitted["config"] == FitConfig(steps=3, seed=5, encoders=encoders)  # type: ignore[arg-type]
-        counts[family] = fitted.parameters
-        named = dict(fitted.model.named_parameters())
-    looking = [p for name, p in named.items() if name.startswith("reverse_encoders.") and ".layers." in name]
-    assert counts["dictionary-encoders"] - counts["dictionary"] == sum(p.numel() for p in looking) > 0
-    other = [p for name, p in named.items() if name.startswith("forward_") or ".forward_" in name]
-    assert counts["dictionary-encoders"] == sum(p.numel() for p in named.values()) - sum(p.numel() for p in other)
-    assert set(FAMILIES) == {*counts, *BASELINES}
 
 
 def test_a_cycle_loses_the_mosaic_and_nothing_else_in_a_camera_that_inverts_itself(
@@ -251,16 +160,6 @@ def test_no_row_that_knows_less_is_better(published: DictionaryISP, frame_of: Ca
     errors = {row: squared_error(published, pixels, params).item() for row, params in rows.items()}
     assert errors["oracle"] < 1.02 * min(errors.values()), "on other pixels than those that it was chosen by"
     assert errors["oracle"] < 1e-5 < errors["blind"], "it finds camera, light and tone at once: 50 dB"
-
-
-@pytest.mark.usefixtures("brief")
-def test_a_better_guess_is_taken(published: DictionaryISP, frame_of: Callable[..., Pair]) -> None:
-    setting = published.draw_setting(1, keyed_generator(5))
-    frame = frame_of("exact")
-    with torch.no_grad():
-        frame = replace(frame, raw=published.reverse(frame.srgb[None], setting).raw[0], cfa=CFA.RGGB)
-    other = published.draw_setting(1, keyed_generator(6))
-    assert torch.equal(oracle(published, frame, [other, setting]).matrix, setting.matrix)
 
 
 BALANCE = (2.0, 1.0, 1.6)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import FitConfig, descent, encoders, fit_isp
-from rawaug.isp.fit.descent import Descent, cycle_error, mean_square, reading_error, weight_distance
+from rawaug.isp.fit import FitConfig, encoders, fit_isp
+from rawaug.isp.fit.descent import Descent, cycle_error, mean_square, reading_error
 from rawaug.isp.fit.samples import FitFrames, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
 
@@ -128,19 +128,6 @@ def _refusing(restored: Callable[..., tuple[int, Any]]) -> Callable[..., tuple[i
     return from_the_start
 
 
-def test_what_it_shows_is_the_mean_loss_since_the_report_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = []
-
-    class Bar(list[int]):
-        def set_postfix_str(self, text: str, refresh: bool) -> None:
-            shown.append(float(text.split()[1]))
-
-    monkeypatch.setattr(descent, "progress", lambda steps, **_: Bar(steps))
-    x, values = torch.zeros(1), iter([1.0, 2.0, 3.0, 4.0, 5.0, 60.0, 10.0])
-    Descent(None, "key", 0, False).run("line", lambda _: next(values) + 0 * x.sum(), {"x": x}, 7, 0.1)
-    assert shown == [3.0, 35.0]
-
-
 CLEAN, NOISY = FitConfig(), FitConfig(noisy=True)
 
 
@@ -193,26 +180,6 @@ def test_the_cycle_is_l2_on_srgb_and_a_tenth_on_every_image_between(isp: Diction
             isp, part, isp.choose(part.srgb), without, CLEAN
         )
         assert rise.item() == pytest.approx(0.1 * 0.5**2, rel=1e-4), name
-
-
-def test_from_noisy_readings_the_way_back_starts_where_the_reverse_pass_ended(
-    isp: DictionaryISP, frame: FitFrames
-) -> None:
-    part, _ = frame
-    back, _, _ = both_passes(isp, part)
-    params = isp.choose(part.srgb)
-    other = part._replace(cell_raw=part.cell_raw + 0.3)
-    assert torch.equal(cycle_error(isp, part, params, back, NOISY), cycle_error(isp, other, params, back, NOISY))
-    assert not torch.equal(cycle_error(isp, part, params, back, CLEAN), cycle_error(isp, other, params, back, CLEAN))
-
-
-def test_weights_apart_add_up_over_both_dictionaries(isp: DictionaryISP) -> None:
-    srgb = torch.rand(1, 3, 8, 8)
-    ours, theirs = isp.choose(srgb), isp.choose_forward(srgb)
-    assert (
-        weight_distance(ours, theirs).item() == pytest.approx(APART, rel=1e-4)
-        and weight_distance(ours, ours).item() == 0.0
-    )
 
 
 def test_the_loss_of_the_encoders_has_both_directions_and_their_consistency(

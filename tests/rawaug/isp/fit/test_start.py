@@ -53,12 +53,6 @@ def test_reach_brings_an_unseen_light_into_the_hull(one_light: list[Pair]) -> No
         torch.testing.assert_close(oracle_gains(isp, light), torch.ones(3).double(), atol=0.01, rtol=0)
 
 
-def test_a_reach_of_one_adds_no_atoms(one_light: list[Pair]) -> None:
-    isp = fit_isp(one_light, replace(QUICK, reach=1.0), progress=False)
-    assert isp.config.gain_atoms == isp.config.colour_atoms == 2
-    assert (oracle_gains(isp, (2.2, 1.0, 1.25)) - 1).abs().max() > 0.1
-
-
 def test_reach_atoms_are_corners_of_a_box_tetrahedron_first() -> None:
     corners = reach_atoms(8, 1.6).exp()
     assert corners[:, 1:].unique().tolist() == pytest.approx([1 / 1.6, 1.6])
@@ -192,18 +186,6 @@ def test_fall_off_is_measured(exact_pair: Callable[..., Pair]) -> None:
     mean, precision = fall_off(linear, samples, least_squares(linear, samples))
     torch.testing.assert_close(precision, 0.8 * torch.eye(2), atol=0.1, rtol=0)
     torch.testing.assert_close(mean, torch.zeros(2), atol=0.1, rtol=0)
-
-
-def test_a_mask_is_kept_where_there_is_fall_off(exact_pair: Callable[..., Pair]) -> None:
-    pairs = [exact_pair(f"shot{k}", WB, k, fall_off=0.8) for k in range(2)]
-    unseen = exact_pair("unseen", WB, seed=9, fall_off=0.8)
-    with_mask = fit_isp(pairs, SHORT, progress=False)
-    without = fit_isp(pairs, replace(SHORT, shading="off"), progress=False)
-    assert "shading" in with_mask.config.stages and "shading" not in without.config.stages
-    torch.testing.assert_close(
-        cast(Any, with_mask.stages["shading"]).mask.precision.diagonal(), torch.full((2,), 0.8), atol=0.1, rtol=0
-    )
-    assert error_db(with_mask, unseen) > error_db(without, unseen) + 6.0
 
 
 def test_content_that_goes_with_the_place_feigns_no_fall_off(exact_pair: Callable[..., Pair]) -> None:

@@ -41,29 +41,12 @@ def small(name: str, cfa: CFA | str = "RGGB") -> BaselineISP:
     return BASELINES[name](cfa, **SMALL[name])
 
 
-def test_every_method_is_covered() -> None:
-    assert set(SMALL) == set(BASELINES)
-
-
 @pytest.mark.parametrize(
     ("method", "millions"), [(UNetISP, 11.77), (CycleISP, 3.14), (InvISP, 1.41), (InvertibleGrey, 0.74)]
 )
 def test_published_number_of_parameters(method: type[BaselineISP], millions: float) -> None:
     with torch.device("meta"):
         assert method().reverse_parameters / 1e6 == pytest.approx(millions, abs=0.02)
-
-
-@pytest.mark.parametrize("cfa", list(CFA))
-@pytest.mark.parametrize("name", list(BASELINES))
-def test_shapes_and_range_both_ways(name: str, cfa: CFA) -> None:
-    model, srgb = small(name, cfa), torch.rand(2, 3, 14, 22, generator=torch.Generator().manual_seed(0))
-    raw = model.reverse(srgb)
-    assert raw.shape == (2, 1, 14, 22)
-    assert raw.min() >= 0.0 and raw.max() <= 1.0
-    if model.bidirectional:
-        rendered = model.cycle(srgb)
-        assert rendered.shape == srgb.shape
-        assert rendered.min() >= 0.0 and rendered.max() <= 1.0
 
 
 @pytest.mark.parametrize("name", list(BASELINES))
@@ -73,11 +56,6 @@ def test_a_site_keeps_its_own_channel(name: str) -> None:
     raw = model.reverse(srgb)
     assert torch.equal(raw[:, 0, 0::2, 0::2], linear[:, 2, 0::2, 0::2])
     assert torch.equal(raw[:, 0, 1::2, 0::2], linear[:, 1, 1::2, 0::2])
-
-
-def test_the_unet_says_that_it_does_not_render() -> None:
-    with pytest.raises(ValueError, match=r"unet only converts sRGB to RAW; rawaug\.paper\.baselines lists"):
-        small("unet")(torch.rand(1, 1, 8, 8))
 
 
 @pytest.mark.parametrize("name", ["unet", "cycleisp", "invisp", "invgrey"])
@@ -127,14 +105,6 @@ def test_a_few_steps_lower_the_loss(
     assert model.loss(crops).item() < 0.9 * before
     assert model.info["steps"] == 15 and model.info["seconds"] > 0.0 and model.info["loss"] > 0.0
     assert not model.training
-
-
-def test_the_same_seed_and_steps_give_the_same_weights(exact_pairs: list[Pair]) -> None:
-    raws = []
-    for seed in (0, 0, 1):
-        model = fit_baseline(UNetISP(width=4), exact_pairs, replace(QUICK, steps=3, seed=seed))
-        raws.append(model.reverse(exact_pairs[0].srgb[None]))
-    assert torch.equal(raws[0], raws[1]) and not torch.equal(raws[0], raws[2])
 
 
 def test_seconds_end_it_and_steps_are_counted(exact_pairs: list[Pair]) -> None:
