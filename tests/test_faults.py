@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import resource
 import signal
@@ -19,7 +18,6 @@ from torch.utils.data import DataLoader, Dataset
 
 import denoisers
 from benchmarks import faults
-from benchmarks.faults import small_shared_memory
 from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands import pair_files, pair_maker
@@ -273,37 +271,3 @@ def test_what_the_machine_lacks_is_said_in_one_line(said: str, way_out: str) -> 
     assert line is not None and way_out in line and "\n" not in line
     assert resource_error(RuntimeError("mat1 and mat2 shapes cannot be multiplied")) is None
     assert "smaller batch" in str(resource_error(MemoryError()))
-
-
-def test_64_descriptors_are_enough_for_two_workers() -> None:
-    """In a process of its own, as this one may have files open that other tests left to the garbage collector."""
-    code = """
-import resource, torch
-from torch.utils.data import DataLoader
-from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairs
-resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
-augment = RawAugment(DictionaryISP(ISPConfig(colour_atoms=3, gain_atoms=3)))
-pairs = RawPairs([torch.rand(3, 16, 16) for _ in range(24)], augment, crop=8, keys=("noisy", "clean"))
-loader = DataLoader(pairs, batch_size=2, num_workers=2, multiprocessing_context="fork")
-assert sum(len(batch["noisy"]) for batch in loader) == 24
-"""
-    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(code, {}))
-    process.start()
-    process.join()
-    assert process.exitcode == 0
-
-
-def test_a_small_dev_shm_is_said_in_one_line() -> None:
-    """Batches of two workers that do not fit into a /dev/shm of 64 KiB, mounted for a child of this process alone."""
-    if in_child(lambda: small_shared_memory(64)):
-        pytest.skip("needs the right to mount a file system")
-
-    def load() -> None:
-        small_shared_memory(64)
-        pictures: Any = [torch.rand(3, 100, 100) for _ in range(8)]
-        loader: DataLoader[Any] = DataLoader(pictures, batch_size=4, num_workers=2)
-        with pytest.raises(RuntimeError) as error:
-            list(loader)
-        assert "shared memory is full" in str(resource_error(error.value))
-
-    assert in_child(load) == 0

@@ -267,11 +267,7 @@ class CameraSampler:
     """Draws settings of an ISP whose colour atoms are published cameras, as these are now, on the CPU."""
 
     def __init__(
-        self,
-        cameras: CameraDictionary,
-        tone_atoms: int,
-        lights: LightRange = PHOTOGRAPHS,
-        consistent: bool = True,
+        self, cameras: CameraDictionary, tone_atoms: int, lights: LightRange = PHOTOGRAPHS, consistent: bool = True
     ) -> None:
         self.known, self.atoms, self.responses = (
             tensor.detach().to("cpu", torch.float64).numpy()

@@ -77,12 +77,7 @@ class BakedISP(nn.Module):
 
     @torch.no_grad()
     def colours(
-        self,
-        srgb: Tensor,
-        params: ISPParams,
-        place: Tensor | None = None,
-        white: float = math.inf,
-        shaded: bool = True,
+        self, srgb: Tensor, params: ISPParams, place: Tensor | None = None, white: float = math.inf, shaded: bool = True
     ) -> Tensor:
         """RAW of all three colours at every site, ``(B, 3, H, W)``; without ``shaded`` x4, for :meth:`shade`."""
         _require_batch(srgb, params, place)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -76,20 +73,6 @@ def test_tiles_that_cannot_be_are_refused() -> None:
             tiled(nn.Identity(), torch.zeros(1, 4, 8, 8), tile=32, overlap=overlap)
 
 
-def test_tiles_are_gone_through_one_by_one_for_whoever_counts() -> None:
-    seen, noisy = [], torch.rand(1, 4, 100, 60)
-
-    def each(parts: Sequence[Any]) -> Iterator[Any]:
-        for part in parts:
-            yield part
-            seen.append(len(parts))
-
-    assert torch.equal(tiled(lambda y, _: y, noisy, tile=64, overlap=8, each=each), noisy)
-    assert seen == [2, 2]
-    SelfEnsemble(lambda y, _: y, "RGGB", each=each)(noisy)
-    assert len(seen) > 4 and set(seen[2:]) == {len(seen) - 2}
-
-
 CFAS = list(bayer.CFA)
 SIZES = [(6, 6), (5, 8), (2, 3)]
 
@@ -151,20 +134,6 @@ def test_the_variance_map_is_turned_alike(cfa: bayer.CFA) -> None:
     torch.testing.assert_close(product, noisy * variance)
 
 
-@pytest.mark.parametrize("cfa", CFAS)
-@pytest.mark.parametrize("views", [4, 8])
-def test_views_of_one_shape_share_a_batch(cfa: bayer.CFA, views: int) -> None:
-    shapes = []
-
-    def note(y: Tensor, _: Tensor | None) -> Tensor:
-        shapes.append(y.shape)
-        return y
-
-    SelfEnsemble(note, cfa, views)(picture(3, 4, 6, 6))
-    assert len(shapes) == 4  # each side with and without the added lines
-    assert sum(batch[0] for batch in shapes) == 3 * views
-
-
 def test_a_network_with_a_noise_map_passes_and_bad_settings_are_refused() -> None:
     noisy = picture(1, 4, 9, 12)
     ensemble = SelfEnsemble(UNet(width=4, scales=2), "GRBG")
@@ -200,18 +169,6 @@ def test_the_network_meets_recorrupted_frames_with_their_noise_map() -> None:
     assert float(added.mean()) == pytest.approx(0.0, abs=0.03) and float(added.std()) == pytest.approx(1.0, abs=0.03)
     torch.testing.assert_close(first_map, (1 + ALPHA**2) * (SHOT_VAR * first + READ_VAR), rtol=1e-3, atol=1e-7)
     assert not torch.equal(first, second)
-
-
-def test_the_average_of_many_is_that_of_the_network_over_the_noise() -> None:
-    """Of y^2 it is y^2 plus the variance of what was added, which is that at y^2: one draw is far from it, and the
-    draws are a mean."""
-    noisy, variance = frame()
-    expected = noisy**2 + ALPHA**2 * (SHOT_VAR * noisy**2 + READ_VAR)
-
-    def error(draws: int) -> float:
-        return float((Recorrupted(lambda z, _: z**2, ALPHA, draws)(noisy, variance) - expected).square().mean())
-
-    assert error(64) == pytest.approx(error(1) / 64, rel=0.3)
 
 
 def test_in_shadows_the_extra_noise_does_not_follow_the_noise() -> None:

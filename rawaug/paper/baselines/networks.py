@@ -329,12 +329,7 @@ class InvISP(CropTrainedISP):
     learning_rate = 3e-4
 
     def __init__(
-        self,
-        cfa: CFA | str = "RGGB",
-        blocks: int = 8,
-        growth: int = 32,
-        jpeg_quality: int | None = None,
-        seed: int = 0,
+        self, cfa: CFA | str = "RGGB", blocks: int = 8, growth: int = 32, jpeg_quality: int | None = None, seed: int = 0
     ) -> None:
         super().__init__(cfa)
         self.jpeg_quality = jpeg_quality

@@ -83,13 +83,6 @@ def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: i
 
 
 @pytest.mark.usefixtures("either_way")
-def test_white_is_where_the_sensor_saturates() -> None:
-    isp, srgb = curved_isp(), torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
-    params, baked = isp.choose(srgb), BakedISP(isp)
-    assert torch.equal(baked(srgb, params, white=0.1), baked(srgb, params).clamp(max=0.1))
-
-
-@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("looks", [False, True])
 def test_choice_is_that_of_the_isp(looks: bool) -> None:
     generator = torch.Generator().manual_seed(2)

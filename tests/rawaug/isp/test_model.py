@@ -124,31 +124,6 @@ def test_damaged_files_are_one_line(tmp_path: Path, before: str, after: str, mes
     assert "camera.safetensors" in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
-        ({"white_balance": (2.0, 1.0, float("nan"))}, "white_balance must be positive"),
-        ({"digital_gain": 0.0}, "digital_gain must be positive"),
-        ({"raw_samples": torch.zeros(2, 0, 3)}, "row, column, value"),
-        ({"raw_samples": torch.full((2, 1, 3), float("nan"))}, "NaN"),
-    ],
-)
-def test_what_no_camera_has_is_refused(srgb: torch.Tensor, given: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DictionaryISP().reverse(srgb, **given)
-
-
-def test_pictures_out_of_range_and_parameters_of_others_are_refused(srgb: torch.Tensor) -> None:
-    isp = DictionaryISP()
-    with pytest.raises(ValueError, match="a float picture must be in"):
-        isp.reverse(255.0 * srgb)
-    with pytest.raises(ValueError, match="uint8 or float32"):
-        isp.reverse(srgb.double())
-    with pytest.raises(ValueError, match="the parameters are for 1 pictures, but the batch has 2"):
-        isp.reverse(srgb, isp.choose(srgb[:1]))
-
-
 def test_a_file_s_multipliers_need_no_scale(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
     a, b = (isp.reverse(srgb, white_balance=wb).raw for wb in ((2.0, 1.0, 1.5), (2048.0, 1024.0, 1536.0)))

@@ -73,12 +73,6 @@ def test_gaussian_mask_takes_mean_and_precision() -> None:
     torch.testing.assert_close(mask(place)[0, 0], expected)
 
 
-def test_gaussian_mask_never_brightens() -> None:
-    mask = stages.GaussianMask()
-    mask.set(torch.zeros(2), torch.tensor([[0.5, 0.0], [0.0, -0.5]]))
-    assert mask(stages.place_in_frame(10, 10)).max() <= 1.0
-
-
 class Squeeze(Stage):
     """``x1 = x - s x (1 - x)``, in the place of the tone network."""
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -70,29 +68,6 @@ def test_forked_workers_go_on_where_the_parent_used_threads(two_threads: None) -
     loader = DataLoader(pairs, batch_size=2, num_workers=2, multiprocessing_context="fork", timeout=300)
     for batch in loader:
         assert all(torch.equal(noisy, own) for noisy in batch)
-
-
-FIRST_NORMAL = 0.2447
-"""Of seed 0: with another stream, saved parameters would replay other pairs."""
-
-CHILD = """
-import os, sys
-import torch
-assert "numba" not in sys.modules
-os.environ["NUMBA_DISABLE_JIT"] = "1"
-from rawaug.noise import FixedLevels, ShotReadNoise
-model = ShotReadNoise(FixedLevels(0.0, 1.0))
-params = {"shot_var": torch.zeros(1), "read_var": torch.ones(1), "seed": torch.zeros(1, dtype=torch.int64)}
-out.write_text(str(model.apply(torch.full((1, 4, 1, 1), -9.0), params)[0, 0, 0, 0].item()))
-"""
-
-
-def test_the_same_noise_where_nothing_can_be_compiled(tmp_path: Path) -> None:
-    variables = {"out": tmp_path / "noisy"}
-    process = multiprocessing.get_context("forkserver").Process(target=exec, args=(CHILD, variables))
-    process.start()
-    process.join()
-    assert float(variables["out"].read_text()) == pytest.approx(-9.0 + FIRST_NORMAL, abs=1e-4)
 
 
 def test_code_that_cannot_be_kept_is_compiled_all_the_same() -> None:

@@ -37,13 +37,6 @@ def test_compiled_normals_are_the_defined_ones(size: tuple[int, int]) -> None:
     assert (drawn(KEY, *size) - normals(KEY, *size)).abs().max() < 4e-6
 
 
-def test_moments(sample: Tensor) -> None:
-    n = sample.double()
-    for power, moment in ((1, 0), (2, 1), (3, 0), (4, 3), (5, 0), (6, 15)):
-        spread = math.sqrt(math.prod(range(1, 2 * power, 2)) / n.numel())
-        assert n.pow(power).mean().item() == pytest.approx(moment, abs=4 * spread)
-
-
 def test_distribution(sample: Tensor) -> None:
     for plane in sample:
         assert stats.kstest(plane.flatten().numpy(), "norm").pvalue > 1e-3

@@ -64,11 +64,6 @@ def test_limits_of_iso_leave_out_the_cameras_without_a_share() -> None:
     )
 
 
-def test_broken_rows_are_left_out() -> None:
-    profiles = published_profiles()
-    assert (profiles.table[1:].isfinite()).all() and (profiles.rows >= 1).all()
-
-
 def test_names_reach_the_noise_model() -> None:
     params = noise_model("any camera").sample(4, generator())
     clean = torch.full((4, 4, 8, 8), 0.2)

@@ -49,20 +49,6 @@ def test_crops_keep_the_pattern_in_every_turn(cfa: CFA) -> None:
         assert sample.variance.abs().max() == 0.0
 
 
-def test_a_crop_is_replayed_from_its_generator_alone() -> None:
-    pictures = [torch.randint(0, 256, (3, 40, 48), generator=seeded(k), dtype=torch.uint8) for k in range(3)]
-    upi, noise = UPI("GRBG"), noise_model("cycleisp_sidd")
-    crops = MadeCrops(pictures, lambda x, g: upi.reverse(x, upi.sample(1, g)), upi.cfa, noise, 16)
-    torch.manual_seed(0)
-    before, once = torch.get_rng_state(), crops.draw(seeded(5))
-    assert torch.equal(torch.get_rng_state(), before)
-    torch.manual_seed(1)
-    crops.draw(seeded(6))
-    again, other = crops.draw(seeded(5)), crops.draw(seeded(6))
-    assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
-    assert not torch.equal(once.clean, other.clean)
-
-
 @pytest.fixture
 def scores(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callable[..., Pair]) -> list[list[Pair]]:
     """The test frames of each call of :func:`psnr_d`, two small ones; one is measured whole and one in part."""

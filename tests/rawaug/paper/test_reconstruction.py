@@ -15,7 +15,7 @@ import torch
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig
-from rawaug.paper import methods, reconstruction
+from rawaug.paper import reconstruction
 from rawaug.paper.baselines import Training
 from rawaug.paper.downstream import DownstreamConfig
 from rawaug.paper.reconstruction import Comparison, compare
@@ -231,97 +231,3 @@ def test_frames_that_cannot_make_a_table_are_refused(laboratory: Laboratory, tmp
         with pytest.raises(ValueError, match=message):
             compare(settings(tmp_path, methods=["unet"]))
     assert laboratory.folds == []
-
-
-class Blocks(Laboratory):
-    """Scores over blocks, whose speed is not measured."""
-
-    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        return {"rows": {"blind": 40.0}, "mpix_s": None}
-
-
-def test_blocks_of_unregistered_frames_make_a_table_of_pointwise_methods(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    laboratory = Blocks(monkeypatch)
-    laboratory.frames = 3
-    laboratory.pairs = [replace(pair, registered=False) for pair in laboratory.open_pairs("", "")]
-    rows = compare(settings(tmp_path, methods=["dictionary"]))
-    assert rows["dictionary"]["psnr_r"][0] == 40.0 and rows["dictionary"]["mpix_s"] is None
-
-
-def test_a_fit_to_noise_sees_noisy_frames_and_is_scored_on_clean_ones(
-    frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[Pair, bool]] = []
-    scored: list[Pair] = []
-
-    class Watching(Laboratory):
-        def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
-            seen.extend((pair, fit.noisy) for pair in pairs)
-            return super().fit_family(family, pairs, fit, training)
-
-        def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-            scored.append(pair)
-            return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
-
-    laboratory = Watching(monkeypatch)
-    laboratory.frames = 2
-    clean = laboratory.pairs = [frame_of(f"f{k}") for k in range(2)]
-    compare(settings(tmp_path, methods=["dictionary"], noise="cycleisp_sidd"))
-    assert all(noisy for _, noisy in seen)
-    for pair, _ in seen:
-        assert pair.noisy is not None and 1e-4 < (pair.noisy - pair.raw).std() < 0.1
-    assert all(torch.equal(pair.raw, clean[int(pair.name[1])].raw) for pair in scored)
-    with pytest.raises(ValueError, match="only the dictionary ISP can be fitted to noisy frames"):
-        Comparison(noise="cycleisp_sidd")
-
-
-def test_settings_that_cannot_be_are_refused() -> None:
-    for wrong, message in (
-        ({"methods": ["unett"]}, r"methods: \['unett'\]; choose from dictionary, .*invgrey"),
-        ({"methods": []}, "methods: none; choose from"),
-        ({"seeds": 0}, "seeds must be at least 1, got 0"),
-        ({"patches": 0}, "patches must be at least 1, or null for all, got 0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Comparison(**wrong)
-
-
-class Fitting(Laboratory):
-    """Fits for real without one frame; by its name, all tensors of the camera."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        super().__init__(monkeypatch)
-        self.found: dict[str, dict[str, torch.Tensor]] = {}
-
-    def fit_family(self, family: str, pairs: Sequence[Pair], fit: FitConfig, training: Training) -> Any:
-        left_out = {"a", "b", "c"} - {pair.name for pair in pairs}
-        if not left_out:
-            return SimpleNamespace(model=None)
-        fitted = methods.fit_family(family, pairs, fit, training)
-        self.found[left_out.pop()] = dict(fitted.model.named_parameters()) | dict(fitted.model.named_buffers())
-        return fitted
-
-    def score_rows(self, fitted: Any, pair: Pair, patches: int | None) -> dict[str, Any]:
-        return {"rows": {"blind": 1.0}, "mpix_s": 1.0}
-
-
-def test_a_fit_never_sees_the_frame_that_is_left_out(
-    frame_of: FrameOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames = [frame_of(name) for name in "abc"]
-    noise = torch.rand(1, 256, 256, generator=torch.Generator().manual_seed(0))
-    poisoned = replace(frames[0], srgb=(255 * noise).byte().expand(3, -1, -1), raw=noise, white_balance=(9.0, 1.0, 9.0))
-
-    def cameras(first: Pair, family: str) -> dict[str, dict[str, torch.Tensor]]:
-        laboratory = Fitting(monkeypatch)
-        laboratory.pairs = [first, *frames[1:]]
-        folder = tmp_path / family / str(first is poisoned)
-        compare(settings(folder, methods=[family], seeds=1, patches=1, fit=TINY))
-        return laboratory.found
-
-    for family in ("dictionary", "upi-tuned"):
-        clean, other = cameras(frames[0], family), cameras(poisoned, family)
-        same = {k: all(torch.equal(clean[k][key], other[k][key]) for key in clean[k]) for k in clean}
-        assert same == {"a": True, "b": False, "c": False}
