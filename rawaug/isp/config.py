@@ -1,13 +1,11 @@
-"""An ISP's configuration, the setting of a picture, the result of a pass, and what every ISP can do."""
+"""An ISP's configuration, the setting of a picture, and the result of a pass."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.registry import require_between
@@ -117,44 +115,3 @@ class ISPResult:
     @property
     def srgb(self) -> Tensor:
         return self.image
-
-
-class ReverseISP(nn.Module, ABC):
-    """A way from sRGB to RAW, and back where the method has one."""
-
-    name: ClassVar[str]
-    bidirectional: ClassVar[bool] = True
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.info: dict[str, Any] = {}
-
-    @property
-    @abstractmethod
-    def cfa(self) -> CFA:
-        """Pattern of the RAW that it makes and takes."""
-
-    @property
-    @abstractmethod
-    def reverse_parameters(self) -> int:
-        """Number of parameters of the reverse pass."""
-
-    @abstractmethod
-    def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
-        """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], to the mosaic ``(B, 1, H, W)``."""
-
-    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
-        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
-        return None
-
-    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        """The mosaic under a setting drawn at random; the one of :meth:`make` where the method has no other."""
-        return self.make(srgb)
-
-    @abstractmethod
-    def cycle(self, srgb: Tensor) -> Tensor:
-        """sRGB to RAW and back, ``(B, 3, H, W)`` in [0, 1]."""
-
-    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor | None:
-        """The same without the mosaic between the passes; None for methods that are not pointwise."""
-        return None

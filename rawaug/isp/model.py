@@ -39,8 +39,6 @@ class DictionaryISP(StagedISP):
         torch.Size([2, 1, 64, 96])
     """
 
-    name = "dictionary"
-
     # -- settings ---------------------------------------------------------------------------------------------------
 
     def params_from_weights(
@@ -165,24 +163,6 @@ class DictionaryISP(StagedISP):
             seen: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
-
-    def make(self, srgb: Tensor, setting: ISPParams | None = None, place: Tensor | None = None) -> Tensor:
-        """The mosaic of :meth:`reverse`."""
-        return self.reverse(srgb, setting, place=place).raw
-
-    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
-        return self.make(srgb, self.draw_setting(len(srgb), generator))
-
-    def cycle(self, srgb: Tensor) -> Tensor:
-        """Through the mosaic, within [0, 1], and back."""
-        result = self.reverse(srgb)
-        return self.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
-
-    def cycle_without_mosaic(self, srgb: Tensor) -> Tensor:
-        """What the stages alone lose."""
-        x = stages.as_float(srgb)
-        params = self.choose(x)
-        return self.forward_pixels(self.reverse_pixels(x, params), params).clamp(0.0, 1.0)
 
     # -- as numbers -------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rawaug.bayer import CFA
-from rawaug.isp.config import ISPConfig, ISPParams, ReverseISP
+from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary
 from rawaug.isp.stages import Stage
 from rawaug.isp.tone import ToneCurve, ToneDictionary
@@ -83,11 +83,13 @@ def thumbnail(image: Tensor) -> Tensor:
     return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
 
 
-class StagedISP(ReverseISP):
+class StagedISP(nn.Module):
     """Stages, dictionaries and encoders; :class:`rawaug.isp.model.DictionaryISP` adds the choice of a setting."""
 
     def __init__(self, config: ISPConfig | None = None, seed: int = 0) -> None:
         super().__init__()
+        self.info: dict[str, Any] = {}
+        """What a fit recorded."""
         self.config = config or ISPConfig()
         """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
         with initialised_from(seed):
@@ -113,13 +115,6 @@ class StagedISP(ReverseISP):
     def find(self, kind: type[S]) -> S | None:
         """The stage of this class, or None."""
         return next((stage for stage in self.ordered_stages if isinstance(stage, kind)), None)
-
-    @property
-    def reverse_parameters(self) -> int:
-        """Number of parameters of the reverse pass."""
-        names = (name for name, _ in self.named_parameters())
-        reverse = [name for name in names if not name.startswith("forward_") and ".forward_" not in name]
-        return sum(self.get_parameter(name).numel() for name in reverse)
 
     def configure(self, **changes: Any) -> None:
         """Change settings that need no new parameters: ``cfa``, ``knee``, or ``stages`` to fewer of them."""

@@ -40,7 +40,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.metrics import psnr, worst_and_best_quarter
 from rawaug.paper.frames import synthetic_frames
-from rawaug.paper.methods import resumed
+from rawaug.paper.methods import cycled_without_mosaic, resumed, reverse_parameters
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS, checked_settings
 from rawaug.seeding import keyed_generator
@@ -286,7 +286,7 @@ def variant_scores(place: Path, config: FitConfig, frames: Sequence[Pair], left_
         isp = fit_isp(frames, config, progress=False, state=place.with_suffix(".state"))
         scores = [score(isp, pair) for pair in left_out]
         by_name = {name: [one[name] for one in scores] for name in scores[0]}
-        return {"joint": isp.info.get("joint"), "parameters": isp.reverse_parameters, **by_name}
+        return {"joint": isp.info.get("joint"), "parameters": reverse_parameters(isp), **by_name}
 
     return resumed(place, fingerprint("learned", asdict(config), sums), measured)
 
@@ -301,7 +301,7 @@ def score(isp: DictionaryISP, pair: Pair) -> dict[str, float]:
         "psnr_r": psnr_r(isp, pair),
         "as_shot": psnr_r(isp, pair, white_balance=True),
         "forward": float(-10.0 * forward.log10()),
-        "cycle": psnr(isp.cycle_without_mosaic(srgb), srgb).item(),
+        "cycle": psnr(cycled_without_mosaic(isp, srgb), srgb).item(),
     }
 
 

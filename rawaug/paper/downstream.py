@@ -22,10 +22,10 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Sample, SomePairs
 from rawaug.evaluation.scores import Score, score_denoiser
-from rawaug.isp.config import ReverseISP
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
+from rawaug.paper.methods import Method
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.seeding import derived_seed, keyed_generator
@@ -85,7 +85,7 @@ def mean_of(scores: Sequence[Score]) -> DownstreamScore:
     return DownstreamScore(fmean(score.psnr for score in scores), fmean(developed))
 
 
-def psnr_d(model: ReverseISP, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
+def psnr_d(model: Method, pictures: Sequence[Tensor], config: DownstreamConfig, place: Path, seed: int) -> float:
     """Train a denoiser on what ``model`` makes of ``pictures``; its mean PSNR on the test frames."""
     net = trained_on(_crops(model, pictures, noise_model(config.noise), config), config, place, seed)
     return score_on(net, config, CFA(model.cfa)).psnr
@@ -110,7 +110,7 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     return mean_of(scores)
 
 
-def _crops(model: ReverseISP, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
+def _crops(model: Method, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:
     if not isinstance(model, DictionaryISP):
         return MadeCrops(pictures, model.draw, model.cfa, noise, config.train.crop)
     # The plugin keeps each crop's place in its frame.

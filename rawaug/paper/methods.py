@@ -44,14 +44,14 @@ from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.files import find_weights, write_json
 from rawaug.isp import conditioning
-from rawaug.isp.config import ISPParams, ReverseISP
+from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame, placed
 from rawaug.metrics import PATCH, psnr
 from rawaug.paper.baselines import BASELINES, Training, fit_baseline
-from rawaug.paper.baselines.base import CropTrainedISP
+from rawaug.paper.baselines.base import BaselineISP, CropTrainedISP
 from rawaug.seeding import keyed_generator
 
 FAMILIES = ("dictionary", "dictionary-encoders", *BASELINES)
@@ -59,8 +59,11 @@ ROWS = {"as-shot": "as-shot gains", "samples": "64 RAW samples", "oracle": "orac
 SAMPLES = 64
 
 
+Method = BaselineISP | DictionaryISP
+
+
 class Fitted(NamedTuple):
-    model: ReverseISP
+    model: Method
     seconds: float
     parameters: int
 
@@ -97,15 +100,22 @@ def fit_family(family: str, pairs: Sequence[Pair], config: FitConfig, training: 
         isp = DictionaryISP.from_pretrained(family)
         if isp.cfa != CFA(pairs[0].cfa):
             raise ValueError(f"{family}: makes {isp.cfa.value} RAW, but the frames are {CFA(pairs[0].cfa).value}")
-        return Fitted(isp, 0.0, isp.reverse_parameters)
+        return Fitted(isp, 0.0, reverse_parameters(isp))
     if family.startswith("dictionary"):
         config = replace(config, seed=training.seed, encoders="on" if family == "dictionary-encoders" else "off")
         isp = fit_isp(pairs, config)
-        return Fitted(isp, time.perf_counter() - start, isp.reverse_parameters)
+        return Fitted(isp, time.perf_counter() - start, reverse_parameters(isp))
     method = BASELINES[family]
     start_of: dict[str, Any] = {"seed": training.seed} if issubclass(method, CropTrainedISP) else {}
     model = fit_baseline(method(cfa=pairs[0].cfa, **start_of), pairs, training)
-    return Fitted(model, time.perf_counter() - start, model.reverse_parameters)
+    return Fitted(model, time.perf_counter() - start, reverse_parameters(model))
+
+
+def reverse_parameters(model: Method) -> int:
+    """Number of parameters of the reverse pass."""
+    network = model.reverse_network if isinstance(model, BaselineISP) else model
+    named = network.named_parameters()
+    return sum(p.numel() for name, p in named if not name.startswith("forward_") and ".forward_" not in name)
 
 
 def score_rows(fitted: Fitted, pair: Pair, patches: int | None) -> dict[str, Any]:
@@ -129,17 +139,19 @@ def balanced_rows(fitted: Fitted, pair: Pair) -> dict[str, float]:
     return {row: balanced_psnr(make, pair) for row, make in _makers(fitted.model, pair).items()}
 
 
-def _makers(model: ReverseISP, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
+def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], Tensor]]:
     """Row to the function from an sRGB patch and its place in the frame to a mosaic."""
 
     def maker(given: Any) -> Callable[[Tensor, Tensor], Tensor]:
-        return lambda patch, place: model.make(patch, given, place)
+        if isinstance(model, DictionaryISP):
+            return lambda patch, place: model.reverse(patch, given, place=place).raw
+        return lambda patch, place: model.reverse(patch, given)
 
     return {row: maker(given) for row, given in settings(model, pair).items()}
 
 
 @singledispatch
-def settings(model: ReverseISP, pair: Pair) -> dict[str, Any]:
+def settings(model: BaselineISP, pair: Pair) -> dict[str, Any]:
     """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
     balanced = model.balanced(pair.white_balance) if pair.balance_known else None
     return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})
@@ -184,15 +196,22 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 @torch.no_grad()
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
     """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back."""
-    model, through, without = fitted.model, [], []
-    if not model.bidirectional:
-        return {}
-    for picture in pictures:
-        x = as_float(picture[None])
-        through.append(psnr(model.cycle(x), x).item())
-        if (back := model.cycle_without_mosaic(x)) is not None:
-            without.append(psnr(back, x).item())
-    return {"cycle": fmean(through)} | ({"cycle_without_mosaic": fmean(without)} if without else {})
+    model, shown = fitted.model, [as_float(picture[None]) for picture in pictures]
+    if isinstance(model, DictionaryISP):
+        without = fmean(psnr(cycled_without_mosaic(model, x), x).item() for x in shown)
+        return {"cycle": fmean(psnr(_cycled(model, x), x).item() for x in shown), "cycle_without_mosaic": without}
+    return {"cycle": fmean(psnr(model.cycle(x), x).item() for x in shown)} if model.bidirectional else {}
+
+
+def _cycled(isp: DictionaryISP, srgb: Tensor) -> Tensor:
+    result = isp.reverse(srgb)
+    return isp.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
+
+
+def cycled_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:
+    """sRGB to x5 and back: what the stages alone lose."""
+    params = isp.choose(srgb)
+    return isp.forward_pixels(isp.reverse_pixels(srgb, params), params).clamp(0.0, 1.0)
 
 
 def mosaic_only_psnr(pictures: Sequence[Tensor], cfa: CFA | str = "RGGB") -> float:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -24,7 +24,6 @@ from torch import Tensor, nn
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.isp.config import ReverseISP
 from rawaug.isp.fit.descent import adam
 from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
@@ -61,28 +60,32 @@ class Training:
         return max(by_time, 0.0 if self.steps is None else steps / self.steps)
 
 
-class BaselineISP(ReverseISP):
+class BaselineISP(nn.Module, ABC):
     """A method that the dictionary ISP is compared with; ``cfa`` is the pattern of the RAW that it makes and takes.
 
     The ``setting`` of a pass is what the method may be told of the shot, such as its gains; without, it takes its own.
     """
 
+    name: ClassVar[str]
+    bidirectional: ClassVar[bool] = True
+
     def __init__(self, cfa: CFA | str = "RGGB") -> None:
         super().__init__()
-        self._cfa = CFA(cfa)
-
-    @property
-    def cfa(self) -> CFA:
-        return self._cfa
+        self.cfa = CFA(cfa)
+        self.info: dict[str, Any] = {}
 
     @property
     def reverse_network(self) -> nn.Module:
         """The part that the reverse pass uses: what the published numbers of parameters count."""
         return self
 
-    @property
-    def reverse_parameters(self) -> int:
-        return sum(parameter.numel() for parameter in self.reverse_network.parameters())
+    def balanced(self, white_balance: tuple[float, float, float]) -> Any:
+        """The setting with these as-shot multipliers R, G, B; None for a method that has no use for them."""
+        return None
+
+    def draw(self, srgb: Tensor, generator: torch.Generator) -> Tensor:
+        """The mosaic under a setting drawn at random, where the method has others than its own."""
+        return self.reverse(srgb)
 
     def learn(self, pairs: Sequence[FramePair], training: Training) -> tuple[int, float]:
         """Fit to the pairs; the number of steps and the last loss. A method as published has nothing to fit."""
@@ -101,9 +104,6 @@ class BaselineISP(ReverseISP):
     def reverse(self, srgb: Tensor, setting: Any = None) -> Tensor:
         """sRGB ``(B, 3, H, W)``, uint8 or float in [0, 1], even sides, to the mosaic ``(B, 1, H, W)`` in [0, 1]."""
         return bayer.mosaic(self.unprocess(as_float(srgb), setting).clamp(0.0, 1.0), self.cfa)
-
-    def make(self, srgb: Tensor, setting: Any = None, place: Tensor | None = None) -> Tensor:
-        return self.reverse(srgb, setting)
 
     def forward(self, raw: Tensor, setting: Any = None) -> Tensor:
         """RAW mosaic ``(B, 1, H, W)`` in :attr:`cfa` to sRGB ``(B, 3, H, W)`` in [0, 1]."""

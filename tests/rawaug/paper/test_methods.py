@@ -97,7 +97,7 @@ def test_the_shots_gains_take_the_place_of_the_methods_own(method: Any, frame_of
 def made(model: Any, pair: Pair, light: tuple[float, float, float]) -> torch.Tensor:
     """The mosaic of a dim grey picture in the as-shot row of a frame of this light."""
     with torch.no_grad():
-        mosaic: torch.Tensor = model.make(torch.full((1, 3, 8, 8), 0.5), methods.settings(model, pair)["as-shot"])
+        mosaic: torch.Tensor = model.reverse(torch.full((1, 3, 8, 8), 0.5), methods.settings(model, pair)["as-shot"])
     return mosaic
 
 
