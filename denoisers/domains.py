@@ -8,13 +8,10 @@ ksigma      :math:`u = y / s + r / s^2`, scaled to ISO 1600  variance u: one cam
 anscombe    :math:`z = 2 \sqrt{u + 3/8}`                     variance 1 everywhere
 ==========  ===============================================  ====================================================
 
-After a transform every exposure of every camera is the same problem. The network is trained to give the transformed
-*clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on as its tangent, so that it stays
-invertible for any noise. Photons are counted with s of at least the domain's ``least_shot``; a noise map then holds the
-noise's deviation relative to that, which is 1 for stronger noise.
-
-Sources: Wang et al., "Practical Deep Raw Image Denoising on Mobile Devices", ECCV 2020 (k-sigma; its anchor is ISO 1600
-of a Reno-10x on a scale with white at 959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
+The network gives the transformed *clean* signal, so the algebraic inverse has no bias. Below ``u = 0`` the root goes on
+as its tangent. Photons are counted with s of at least the domain's ``least_shot``; a noise map then holds the noise's
+deviation relative to that. Sources: Wang et al., ECCV 2020 (k-sigma; its anchor is ISO 1600 of a Reno-10x with white at
+959); Starck, Murtagh and Bijaoui 1998 (generalised Anscombe transform).
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.data.pairs import Pair
-from rawaug.isp import conditioning
+from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
@@ -36,12 +36,12 @@ def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches:
     pair.require_rendered()
     given = pair.white_balance if white_balance else None
     if pair.registered:
-        params = conditioning.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
+        params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
         if patches is not None:
             return windows_psnr(lambda patch, place: isp.reverse(patch, params, place=place).raw, pair, patches)
         return patch_psnr(mosaic_of(isp, pair, params), pair.raw[None]).item()
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
-    params = conditioning.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
+    params = staged.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
     made = isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0]
     return block_psnr(made, blocks.raw, blocks.clipped)
 

@@ -4,20 +4,18 @@ A camera is a 3 x 3 matrix M from CIE XYZ to its linear RGB. Its response to a l
 
 .. math:: \mathrm{wb} = (M L)_G / (M L), \qquad C = \mathrm{diag}(M S 1)^{-1} M S
 
-with S from linear sRGB to XYZ: the rows of C sum to 1, so white stays white and the gains carry all of the balance,
-as in dcraw and in Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019. The matrices are those of
-LibRaw and rawspeed, most of them Adobe's for D65; under other lights they are an approximation, as in those developers.
+with S from linear sRGB to XYZ: the rows of C sum to 1, so white stays white and the gains carry all of the balance
+(Brooks et al., CVPR 2019). The matrices are those of LibRaw and rawspeed, most of them Adobe's for D65; under other
+lights they are an approximation, as in those developers.
 
-A light is drawn at a correlated colour temperature T, uniform in the reciprocal :math:`10^6 / T` (mired), in which
-equal steps look alike; or, as most photographs are taken, by day, on the daylight locus at T near 5,300 K. On the
-Planckian locus (Krystek, "An algorithm to calculate correlated colour temperature", 1985)
+A light is drawn uniformly in mired, :math:`10^6 / T` of its colour temperature T; or, as most photographs are taken, on
+the daylight locus at T near 5,300 K. On the Planckian locus (Krystek, 1985)
 
 .. math:: u = \frac{0.860117757 + 1.54118254 \cdot 10^{-4} T + 1.28641212 \cdot 10^{-7} T^2}
                    {1 + 8.42420235 \cdot 10^{-4} T + 7.08145163 \cdot 10^{-7} T^2}
 
 and v alike; on the daylight locus :math:`y = -3 x^2 + 2.87 x - 0.275` (CIE 15:2018, 4,000 to 25,000 K). Real lights lie
-a little off both: a step Duv along the normal of the locus in CIE 1960 (u, v), positive towards green. Fluorescent and
-LED lamps are those that the CIE tabulates.
+a step Duv off both, along the normal in CIE 1960 (u, v), positive towards green.
 """
 
 from __future__ import annotations

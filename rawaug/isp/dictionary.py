@@ -1,20 +1,15 @@
 r"""Dictionaries of camera parameters: atoms, their convex hull, and settings drawn from it.
 
-``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (non-negative, sum 1).
-Combining colour matrices equals combining the N transformed images (Conde et al., AAAI 2022, "Parameter Dictionaries").
-For gains that holds below the highlights; there Brooks' rule takes the larger of two factors, gain by gain, which is
-not linear where the gains of the atoms lie on both sides of 1.
-
-Colour atoms act in the reverse direction, sRGB to camera; each row of theirs (a column in the paper, where pixels are
-row vectors) has l1 norm 1, so that with no negative entry white stays white and the gains carry all of the white
-balance. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
+``C = sum_i w_i D_ccm[i]`` and ``1 / g = sum_i w_i / D_wb[i]``, with ``w`` on the simplex (Conde et al., AAAI 2022,
+"Parameter Dictionaries"). Colour atoms act from sRGB to camera; each row of theirs (a column in the paper, where pixels
+are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
 
 *The hull.* Two matrices C and C' differ on pictures of second moment :math:`S = E[x x^T]`, x in linear sRGB, by
 
-.. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 .
+.. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 ,
 
-In the coordinates :math:`C S^{1/2} / \sqrt 3` that is a squared Euclidean distance, and the best mixture the projection
-on the hull of the atoms, found by accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
+a squared distance in the coordinates :math:`C S^{1/2} / \sqrt 3`. The best mixture is the projection on the hull of the
+atoms, found by accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
 
 *Sampling.* One draw is a camera in a light, not a colour matrix and gains on their own:
 
@@ -23,10 +18,8 @@ on the hull of the atoms, found by accelerated projected gradients (Beck and Teb
 
 with h Brooks' highlight-preserving inverse gains, w a mixture of two of the cameras that the hull was made for, a light
 L (:mod:`rawaug.isp.cameras`), a mixture v of up to three inverse tone curves, and e an exposure in stops. The smallest
-gain is 1, as in cameras and LibRaw, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet
-distribution of concentration 1/2, which crowds its ends: most draws are near one camera, and tone is near one curve or
-between two. Flat weights of all atoms would crowd the middle of the hull, and a few atoms at a time its corners, where
-cameras are rare.
+gain is 1, so that clipped RAW develops to white. Shares of a mixture follow the Dirichlet distribution of concentration
+1/2, so that most draws are near one camera: flat weights would crowd the middle of the hull, where cameras are rare.
 """
 
 from __future__ import annotations

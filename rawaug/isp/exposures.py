@@ -1,24 +1,19 @@
-r"""Exposures of a scene, merged or scaled in RAW.
+"""Exposures of a scene, merged or scaled in RAW.
 
-The reverse pass takes a picture of exposure t (2^EV) to RAW y = t E, with E the RAW of the scene at 0 EV. Pictures k of
-one scene give at each pixel
+Pictures k of one scene, of exposures t_k (2^EV) and RAW y_k = t_k E, give at each pixel the RAW E at 0 EV
 
     E = sum_k m_k y_k / sum_k m_k t_k,        m_k = clip((0.95 - max_c x_k) / 0.1, 0, 1),
 
-the maximum-likelihood estimate under Poisson statistics, as photons are summed over summed exposure, of what m_k
-keeps: a pixel whose brightest sRGB channel comes close to white may be clipped. Where every picture is, the shortest
-exposure alone decides. Merging of exposures: Debevec and Malik, "Recovering High Dynamic Range Radiance Maps from
-Photographs", SIGGRAPH 1997; there the response is solved for, here it is the ISP's.
+the maximum-likelihood estimate under Poisson statistics of what m_k keeps: a pixel whose brightest sRGB channel comes
+close to white may be clipped. Where every picture is, the shortest exposure alone decides (after Debevec and Malik,
+SIGGRAPH 1997).
 
 On the way to sRGB, RAW is scaled by 2^EV, and by f(L) / L where its largest linear channel L exceeds middle grey a:
 
     f(L) = a + (1 - a) g((L - a) / (1 - a)),        g(u) = u (1 + u / v^2) / (1 + u),
 
-with g from Reinhard et al., "Photographic Tone Reproduction for Digital Images", SIGGRAPH 2002, eq. 4, and v such that
-f takes the scene's white to 1. Without highlights above 1, f is the identity.
-
-RAW has all three colours at every pixel here (x5, before the mosaic): merging and scaling act on each value alone, and
-so commute with the mosaic, but no detail is lost to demosaicing.
+with g from Reinhard et al., SIGGRAPH 2002, eq. 4, and v such that f takes the scene's white to 1. RAW has all three
+colours at every pixel here (x5): merging and scaling commute with the mosaic, but no detail is lost to demosaicing.
 """
 
 from __future__ import annotations

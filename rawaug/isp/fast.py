@@ -3,21 +3,17 @@ r"""The fitted passes as a table and a matrix each: the same RAW and the same sR
 ``y_c = sum_k C[c, k] T_k(x) * max(m + (1 - m) / g_c, 1 / g_c) * G(p) A(x4)``
 
 Tone network and gamma are the same for every picture, and pointwise: ``T`` is their table over the sRGB cube, read by
-trilinear interpolation (65 nodes a side: above 75 dB against the network). Colour and gains are one matrix and three
-numbers a picture, and the mask is a function of the coordinates. Every site computes its own colour alone, which the
-mosaic would keep anyway, so the result comes packed. The attention mask, pointwise in x4, needs all three colours and
-has a table of its own.
+trilinear interpolation (65 nodes a side: above 75 dB against the network), and so is the attention mask ``A``. Colour
+and gains are one matrix and three numbers a picture. Every site computes its own colour alone, hence packed RAW.
 
 The forward pass of demosaiced RAW is ``x = T'(sqrt(pinv(C) min(g x5 / G(p) A', min g)))``, with the forward network
 and gamma in a table over the roots of linear light, or the picture's own tone curve inverted.
 
-The encoders' choice of a setting is made cheap as well. They look at the N images that the atoms make of one picture,
-which are linear in a few maps,
+The encoders look at the N images that the atoms make of one picture, which are linear in a few maps,
 
 .. math:: D_n x_2 \quad\text{and}\quad x_3 (floor_n + m \, rise_n) = floor_n x_3 + rise_n (m x_3),
 
-and so is a convolution of them: one of 3 maps, or 6, instead of 3 N, with the same result (symbols as in
-:mod:`rawaug.kernels.reference`).
+and so their first layer is a convolution of 3 maps, or 6, instead of 3 N, with the same result.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
-from rawaug.isp import conditioning, stages
+from rawaug.isp import staged, stages
 from rawaug.isp.cameras import light_range
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
@@ -111,7 +111,7 @@ class DictionaryISP(StagedISP):
                 choose the colour atoms of such light as well.
             digital_gain: the factor on all channels, scalar or ``(B,)``; the fit's own by default.
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
-                (:func:`rawaug.isp.conditioning.with_raw_samples`).
+                (:func:`rawaug.isp.staged.with_raw_samples`).
             place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
                 (:func:`rawaug.isp.stages.place_in_frame`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
@@ -127,11 +127,11 @@ class DictionaryISP(StagedISP):
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
         with self._float32(srgb):
             x = stages.display_referred(srgb)
-            params = conditioning.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
+            params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
             if len(params.gains) != len(x):
                 raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
             if raw_samples is not None:
-                params = conditioning.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
+                params = staged.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
             seen: dict[str, Tensor] = {}
             x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
             return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
@@ -159,7 +159,7 @@ class DictionaryISP(StagedISP):
             x5 = bayer.demosaic(_scene_referred(raw), self.cfa)
             if params is None:
                 params = self.choose_forward(self.unshaded(x5, place))
-            params = conditioning.with_white_balance(self, params, white_balance, None)
+            params = staged.with_white_balance(self, params, white_balance, None)
             seen: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
         return ISPResult(srgb.clamp(0.0, 1.0), params, seen if intermediates else {})
@@ -171,7 +171,7 @@ class DictionaryISP(StagedISP):
         encoders = self.reverse_encoders
         weights = [encoder.prior.softmax(0)[None] for encoder in (encoders.colour, encoders.gain)]
         given = None if white_balance is None else tuple(white_balance)
-        return conditioning.with_white_balance(self, self.params_from_weights(*weights), given, None)
+        return staged.with_white_balance(self, self.params_from_weights(*weights), given, None)
 
     @torch.no_grad()
     def reverse_table(self, setting: ISPParams, nodes: int = 33) -> Tensor:

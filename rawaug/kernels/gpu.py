@@ -27,32 +27,13 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     entries = camera.curves.shape[1] if camera.curves.numel() else 0
     scale = ((entries or nodes) - 1) / (255.0 if srgb.dtype == torch.uint8 else 1.0)
     sites = [i + 2 * j + 4 * channel for i, j, channel in camera.sites.tolist()]
+    tensors = [part.contiguous() for part in camera if isinstance(part, Tensor)][:-1]  # all but the sites
     with torch.cuda.device_of(srgb):  # which need not be the current one
         _raw_cells[(triton.cdiv(h * w, _RAW_BLOCK), batch)](
-            srgb.contiguous(),
-            camera.table,
-            camera.curves.contiguous(),
-            camera.attention,
-            camera.colour.contiguous(),
-            camera.frame.contiguous(),
-            camera.shading,
-            raw,
-            h,
-            w,
-            scale,
-            camera.knee,
-            white,
-            NODES=nodes,
-            S0=sites[0],
-            S1=sites[1],
-            S2=sites[2],
-            S3=sites[3],
-            ENTRIES=entries,
-            ATTENDS=camera.attention.numel() > 0,
-            SHADES=camera.shading.numel() > 0,
-            BLOCK=_RAW_BLOCK,
-            enable_fp_fusion=True,
-        )
+            srgb.contiguous(), *tensors, raw, h, w, scale, camera.knee, white, *sites,
+            NODES=nodes, ENTRIES=entries, ATTENDS=camera.attention.numel() > 0, SHADES=camera.shading.numel() > 0,
+            BLOCK=_RAW_BLOCK, enable_fp_fusion=True,
+        )  # fmt: skip
     return raw
 
 
@@ -175,17 +156,9 @@ def shot_read(
     grid = (triton.cdiv(height * width, _NOISE_BLOCK), batch)
     with torch.cuda.device_of(clean):  # which need not be the current one
         _noise_cells[grid](
-            clean,
-            variances,
-            signed,
-            noisy,
-            variance,
-            height * width,
-            white,
-            with_variance,
-            BLOCK=_NOISE_BLOCK,
-            enable_fp_fusion=True,
-        )
+            clean, variances, signed, noisy, variance, height * width, white, with_variance,
+            BLOCK=_NOISE_BLOCK, enable_fp_fusion=True,
+        )  # fmt: skip
     return noisy, variance
 
 

@@ -2,21 +2,18 @@ r"""A camera's own noise, measured on its RAW files: photon transfer on flat blo
 
 .. math:: \operatorname{var} = \mathrm{shot\_var} \cdot \operatorname{mean} + \mathrm{read\_var}
 
-is fitted to local mean and local variance on same-colour sites (Janesick, "Photon transfer", 2007; on scenes that are
-not charts: Foi et al. 2008). Each packed plane is cut into 8 x 8 blocks and transformed by the orthonormal DCT, where
-white noise has the same variance in every coefficient and texture is strongest in the low ones. Low coefficients say
-whether a block is flat, high ones how noisy it is (Ponomarenko et al., "An automatic approach to lossy compression of
-AVIRIS images", 2007): as they are independent, the choice does not bias the measure. The first row and column are not
-used, so that banding does not count. A level whose noise is not white, smoothed by a codec or mixed with texture, is
-left out. Noise that a codec quantised coarsely can be white and yet not the sensor's: do not trust ``read_var``, a
-small remainder in the shadows, on such files.
+is fitted to local mean and variance on same-colour sites (Janesick, "Photon transfer", 2007; Foi et al. 2008). Each
+packed plane is cut into 8 x 8 blocks and transformed by the orthonormal DCT, where white noise has the same variance in
+every coefficient. Low coefficients say whether a block is flat, high ones how noisy it is (Ponomarenko et al., 2007):
+as they are independent, the choice does not bias the measure. The first row and column are not used, so that banding
+does not count. A level whose noise is not white, smoothed by a codec or mixed with texture, is left out; do not trust
+``read_var`` on files that a codec quantised coarsely.
 
-Without light, in frames with the lens capped, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours
-of one colour hold n alone, twice its variance; those between the means of successive sensor rows hold the banding as
-well (after Wei et al. 2020). Slow gradients such as amplifier glow cancel in both.
+With the lens capped, :math:`y = b_c + r_{row} + n`. Differences between horizontal neighbours of one colour hold n
+alone, twice its variance; those between the means of successive sensor rows hold the banding as well (after Wei et al.
+2020). Slow gradients cancel in both.
 
-Signals are black-subtracted, white = 1. The variance that rounding to the sensor's grid adds (a twelfth of a squared
-step) is part of ``read_var``.
+Signals are black-subtracted, white = 1; the variance of rounding to the sensor's grid is part of ``read_var``.
 """
 
 from __future__ import annotations

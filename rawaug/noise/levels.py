@@ -4,17 +4,15 @@ A published preset draws shot_var log-uniformly and read_var around a line in th
 
 .. math:: \log \mathrm{read\_var} = a \log \mathrm{shot\_var} + b + N(0, \sigma^2)
 
-(Brooks et al., "Unprocessing images for learned raw denoising", 2019). The logarithm is natural in some sources and
-base 10 in others, with the same constants; each preset keeps its own.
-
-A measured camera has levels by ISO. With a gain of K digital numbers (DN) an electron, V DN from black to white and
-read noise of :math:`\sigma` DN,
+(Brooks et al., 2019), natural in some sources and of base 10 in others; each preset keeps its own. A measured camera
+has levels by ISO: with a gain of K digital numbers (DN) an electron, V DN from black to white and read noise of
+:math:`\sigma` DN,
 
 .. math:: \mathrm{shot\_var} = K / V, \qquad \mathrm{read\_var} = \sigma^2 / V^2 .
 
-Three published sets: five phones of SIDD, tabulated per ISO (Abdelhamed et al. 2018; the numbers of Noise Flow, 2019),
-the line of PMRID for one phone (Wang et al. 2020), and the log-linear laws of ELD for five cameras (Wei et al. 2020).
-Outside the measured range an ISO is refused; without an ISO the whole range is sampled, log-uniformly.
+Published are five phones of SIDD (Abdelhamed et al. 2018; the numbers of Noise Flow, 2019), the line of PMRID for one
+phone (Wang et al. 2020), and the log-linear laws of ELD for five cameras (Wei et al. 2020). Outside the measured range
+an ISO is refused; without an ISO the whole range is sampled, log-uniformly.
 """
 
 from __future__ import annotations

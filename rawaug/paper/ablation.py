@@ -31,7 +31,7 @@ from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free
 from rawaug.files import fingerprint, write_json
-from rawaug.isp import conditioning
+from rawaug.isp import staged
 from rawaug.isp.config import POINTWISE_STAGES
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import cycle_error
@@ -128,7 +128,7 @@ def stage_psnr(isp: DictionaryISP, pair: Pair, white_balance: bool) -> list[list
     """PSNR of x, x1 ... x5 (a stage that is left out repeats the one before) in RGB, Y and UV: 6 rows of 3."""
     srgb, raw, place, known = _comparable(pair)
     given = pair.white_balance if white_balance else None
-    params = conditioning.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
+    params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
     seen: dict[str, Tensor] = {}
     isp.reverse_pixels(srgb, params, place, seen)
     rows, image = [], srgb

@@ -1,17 +1,13 @@
 r"""Frames made for a comparison: of published cameras in many lights, and with pictures that the camera did not make.
 
-*Synthetic* frames are photographs as scenes before the demo camera's lens and sensor. A frame's colour is
-``C = colour_matrix(M)`` and ``wb(M, L)`` of :mod:`rawaug.isp.cameras` for a camera's published matrix M and a light L
-drawn as there; blur, shading, exposure, converter and rendering are those of :class:`rawaug.data.DemoCamera`, which
-shares no code with the ISPs that are fitted to its frames.
-
-*Perturbed* frames are overexposed: the shot with ``2^s`` times the light, RAW and picture clipped at white,
+*Synthetic* frames are photographs as scenes before the demo camera's lens and sensor, in the colour
+``C = colour_matrix(M)`` and the balance ``wb(M, L)`` of a published camera M and a light L drawn as in
+:mod:`rawaug.isp.cameras`. *Perturbed* frames are overexposed by s stops, RAW and picture clipped at white,
 
 .. math:: y' = \min(2^s y, 1), \qquad x' = E(\min(2^s D(x), 1))
 
-with the sRGB curve E and its inverse D (IEC 61966-2-1). Or they are retouched: the RAW stays, the picture is given an S
-curve, ``x + c (3 x^2 - 2 x^3 - x)``, and more saturated colour, ``Y + k (x - Y)`` with the luma Y of ITU-R BT.709, as
-after an edit by hand.
+with the sRGB curve E and its inverse D; or retouched: the RAW stays, the picture is given an S curve,
+``x + c (3 x^2 - 2 x^3 - x)``, and more saturated colour, ``Y + k (x - Y)`` with the luma Y of ITU-R BT.709.
 """
 
 from __future__ import annotations

@@ -1,26 +1,23 @@
 r"""The methods of the reconstruction table, on equal terms: fitted to the same pairs, scored on the same patches.
 
 A family is fitted once and may fill several rows: the dictionary ISP blind, with the as-shot white balance, with 64 RAW
-samples, and with the best setting that can be found (oracle), the limit of the dictionaries. A shipped ISP, or the file
-of one, is a method that is not fitted.
+samples, and with the best setting that can be found (oracle). A shipped ISP, or the file of one, is not fitted.
 
 The oracle is the setting of an ISP that comes closest to a frame's RAW,
 
 .. math:: \min_{w, v, g} \; \log \bigl( \| y - f^{-1}(x; w, v, g) \|^2 / P + \epsilon \bigr)
 
-over the weights of the atoms and, for an ISP of published cameras, the gains, which there follow from any light.
-Descent starts where alternating least squares end (:mod:`rawaug.isp.conditioning`), with all P pixels for readings. A
-fitted ISP's gains stay within the hull of its own, and descent starts from the middle of the hulls. The settings of
-rows that know less are compared as well: none of them is better than the oracle.
+over the weights of the atoms and, for an ISP of published cameras, the gains. Descent starts where alternating least
+squares end (:mod:`rawaug.isp.staged`), with all P pixels for readings; of a fitted ISP, whose gains stay within
+the hull of its own, from the middle of the hulls. The settings of rows that know less are compared as well.
 
 InvISP's figure on MIT-Adobe FiveK is the PSNR of demosaiced, white-balanced and gamma-compressed RAW,
 
 .. math:: z(y) = \left(\frac{w}{\max w} \, \mathrm{demosaic}(y)\right)^{1/2.2}, \qquad
     \mathrm{PSNR} = -10 \log_{10} \mathrm{mean} (z(\hat y) - z(y))^2
 
-with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1], over the three channels of
-each of a frame's 3 x 3 equal pieces, of which the mean is taken. Source: Y. Xing, Z. Qian, Q. Chen, "Invertible image
-signal processing", CVPR 2021, and the authors' published scripts. Pieces begin at even sites here.
+with the as-shot white balance w, bilinear interpolation and :math:`\hat y` within [0, 1]: the mean over a frame's 3 x 3
+equal pieces, which begin at even sites here. Source: Xing et al., CVPR 2021, and the authors' published scripts.
 """
 
 from __future__ import annotations
@@ -43,7 +40,7 @@ from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.psnr_r import block_psnr, psnr_r, windows_of, windows_psnr
 from rawaug.files import find_weights, write_json
-from rawaug.isp import conditioning
+from rawaug.isp import staged
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
@@ -176,7 +173,7 @@ def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     """The camera settings of the dictionary's rows for a frame."""
     with torch.no_grad():
         blind = isp.choose(pair.srgb[None])
-        as_shot = conditioning.with_white_balance(isp, blind, pair.white_balance, None)
+        as_shot = staged.with_white_balance(isp, blind, pair.white_balance, None)
         known = {
             "blind": blind,
             **({"as-shot": as_shot} if pair.balance_known else {}),
@@ -190,7 +187,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in pair.raw.shape[-2:])
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return conditioning.with_raw_samples(isp, x, blind, readings, placed(x, None))
+    return staged.with_raw_samples(isp, x, blind, readings, placed(x, None))
 
 
 @torch.no_grad()
@@ -264,7 +261,7 @@ def oracle(isp: DictionaryISP, pair: Pair, others: Sequence[ISPParams]) -> ISPPa
     start = None
     if isp.config.cameras:
         own, value = pixels.site[:, :, 0], pixels.target.sum(dim=(1, 2))
-        start = conditioning.with_readings(isp, pixels.srgb, pixels.place, own, value, others[0])
+        start = staged.with_readings(isp, pixels.srgb, pixels.place, own, value, others[0])
     found = [*others, _descended(isp, pixels, start)]
     return min(found, key=lambda setting: squared_error(isp, pixels, setting).item())
 

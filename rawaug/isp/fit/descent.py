@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from rawaug.files import read_tensors, write_tensors
-from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FitFrames, PixelSamples
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.staged import with_white_balance
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
 

@@ -1,16 +1,12 @@
-r"""Training of the encoders and of everything at once, each kept only if frames that were left out say that it helps.
+"""Training of the encoders and of everything at once, each kept only if frames that were left out say that it helps.
 
-*Encoders* are trained last, with tone and dictionaries frozen:
-``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2``, the RAW that the weights of the reverse
-encoders make, the same for the forward encoders', and the consistency of the two (Conde et al., AAAI 2022, "Training").
-Trained together with the rest on few frames, encoders memorise the frames and distort tone and matrices as well.
-Whether they help is decided on unseen frames: for every fold, curve, tone and atoms are fitted anew without its frames,
-then constants and encoders are compared on these.
+*Encoders* are trained last, with tone and dictionaries frozen, on the RAW that either direction's weights make:
+``L = sum_f log(MSE_f(w_r) + eps) + log(MSE_f(w_f) + eps) + c |w_r - w_f|^2`` (Conde et al., AAAI 2022, "Training").
+For every fold, curve, tone and atoms are fitted anew without its frames, then constants and encoders compared on these.
 
-*End-to-end training*, as in the paper, refines an ISP that is already fitted:
+*End-to-end training* refines an ISP that is already fitted:
 ``L = |y_hat - y|^2 + |x_hat - x|^2 + 0.1 sum_k |x_k^f - x_k^r|^2 + 0.01 |w_r - w_f|^2`` on random pixels of random
-frames; both passes use the weights that their own encoders choose. A tenth of the frames is left out and watched: the
-parameters come back that served these best, which may be those of the start.
+frames, by the weights that both encoders choose. A tenth of the frames is watched: the best parameters come back.
 """
 
 from __future__ import annotations

@@ -1,17 +1,15 @@
-r"""The stages of a fit, in order.
+"""The stages of a fit, in order.
 
 1. Curve. ``x2 = (x + a (1 - x))^gamma`` (sRGB, BT.709 and plain gamma are of this form), each frame's matrix ``M_f``
    and, where there is fall-off, the Gaussian mask: least squares first, then gradient descent on these few numbers.
 2. Tone. The tone network starts as that curve and is refined together with all of stage 1; or the curve itself is
-   bent (:mod:`rawaug.isp.tone`). With ``tone="auto"`` both are fitted without some of the frames and compared on these,
-   by PSNR_r with the as-shot gains: blind, the guess of the gains would decide, which is the same for both.
+   bent (:mod:`rawaug.isp.tone`). With ``tone="auto"`` both are compared on frames left out, given their as-shot gains.
 3. Atoms. The frames' matrices and gains become the dictionaries, with the constant weights that serve best.
 4. Encoders, where frames that were left out of stages 1 to 3 as well say that they help.
 5. Forward. The forward networks, given the reverse pass: l2 on sRGB and on every intermediate image.
 6. Joint. With many frames, everything at once, kept as far as frames left out of it gain.
 
-Source: the model and losses of Conde et al., AAAI 2022; splitting the fit into a global and a per-frame part is what
-makes it hold up with a handful of frames (``docs/fit.md``).
+Model and losses: Conde et al., AAAI 2022; a global and a per-frame part make it hold up with a handful of frames.
 """
 
 from __future__ import annotations

@@ -1,15 +1,12 @@
-r"""From the frames to dictionaries: every frame's own colour, the atoms, and the constant weights.
+"""From the frames to dictionaries: every frame's own colour, the atoms, and the constant weights.
 
-A frame's colour is ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised. What a camera's frames
-have in common shows once the as-shot white balance is taken out: ``M_f`` divided by its row sums ``s_f``, and
-``k_f = s_f wb_f``, which is 1 where the metadata are exact. Frames of one camera are drawn together by
-``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure) on both: a deviation far beyond tau, such as metadata that
-lie, costs a constant.
+A frame's colour is ``M_f = diag(1 / g_f) C_f`` (sRGB to RAW), rows of ``C_f`` l1-normalised. Frames of one camera share
+``M_f`` divided by its row sums ``s_f``, and ``k_f = s_f wb_f``, which is 1 where the metadata are exact. Both are drawn
+together by ``rho(d) = tau^2 d^2 / (tau^2 + d^2)`` (Geman and McClure): metadata that lie cost a constant.
 
 The constant weights minimise ``sum_f log(E_f(w) + eps)``, because the score averages decibels. ``E_f`` is the squared
-error beyond that of the frame's best gains, which is noise where the frames are noisy. It is quadratic in the inverse
-gains ``u``: with second moments ``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``. Clipped readings
-enter none of this.
+error beyond that of the frame's best gains. It is quadratic in the inverse gains ``u``: with second moments
+``a = <x^2>``, ``b = <x y>`` of a channel it is ``(u a - b)^2 / a``. Clipped readings enter none of this.
 """
 
 from __future__ import annotations

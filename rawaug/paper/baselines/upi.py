@@ -1,20 +1,14 @@
-r"""UPI (Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019), as published and tuned to pairs.
+"""UPI (Brooks et al., "Unprocessing Images for Learned Raw Denoising", CVPR 2019), as published and tuned to pairs.
 
 As published, ``y = mosaic(clip(h(C s^-1(x)^2.2; g)))``. ``s^-1(x) = 1/2 - sin(asin(1 - 2x) / 3)`` undoes the tone curve
 ``s(x) = 3x^2 - 2x^3``. ``C`` is a random convex combination of four cameras' XYZ-to-camera matrices, times sRGB-to-XYZ,
 rows divided by their sum. The gains ``g`` are a digital one, 1 / N(0.8, 0.1), times a red one, U(1.9, 2.4), and a blue
-one, U(1.5, 1.9); ``h`` divides by them and spares highlights. Nothing is learned. Domain: display-referred sRGB in
-[0, 1] to linear camera colour in [0, 1].
+one, U(1.5, 1.9); ``h`` divides by them and spares highlights. Nothing is learned.
 
-Tuned, as in the paper of the dictionary ISP, it keeps the tone curve and gamma, with one matrix and one set of gains
-fitted to pairs: ``y = M s^-1(x)^2.2`` below the highlights, with ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All
-of a frame's mean squared error is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``, so a fit is
-a few 3 x 3 systems: the whole is exact and takes well under a second.
-
-The frames differ in gains that cannot be guessed. The sum of their errors would follow the brightest; what is minimised
-is ``sum_f log(MSE_f + eps)``, since the score averages decibels, by weighted least squares with weights
-``1 / (MSE_f + eps)``: each round minimises the tangent of the concave logarithm, which lies above it, so the loss never
-rises.
+Tuned, as in the paper of the dictionary ISP, it has one matrix and one set of gains fitted to pairs: below the
+highlights ``y = M s^-1(x)^2.2``, ``M = diag(1 / g) C``, rows of ``C`` summing to 1. All of a frame's mean squared error
+is in second moments, ``MSE_f(M) = sum_c m_c A_fc m_c - 2 m_c b_fc + e_fc``. What is minimised is
+``sum_f log(MSE_f + eps)``, by weighted least squares with weights ``1 / (MSE_f + eps)``, of which no round rises.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import torch
 from scipy.optimize import nnls
 
 from rawaug.data.pairs import Pair
-from rawaug.isp.conditioning import with_white_balance
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import sample_pixels
@@ -27,6 +26,7 @@ from rawaug.isp.fit.start import (
     set_priors,
 )
 from rawaug.isp.model import DictionaryISP
+from rawaug.isp.staged import with_white_balance
 from rawaug.metrics import psnr
 
 QUICK = FitConfig(steps=0, curve_steps=20, pixels=2048, batch=512, shading="off")  # the curve is the start's
