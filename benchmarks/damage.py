@@ -34,16 +34,12 @@ NUMBERS = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF,
 def make_originals(folder: Path) -> dict[str, list[Path]]:
     """Whole files by kind; the list of an unavailable kind is empty."""
     shared = Path(os.environ.get("RAWAUG_SHARED", Path(__file__).parents[1].parent / "shared" / "data"))
+    made = {"picture": _make_pictures, "mat5": _make_mat5, "mat73": _make_mat73, "safetensors": _make_safetensors}
     return {
         "raw": sorted(shared.glob("raw/canon/*.crw"))[:3],
         "dng": _make_dngs(folder, sorted(shared.glob("raw/*/*.dng"))[:1]),
         "jpeg": _make_jpegs(folder, sorted(shared.glob("raw_jpeg/*/*.jpg"))[:1]),
-        "picture": _make_pictures(folder),
-        "mat5": _make_mat5(folder),
-        "mat73": _make_mat73(folder),
-        "safetensors": _make_safetensors(folder),
-        "npy": _make_npy(folder),
-        "recipe": _make_recipes(folder),
+        **{kind: make(folder) for kind, make in {**made, "npy": _make_npy, "recipe": _make_recipes}.items()},
     }
 
 
@@ -459,14 +455,7 @@ def recipe(whole: bytes, rng: np.random.Generator) -> bytes:
 
 
 MUTATIONS: dict[str, Mutation] = {
-    ".crw": crw,
-    ".dng": tiff,
-    ".tif": tiff,
-    ".jpg": jpeg,
-    ".png": png,
-    ".mat5.mat": mat5,
-    ".mat73.mat": hdf5,
-    ".safetensors": safetensors,
-    ".yaml": recipe,
-}
+    ".crw": crw, ".dng": tiff, ".tif": tiff, ".jpg": jpeg, ".png": png, ".mat5.mat": mat5, ".mat73.mat": hdf5,
+    ".safetensors": safetensors, ".yaml": recipe,
+}  # fmt: skip
 """By the end of a file's name."""

@@ -351,14 +351,9 @@ def little_shared_memory(folder: Path, name: str, whole: Files) -> str | None:
 
 
 FAULTS = {
-    "full disk": full_disk,
-    "two at once": two_at_once,
-    "64 descriptors": few_descriptors,
-    "clock jumps": jumping_clock,
-    "folder removed": removed_folder,
-    "folder read-only": unwritable_folder,
-    "small /dev/shm": little_shared_memory,
-}
+    "full disk": full_disk, "two at once": two_at_once, "64 descriptors": few_descriptors, "clock jumps": jumping_clock,
+    "folder removed": removed_folder, "folder read-only": unwritable_folder, "small /dev/shm": little_shared_memory,
+}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:

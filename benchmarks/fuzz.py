@@ -1,16 +1,14 @@
-"""How the readers handle damaged files: each must be read, or refused in one line that names it.
+"""How the readers handle hostile files: each must be read, or refused in one line that names it.
 
     python -m benchmarks.fuzz [--cases 10000] [--seed 0] [--kinds dng mat5 ...] [--quick] [--keep FOLDER] [--json FILE]
 
-Small files of every kind are made first; real camera files take part where RAWAUG_SHARED, or shared/data beside the
-repository, has them. Half of the mutations know the structure of the file (MUTATIONS of benchmarks/damage.py); the
-others flip bits, cut the file short, overwrite numbers, exchange or repeat pieces (``mutated`` there); all are keyed by
-(seed, kind, number). The helper process of :mod:`rawaug.io.isolated` reads one after the other, every eighth by the
-commands too, and is restarted when a decoder takes it down. Counted are files that were read; that were refused as
-documented (ValueError or OSError of one line with the file's name); that crashed a decoder, by its name, which the
-package contains; and what must not be: other exceptions and numbers that are not finite, more than 10 s of a processor
-(60 with commands), more than 2 GiB. Exit status 1 if there is any of the last three. ``--keep`` keeps all files but
-those of the first two columns. Linux only.
+Small files of every kind are made and damaged (benchmarks/damage.py), half of them as their structure suggests, keyed
+by (seed, kind, number); real camera files take part where RAWAUG_SHARED, or shared/data beside the repository, has
+them. The helper process of :mod:`rawaug.io.isolated` reads one after the other, every eighth by the commands too.
+Counted are files that were read; that were refused as documented (ValueError or OSError of one line with the file's
+name); that crashed a decoder, which the package contains; and what must not be: other exceptions and numbers that are
+not finite, more than 10 s of a processor (60 with commands), more than 2 GiB. Exit status 1 if there is any of the last
+three. ``--keep`` keeps all files but those of the first two columns. Linux only.
 """
 
 from __future__ import annotations
@@ -58,16 +56,9 @@ from rawaug.training.state import first_network
 WAITING_SECONDS = 240
 """For a file, which may have to wait for a processor."""
 DECODERS = {
-    "picture": "OpenImageIO",
-    "jpeg": "OpenImageIO",
-    "npy": "NumPy",
-    "mat5": "SciPy",
-    "mat73": "HDF5",
-    "safetensors": "safetensors",
-    "recipe": "PyYAML",
-    "dng": "LibRaw",
-    "raw": "LibRaw",
-}
+    "picture": "OpenImageIO", "jpeg": "OpenImageIO", "npy": "NumPy", "mat5": "SciPy", "mat73": "HDF5",
+    "safetensors": "safetensors", "recipe": "PyYAML", "dng": "LibRaw", "raw": "LibRaw",
+}  # fmt: skip
 """What reads each kind for us, the cheapest first."""
 
 BY_COMMANDS = 8
@@ -340,9 +331,7 @@ def main(arguments: list[str] | None = None) -> int:
     results = fuzz(args.kinds, 100 if args.quick else args.cases, args.seed, args.keep)
     print_table(results)
     absent = [kind for kind in args.kinds if kind not in results]
-    print(
-        f"{time.perf_counter() - start:.0f} s" + (f"; no files of kind {', '.join(absent)} available" if absent else "")
-    )
+    print(f"{time.perf_counter() - start:.0f} s; kinds without files: {', '.join(absent) or 'none'}")
     if args.json:
         args.json.write_text(json.dumps({"seed": args.seed, "kinds": results}, indent=1) + "\n", encoding="utf-8")
     return int(any(row[outcome] for row in results.values() for outcome in FORBIDDEN))

@@ -1,6 +1,6 @@
 """What the hulls of colour, light and tone atoms hold, and whether it holds for cameras and curves not looked at.
 
-    python -m benchmarks.hulls [--photographs FOLDER] [--atoms 10] [--halves 5]
+    python -m benchmarks.hulls [--atoms 10] [--halves 5]
     python -m benchmarks.hulls --figure docs/coverage.png
 
 Cameras: the error is that of linear colour on photographs, between a camera's own sRGB-to-camera matrix and the nearest
@@ -19,13 +19,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.measure import parser
-from rawaug.io.pictures import decode_srgb, read_picture
-from rawaug.isp.cameras import colour_matrix, published_cameras
-from rawaug.isp.dictionary import DECIBEL, CameraDictionary, colour_coordinates, nearest_in_hull, psnr
+from rawaug.isp.cameras import published_cameras
+from rawaug.isp.dictionary import DECIBEL, CameraDictionary, nearest_in_hull, psnr
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import tone_tables
 from rawaug.isp.universal import (
-    COLOURS,
     camera_points,
     chosen_atoms,
     chosen_gains,
@@ -84,11 +82,8 @@ def draw(path: Path) -> None:
             psnr(nearest_in_hull(cameras, atoms)[1]).sort().values, shares, label=f"{name}, {len(atoms)} atoms"
         )
     by_camera.set(xlim=(35, 70), xlabel="PSNR of linear colour (dB)", ylabel=f"% of {len(cameras)} cameras above it")
-    isp = DictionaryISP.from_pretrained("universal")
-    inverse, atoms = (
-        inverse_gains_in_any_light(published_cameras().distinct(), "figure", 400),
-        1.0 / isp.gain.channel_gains().double(),
-    )
+    atoms = 1.0 / DictionaryISP.from_pretrained("universal").gain.channel_gains().double()
+    inverse = inverse_gains_in_any_light(published_cameras().distinct(), "figure", 400)
     kept = psnr(nearest_in_hull(inverse / 3**0.5, atoms / 3**0.5)[1]) >= DECIBEL
     for points, style, label in (
         (1.0 / inverse[kept], "o", f"{int(kept.sum())} draws held"),
@@ -115,7 +110,6 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     cli = parser(__doc__)
-    cli.add_argument("--photographs", type=Path, help="folder of JPEG files; those of the package by default")
     cli.add_argument("--atoms", type=int, default=10)
     cli.add_argument("--gains", type=int, default=16)
     cli.add_argument("--halves", type=int, default=5)
@@ -126,24 +120,14 @@ def main() -> None:
         return
     for name, value in left_out_tones().items():
         print(f"tone {name}: {value:.1f} dB under the others")
-    moment = torch.tensor(COLOURS) if options.photographs is None else _moment(options.photographs)
     cameras = published_cameras().distinct()
-    points = colour_coordinates(colour_matrix(cameras), moment)
+    points = camera_points(cameras)
     print(f"{len(points)} distinct matrices, {options.atoms} atoms", flush=True)
     for seed, share in enumerate(halves(points, options.atoms, options.halves)):
         print(f"half {seed}: {share:.1%} of the other half", flush=True)
     for seed, share in enumerate(lights_of_halves(cameras, options.gains, options.halves)):
         print(f"gains, half {seed}: {share:.1%} of the other half's", flush=True)
     print(f"all matrices: {held(points, points[chosen_atoms(points, options.atoms).atoms]):.1%}")
-
-
-def _moment(folder: Path) -> Tensor:
-    files = sorted(folder.glob("*.jpg"))
-    if not files:
-        raise SystemExit(f"{folder}: no *.jpg in it")
-    pictures = (read_picture(file)[:, ::4, ::4].double() / 255.0 for file in files)
-    colours = [decode_srgb(picture).flatten(1).double() for picture in pictures]
-    return torch.stack([linear @ linear.T / linear.shape[1] for linear in colours]).mean(dim=0)
 
 
 if __name__ == "__main__":
