@@ -1,21 +1,20 @@
-r"""The losses of a fit, and gradient descent that can be stopped and resumed.
+r"""The losses of a fit, and gradient descent in stages, between which it can be stopped and resumed.
 
 The loss on RAW is ``(y_hat - y)^2 / (4 (y_hat + 0.01))``, with the denominator taken as a constant: shot noise makes
 the error of a reading proportional to its square root, and weights that do not depend on ``y`` keep noise unbiased.
 The loss on sRGB takes in the images between the stages (Conde et al., AAAI 2022, "Training").
 
 A fit has stages; one is a loss and its tensors. What a step draws is keyed by (seed, stage, step), so that a resumed
-stage ends with the same bits as one that was not stopped.
+fit ends with the same bits as one that was not stopped.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,19 +81,11 @@ def adam(
     learning_rate: float,
     loss: Callable[[int], Tensor],
     spent: Callable[[int], float],
-    *,
-    start: int = 0,
-    state: Mapping[int, Any] | None = None,
     clip_norm: float | None = None,
-) -> Iterator[tuple[torch.optim.Adam, Tensor]]:
-    """Adam on ``loss(step)`` until ``spent(step)`` is 1, under a cosine; yields the optimiser and each step's loss.
-
-    ``start`` and ``state`` resume a descent.
-    """
+) -> Iterator[Tensor]:
+    """Adam on ``loss(step)`` until ``spent(step)`` is 1, under a cosine; yields the loss of each step."""
     optimiser = torch.optim.Adam(tensors, lr=learning_rate)
-    if state:
-        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
-    step = start
+    step = 0
     while (share := spent(step)) < 1.0:
         optimiser.param_groups[0]["lr"] = learning_rate * 0.5 * (1.0 + math.cos(math.pi * share))
         value = loss(step)
@@ -104,7 +95,7 @@ def adam(
             torch.nn.utils.clip_grad_norm_(tensors, clip_norm)
         optimiser.step()
         step += 1
-        yield optimiser, value.detach()
+        yield value.detach()
 
 
 class BestScore(NamedTuple):
@@ -116,18 +107,19 @@ class BestScore(NamedTuple):
 
 
 class Descent:
-    """Runs the stages of a fit; reports every so many steps, and writes its state every so many seconds."""
+    """Runs the stages of a fit, and writes what each came to, so that a stopped fit goes on with the next one."""
 
     report_steps: ClassVar[int] = 50
-    save_seconds: ClassVar[float] = 10.0
 
     def __init__(self, path: Path | None, key: str, seed: int, progress: bool) -> None:
         self.path, self.key, self.seed, self.progress = path, key, seed, progress
         self.watched: dict[str, BestScore] = {}
-        self._steps: dict[str, int] = {}
-        self._tensors: dict[str, Tensor] = {}
+        self._ends: dict[str, Tensor] = {}
         if path is not None and path.is_file():
-            self._load(path)
+            header, tensors = read_tensors(path, "delete this state of an interrupted fit")
+            if header.get("key") == key:
+                self.watched = {k: BestScore(*values) for k, values in json.loads(header["watched"]).items()}
+                self._ends = tensors
 
     def run(
         self,
@@ -139,77 +131,58 @@ class Descent:
         report: Callable[[], str] | None = None,
         watch: Callable[[], float] | None = None,
     ) -> None:
-        """Minimise ``loss`` over ``tensors`` in place, from where a stopped run left off."""
-        start, state = self._restored(stage, tensors)
-        if watch is not None and stage not in self.watched:
-            self._note(stage, 0, watch(), tensors)
-        for tensor in tensors.values():
-            tensor.requires_grad_()
+        """Minimise ``loss`` over ``tensors`` in place; a watched stage ends with its best ones."""
+        if not all(f"{stage}/{name}" in self._ends for name in tensors):
+            if watch is not None:
+                self._note(stage, 0, watch(), tensors)
+            for tensor in tensors.values():
+                tensor.requires_grad_()
+            self._descend(stage, loss, tensors, steps, learning_rate, report, watch)
+            if watch is None:
+                self._keep(stage, tensors)
+            if self.path is not None:
+                write_tensors(self._ends, {"key": self.key, "watched": json.dumps(self.watched)}, self.path)
+        for name, tensor in tensors.items():
+            tensor.data.copy_(self._ends[f"{stage}/{name}"])
+            tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
+
+    def _descend(
+        self,
+        stage: str,
+        loss: Callable[[torch.Generator], Tensor],
+        tensors: Mapping[str, Tensor],
+        steps: int,
+        learning_rate: float,
+        report: Callable[[], str] | None,
+        watch: Callable[[], float] | None,
+    ) -> None:
         descent = adam(
             list(tensors.values()),
             learning_rate,
             lambda step: loss(keyed_generator(self.seed, stage, step)),
             lambda step: step / steps if step < steps else 1.0,
-            start=start,
-            state=state,
         )
-        bar = progress(descent, label=stage, unit="step", initial=start, total=steps, shown=self.progress)
-        saved, losses = time.monotonic(), list[Tensor]()
-        for done, (optimiser, value) in enumerate(bar, start + 1):
+        bar, losses = progress(descent, label=stage, unit="step", total=steps, shown=self.progress), list[Tensor]()
+        for done, value in enumerate(bar, 1):
             losses.append(value)
             if done % self.report_steps == 0 or done == steps:
                 scores = "" if report is None else report()
                 scores += "" if watch is None else self._note(stage, done, watch(), tensors)
                 bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores}", refresh=False)
                 losses.clear()
-            due = done == steps or time.monotonic() - saved > self.save_seconds
-            if self.path is not None and due:
-                self._keep(stage, done, tensors, optimiser)
-                saved = time.monotonic()
-        for tensor in tensors.values():
-            tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
-        if watch is not None:
-            for name, tensor in tensors.items():
-                tensor.data.copy_(self._tensors[f"{stage}, best/{name}"])
 
     def finish(self) -> None:
         """Remove the state: the fit is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
+    def _keep(self, stage: str, tensors: Mapping[str, Tensor]) -> None:
+        self._ends |= {f"{stage}/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
+
     def _note(self, stage: str, step: int, score: float, tensors: Mapping[str, Tensor]) -> str:
         """Note a score, and the tensors if it is the best so far."""
         before = self.watched.get(stage, BestScore(score, step, -math.inf))
         if stage not in self.watched or score > before.best:
             self.watched[stage] = BestScore(before.start, step, score)
-            self._tensors |= {f"{stage}, best/{name}": tensor.detach().clone() for name, tensor in tensors.items()}
+            self._keep(stage, tensors)
         return f"held out {score:.2f} dB"
-
-    def _keep(self, stage: str, step: int, tensors: Mapping[str, Tensor], optimiser: torch.optim.Optimizer) -> None:
-        assert self.path is not None
-        self._steps[stage] = step
-        moments = optimiser.state_dict()["state"]
-        for index, (name, tensor) in enumerate(tensors.items()):
-            self._tensors[f"{stage}/{name}"] = tensor.detach().clone()
-            for moment, value in moments.get(index, {}).items():
-                self._tensors[f"{stage}/{name}/{moment}"] = value.clone()
-        header = {"key": self.key, "steps": json.dumps(self._steps), "watched": json.dumps(self.watched)}
-        write_tensors(self._tensors, header, self.path)
-
-    def _load(self, path: Path) -> None:
-        header, tensors = read_tensors(path, "delete this state of an interrupted fit")
-        if header.get("key") == self.key:
-            self._steps = json.loads(header["steps"])
-            self.watched = {k: BestScore(*values) for k, values in json.loads(header["watched"]).items()}
-            self._tensors = tensors
-
-    @torch.no_grad()
-    def _restored(self, stage: str, tensors: Mapping[str, Tensor]) -> tuple[int, dict[int, Any]]:
-        """Steps that are done, with the optimiser's state after them."""
-        step, state = self._steps.get(stage, 0), dict[int, Any]()
-        for index, (name, tensor) in enumerate(tensors.items() if step else ()):
-            tensor.copy_(self._tensors[f"{stage}/{name}"])
-            prefix = f"{stage}/{name}/"
-            if moments := {k[len(prefix) :]: v for k, v in self._tensors.items() if k.startswith(prefix)}:
-                state[index] = moments
-        return step, state

@@ -153,7 +153,7 @@ class CropTrainedISP(BaselineISP):
         bar = progress_bar(
             descent, label=f"fit {self.name}", unit="step", total=training.steps, shown=training.progress
         )
-        for _, loss in bar:
+        for loss in bar:
             done, value = done + 1, loss.item()
             bar.set_postfix_str(f"loss {value:.2e}, {time.perf_counter() - start:.0f} s", refresh=False)
         return done, value

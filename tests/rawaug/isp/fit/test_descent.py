@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.fit import FitConfig, encoders, fit_isp
+from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
 from rawaug.isp.fit.descent import Descent, cycle_error, reading_error
 from rawaug.isp.fit.samples import FitFrames, PixelSamples, sample_pixels
 from rawaug.isp.model import DictionaryISP
@@ -23,54 +24,34 @@ TINY = FitConfig(steps=12, curve_steps=12, pixels=512, batch=128, prior_steps=20
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every 5 steps a report, and after each the state is written."""
+    """Every 5 steps a report."""
     monkeypatch.setattr(Descent, "report_steps", 5)
-    monkeypatch.setattr(Descent, "save_seconds", -1.0)
 
 
-def stopped_at(step: int) -> Callable[[torch.Tensor], Callable[[torch.Generator], torch.Tensor]]:
-    """A noisy bowl, whose ``step``-th evaluation is interrupted."""
+def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False) -> torch.Tensor:
+    """20 steps into a noisy bowl, whose ``stop``-th evaluation is interrupted."""
+    x, calls = torch.zeros(3), count(1)
 
-    def bowl(x: torch.Tensor) -> Callable[[torch.Generator], torch.Tensor]:
-        calls = 0
+    def loss(generator: torch.Generator) -> torch.Tensor:
+        if next(calls) == stop:
+            raise KeyboardInterrupt
+        return ((x - torch.randn(3, generator=generator)) ** 2).sum()
 
-        def loss(generator: torch.Generator) -> torch.Tensor:
-            nonlocal calls
-            calls += 1
-            if calls == step:
-                raise KeyboardInterrupt
-            return ((x - torch.randn(3, generator=generator)) ** 2).sum()
-
-        return loss
-
-    return bowl
-
-
-def run(path: Path | None, key: str = "key", stop: int = 0, watch: bool = False, steps: int = 20) -> torch.Tensor:
-    x = torch.zeros(3)
-    loss = stopped_at(stop)(x)
     score = (lambda: -float((x.detach() - 0.1).abs().sum())) if watch else None
-    Descent(path, key, 0, False).run("bowl", loss, {"x": x}, steps, 0.1, watch=score)
+    Descent(path, key, 0, False).run("bowl", loss, {"x": x}, 20, 0.1, watch=score)
     return x
 
 
-@pytest.mark.parametrize("stop", [2, 7, 20])
 @pytest.mark.parametrize("watch", [False, True])
-def test_a_stopped_descent_goes_on_bit_for_bit(tmp_path: Path, stop: int, watch: bool) -> None:
+def test_a_stage_that_is_done_takes_no_step_and_another_begins_anew(tmp_path: Path, watch: bool) -> None:
     path = tmp_path / "state"
     with pytest.raises(KeyboardInterrupt):
-        run(path, stop=stop, watch=watch)
-    assert path.is_file()
-    resumed = run(path, stop=20 - stop + 3, watch=watch)  # would be interrupted if it began anew
-    assert torch.equal(resumed, run(None, watch=watch))
-    assert torch.equal(run(path, stop=1, watch=watch), resumed)  # a stage that is done takes no step
-
-
-def test_a_state_of_another_key_is_not_used(tmp_path: Path) -> None:
+        run(path, stop=7, watch=watch)
+    whole = run(path, watch=watch)
+    assert torch.equal(whole, run(None, watch=watch))
+    assert torch.equal(run(path, stop=1, watch=watch), whole)
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "state", key="other", stop=7)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "state", stop=20)  # all of the first 19 steps again
+        run(path, key="other", stop=1)
 
 
 def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
@@ -91,7 +72,9 @@ def test_watched_tensors_come_back_from_their_best_step() -> None:
     assert -abs(float(x.sum()) + 1.5) == pytest.approx(best)
 
 
-def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pair]) -> None:
+def test_a_stopped_fit_goes_on_bit_for_bit(
+    tmp_path: Path, exact_pairs: list[Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
     state, calls = tmp_path / "camera.state", 0
 
     def report(isp: DictionaryISP) -> str:
@@ -105,27 +88,25 @@ def test_a_stopped_fit_goes_on_bit_for_bit(tmp_path: Path, exact_pairs: list[Pai
         fit_isp(exact_pairs, TINY, progress=False, state=state, report=report)
     stopped = state.read_bytes()
     resumed = fit_isp(exact_pairs, TINY, progress=False, state=state, report=report).state_dict()
-    assert calls == 4  # after 5 and 10 steps, then after 10 and 12
+    assert calls == 5  # after 5 and 10 steps, then after 5, 10 and 12
     assert list(tmp_path.iterdir()) == []
     whole = fit_isp(exact_pairs, TINY, progress=False).state_dict()
     assert all(torch.equal(resumed[key], whole[key]) for key in whole)
 
     # of other settings, or of frames about which the files say something else, it is not used
-    liar = replace(exact_pairs[0], white_balance=(1.0, 1.0, 1.0))
-    for pairs, config in ((exact_pairs, replace(TINY, learning_rate=1e-3)), ([liar, *exact_pairs[1:]], TINY)):
+    liar, known = replace(exact_pairs[0], white_balance=(1.0, 1.0, 1.0)), list[bool]()
+
+    class Noted(Descent):
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            known.append(bool(self._ends))
+
+    monkeypatch.setattr(pipeline, "Descent", Noted)
+    other = replace(TINY, learning_rate=1e-3)
+    for pairs, config in ((exact_pairs, other), ([liar, *exact_pairs[1:]], TINY), (exact_pairs, TINY)):
         state.write_bytes(stopped)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Descent, "_restored", _refusing(Descent._restored))
-            fit_isp(pairs, config, progress=False, state=state)
-
-
-def _refusing(restored: Callable[..., tuple[int, Any]]) -> Callable[..., tuple[int, Any]]:
-    def from_the_start(self: Descent, *args: object) -> tuple[int, Any]:
-        step, state = restored(self, *args)
-        assert step == 0
-        return step, state
-
-    return from_the_start
+        fit_isp(pairs, config, progress=False, state=state)
+    assert known == [False, False, True]
 
 
 CLEAN, NOISY = FitConfig(), FitConfig(noisy=True)
