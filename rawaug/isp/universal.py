@@ -71,7 +71,8 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     isp.tone.curves.copy_(tables[tone.atoms])
     isp.tone.typical.copy_(tone.typical)
     with torch.no_grad():
-        isp.gain.log_gains.copy_(_triplets(1.0 / inverse[gain.atoms]).log())
+        red, green, blue = (1.0 / inverse[gain.atoms]).unbind(1)
+        isp.gain.log_gains.copy_(torch.stack([green, red / green, blue / green], dim=1).float().log())
     for encoders in (isp.reverse_encoders, isp.forward_encoders):
         encoders.colour.set_prior(isp.colour.typical)
         encoders.gain.set_prior(gain.typical)
@@ -145,11 +146,6 @@ def held(points: Tensor, atoms: Tensor) -> float:
 
 def _of_colour(key: str) -> bool:
     return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
-
-
-def _triplets(gains: Tensor) -> Tensor:
-    """Channel gains ``(M, 3)`` as digital, red and blue gain."""
-    return torch.stack([gains[:, 1], gains[:, 0] / gains[:, 1], gains[:, 2] / gains[:, 1]], dim=1).float()
 
 
 def _name_of(matrix: Tensor, names: Sequence[str], matrices: Tensor) -> str:

@@ -361,13 +361,6 @@ class ScaledLevels:
         return shot_var * self.factor, read_var * self.factor
 
 
-def expected_pair_psnr(law: NoiseLevels, signal: Sequence[float]) -> float:
-    """P_0: mean PSNR in dB of pairs whose clean pictures have these mean signals; the same at every call."""
-    shot_var, read_var = law.sample(_DRAWS, keyed_generator(0, "pair_psnr"))
-    square = torch.outer(torch.tensor(signal, dtype=torch.float64), shot_var.double()) + read_var.double()
-    return -10.0 * float(square.log10().mean())
-
-
 @NOISE.register("CalibratedNoise")
 class CalibratedNoise(ShotReadNoise):
     """Shot and read noise at a stated mean PSNR of the pairs; the ratio of read to shot noise is that of the law.
@@ -398,7 +391,9 @@ class CalibratedNoise(ShotReadNoise):
         if not signals or not all(0.0 < mean <= 1.0 for mean in signals):
             raise ValueError(f"signal: mean signals must be above 0 and at most 1, got {signal}")
         law = noise_levels(levels)
-        uncalibrated = expected_pair_psnr(law, signals)
+        shot_var, read_var = law.sample(_DRAWS, keyed_generator(0, "pair_psnr"))
+        square = torch.outer(torch.tensor(signals, dtype=torch.float64), shot_var.double()) + read_var.double()
+        uncalibrated = -10.0 * float(square.log10().mean())
         if not math.isfinite(uncalibrated):
             raise ValueError(f"levels {levels!r} have no noise, which no factor brings to {pair_psnr:g} dB")
         super().__init__(ScaledLevels(law, 10.0 ** ((uncalibrated - pair_psnr) / 10.0)))

@@ -130,7 +130,9 @@ def estimate_noise(
         shot, read = _fit(points, read_var)[0]
         points = _points(levels, shot, read)
     (shot, read), errors, points = _fit(points, read_var)
-    return NoiseEstimate(shot, read, *errors, _r2(points, shot, read), points)
+    x, y = points.signal[points.used], points.variance[points.used]
+    r2 = float(1 - (y - shot * x - read).square().sum() / (y - y.mean()).square().sum())
+    return NoiseEstimate(shot, read, *errors, r2, points)
 
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
@@ -140,7 +142,8 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
         raise ValueError(f"a mosaic must have shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
     if min(frame.shape[-2:]) < 2 * BLOCK:
         raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise from")
-    floor, ceiling = _clipping_levels(frame)
+    floor = float(frame.min()) if _piles_up(frame) else -math.inf
+    ceiling = min(float(frame.max()) if _piles_up(-frame) else 1.0, 1.0)
     planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
     tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
     energy = torch.from_numpy(dctn(tiles.cpu().numpy(), axes=(-2, -1), norm="ortho")).square_()
@@ -150,13 +153,6 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
     inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
     room = signal - floor, ceiling - signal
     return _Blocks(*(t.flatten()[inside].double().cpu() for t in (channel, signal, *bands, *room)))
-
-
-def _clipping_levels(frame: Tensor) -> tuple[float, float]:
-    """(floor, ceiling): where values pile up at the end of the range; else no floor, and white."""
-    floor = float(frame.min()) if _piles_up(frame) else -math.inf
-    ceiling = float(frame.max()) if _piles_up(-frame) else 1.0
-    return floor, min(ceiling, 1.0)
 
 
 def _piles_up(frame: Tensor) -> bool:
@@ -253,11 +249,6 @@ def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) ->
         return (w * wxy - wx * wy) / determinant, read, (w / determinant) ** 0.5, (wxx / determinant) ** 0.5
     read = max(read, 0.0)
     return (wxy - read * wx) / wxx, read, wxx**-0.5, 0.0
-
-
-def _r2(points: NoisePoints, shot_var: float, read_var: float) -> float:
-    x, y = points.signal[points.used], points.variance[points.used]
-    return float(1 - (y - shot_var * x - read_var).square().sum() / (y - y.mean()).square().sum())
 
 
 def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import ClassVar
 
 import torch
@@ -57,6 +58,7 @@ def draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
     return torch.full((batch,), float(value), device=generator.device, dtype=torch.float32)
 
 
+@cache
 def tukey_lambda_variance(shape: float) -> float:
     """The variance of the Tukey lambda distribution of scale 1, infinite for shapes up to -1/2, which are refused."""
     from scipy.stats import tukeylambda

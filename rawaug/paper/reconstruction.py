@@ -29,7 +29,7 @@ from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
-from rawaug.noise import NoiseModel, noise_model
+from rawaug.noise import noise_model
 from rawaug.paper.baselines import Training
 from rawaug.paper.downstream import DownstreamConfig, psnr_d
 from rawaug.paper.frames import PERTURBED
@@ -302,7 +302,11 @@ def _fitted_frames(settings: Comparison, found: Sequence[Pair]) -> list[Pair]:
         if pair.cfa != pairs[0].cfa or (exact and not pair.registered):
             what = "is not registered pixel by pixel" if pair.cfa == pairs[0].cfa else "has a different CFA"
             raise ValueError(f"data: {pair.name} {what}; {', '.join(settings.methods)} cannot share a table on it")
-    return pairs if settings.noise is None else [_with_noise(pair, noise_model(settings.noise)) for pair in pairs]
+    if settings.noise is None:
+        return pairs
+    noise = noise_model(settings.noise)  # frozen: keyed by the frame's name, as a noisy capture
+    drawn = [frozen_sample(pair, noise, CFA(pair.cfa), 0).noisy for pair in pairs]
+    return [replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]) for pair, noisy in zip(pairs, drawn, strict=True)]
 
 
 def _test_frames(settings: Comparison, found: Sequence[Pair]) -> Sequence[Pair]:
@@ -314,10 +318,3 @@ def _test_frames(settings: Comparison, found: Sequence[Pair]) -> Sequence[Pair]:
     if (seen := shared_frame(scored, found)) is not None:
         raise ValueError(f"test: {seen} is also in data; score on unseen frames")
     return scored
-
-
-def _with_noise(pair: Pair, noise: NoiseModel) -> Pair:
-    """The frame with noise keyed by its name, as a noisy capture."""
-    cfa = CFA(pair.cfa)
-    noisy = bayer.unpack(frozen_sample(pair, noise, cfa, 0).noisy, cfa)[0]
-    return replace(pair, noisy=noisy)

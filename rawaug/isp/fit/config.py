@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -13,32 +12,6 @@ MOST = 2**31
 """Of steps and pixels."""
 
 _SWITCH = ("auto", "on", "off")
-
-
-@dataclass(frozen=True)
-class EncoderTraining:
-    """How encoders are trained, and whether they help is found out.
-
-    Args:
-        steps: steps of Adam.
-        frames: frames in a step.
-        pixels: pixels of each frame in a step.
-        learning_rate: initial learning rate, with cosine decay to 0.
-        fewest_frames: number of frames from which on "auto" trains encoders.
-        folds: parts of the frames that are left out in turn, to compare encoders with constants on them.
-    """
-
-    steps: int = 200
-    frames: int = 4
-    pixels: int = 1024
-    learning_rate: float = 1e-3
-    fewest_frames: int = 12
-    folds: int = 4
-
-    def __post_init__(self) -> None:
-        for key, least in {"steps": 0, "frames": 1, "pixels": 1, "fewest_frames": 2, "folds": 2}.items():
-            require_between(f"encoder_training.{key}", getattr(self, key), least, MOST)
-        require_between("encoder_training.learning_rate", self.learning_rate, 0.0, float(MOST))
 
 
 @dataclass(frozen=True)
@@ -64,7 +37,7 @@ class FitConfig:
         attention: fit the attention mask as well.
         encoders: "on" trains the encoders, "off" uses constant weights, "auto" trains them with a dozen frames or more
             and keeps them if they beat the constants on held-out frames.
-        encoder_training: how that is done, as an :class:`EncoderTraining` or its settings by name.
+        encoder_steps: steps of the encoders' training.
         joint_steps: steps of a last end-to-end training of everything at once; by default 1000 with 50 frames or more,
             else 0. Kept only if held-out frames improve.
         curve_steps: steps of the first stage, which fits the tone curve; 150 by default.
@@ -89,7 +62,7 @@ class FitConfig:
     tone: Literal["auto", "learned", "curve"] = "learned"
     attention: bool = False
     encoders: Literal["auto", "on", "off"] = "auto"
-    encoder_training: EncoderTraining = field(default_factory=EncoderTraining)
+    encoder_steps: int = 200
     joint_steps: int | None = None
     curve_steps: int | None = None
     prior_steps: int = 400
@@ -107,13 +80,13 @@ class FitConfig:
 
     def shortest(self) -> FitConfig:
         """The same configuration, reduced to a fit of a second."""
-        few = replace(self.encoder_training, steps=4)
-        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_training=few)
+        return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_steps=4)
 
     def __post_init__(self) -> None:
-        if isinstance(self.encoder_training, Mapping):
-            object.__setattr__(self, "encoder_training", EncoderTraining(**self.encoder_training))
-        positive, counts = ("atoms", "pixels", "batch"), ("steps", "joint_steps", "curve_steps", "prior_steps")
+        positive, counts = (
+            ("atoms", "pixels", "batch"),
+            ("steps", "joint_steps", "curve_steps", "prior_steps", "encoder_steps"),
+        )
         for key, least in {**dict.fromkeys(positive, 1), **dict.fromkeys(counts, 0)}.items():
             if getattr(self, key) is not None:
                 require_between(key, getattr(self, key), least, MOST)

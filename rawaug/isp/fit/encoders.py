@@ -21,6 +21,13 @@ from rawaug.isp.fit.descent import Descent, cycle_error, decibels, mean_square, 
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 
+FRAMES_A_STEP = 4
+ENCODER_PIXELS, ENCODER_RATE = 1024, 1e-3
+FEWEST_FRAMES, FOLDS = 12, 4
+"""From so many frames on "auto" trains encoders; and parts that are left out in turn to judge them."""
+MANY_FRAMES, STEPS, LEARNING_RATE, CONSISTENCY = 50, 1000, 2e-4, 0.01
+"""Of end-to-end training."""
+
 Refit = Callable[[FitFrames, str, FitConfig], DictionaryISP]
 """Fits an ISP without encoders to some frames alone; the text tells its stages from those of other fits."""
 
@@ -48,8 +55,8 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
 
     wanted = config.encoders
     isp.use_encoders(False)
-    if wanted == "auto" and len(frames.shots) >= config.encoder_training.fewest_frames:
-        gain = gain_left_out(frames, config.encoder_training.folds, better)
+    if wanted == "auto" and len(frames.shots) >= FEWEST_FRAMES:
+        gain = gain_left_out(frames, FOLDS, better)
         isp.info["encoders_gain_db"] = round(gain, 2)
         wanted = "on" if gain > 0 else "off"
     if wanted == "on":
@@ -58,14 +65,13 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
 
 def _train(isp: DictionaryISP, frames: FitFrames, config: FitConfig, descent: Descent, stage: str) -> None:
     isp.use_encoders(True, descent.seed)
-    how = config.encoder_training
     tensors = {name: p for name, p in isp.named_parameters() if "_encoders." in name and ".layers." in name}
 
     def loss(generator: torch.Generator) -> Tensor:
-        drawn = _drawn(frames, how.frames, how.pixels, generator)
+        drawn = _drawn(frames, FRAMES_A_STEP, ENCODER_PIXELS, generator)
         return torch.stack([_frame_loss(isp, part, shot, config, generator) for part, shot in drawn]).mean()
 
-    descent.run(stage, loss, tensors, how.steps, how.learning_rate)
+    descent.run(stage, loss, tensors, config.encoder_steps, ENCODER_RATE)
 
 
 def _drawn(
@@ -99,13 +105,6 @@ def _same_piece(srgb: Tensor, raw: Tensor, generator: torch.Generator) -> tuple[
         piece = image[..., top : top + height, left : left + width]
         pieces.append(piece.flip(-1) if flip else piece)
     return pieces[0], pieces[1]
-
-
-MANY_FRAMES = 50
-STEPS = 1000
-FRAMES_A_STEP = 4
-LEARNING_RATE = 2e-4
-CONSISTENCY = 0.01
 
 
 def joint_steps(config: FitConfig, frames: int) -> int:

@@ -110,7 +110,7 @@ def fit_isp(
 
 
 def _key(config: FitConfig, frames: FitFrames) -> str:
-    """What a kept state belongs to: the version, the settings, the very pixels and what the files say of them."""
+    """What a kept state belongs to."""
     known = [(shot.name, shot.camera, shot.white_balance) for shot in frames.shots]
     settings = repr((__version__, config, known)).encode()
     return digest(settings, frames.pixels.srgb.numpy().tobytes(), frames.pixels.target.numpy().tobytes())
@@ -236,7 +236,11 @@ class _Fit:
             return reading_error(predicted, part) + self.tie(self.colour)
 
         def status() -> str:
-            return "" if report is None else report(self.snapshot())
+            if report is None:
+                return ""
+            isp = deepcopy(self.isp)  # as it would be if this stage ended now
+            self.atoms(isp)
+            return report(isp.eval())
 
         name = f"sRGB to RAW{self.part}"
         self.descent.run(name, loss, tensors, self.config.steps, self.config.learning_rate, status)
@@ -265,12 +269,6 @@ class _Fit:
         set_knee(isp, self.colour, self.samples)
         set_atoms(isp, self.colour, self.shots, self.config)
         set_priors(isp, self.samples, self.config)
-
-    def snapshot(self) -> DictionaryISP:
-        """The ISP as it would be if stage 2 ended now."""
-        isp = deepcopy(self.isp)
-        self.atoms(isp)
-        return isp.eval()
 
     # -- stage 5 ----------------------------------------------------------------------------------------------------
 

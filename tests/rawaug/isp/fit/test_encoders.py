@@ -11,7 +11,6 @@ import torch
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
-from rawaug.isp.fit.config import EncoderTraining
 from rawaug.isp.fit.descent import Descent, decibels
 from rawaug.isp.fit.encoders import joint_steps, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
@@ -21,13 +20,17 @@ LIGHTS = [(1.6, 1.0, 1.9), (1.9, 1.0, 1.6)]
 SETTINGS = {"encoder_widths": (8, 8, 16)}
 
 
-QUICK = EncoderTraining(steps=30, frames=2, pixels=64, learning_rate=1.5e-2, folds=2)
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = {"FRAMES_A_STEP": 2, "ENCODER_PIXELS": 64, "ENCODER_RATE": 1.5e-2, "FOLDS": 2}
+    for name, value in quick.items():
+        monkeypatch.setattr(encoders, name, value)
 
 
-def config(wanted: str, quick: EncoderTraining = QUICK) -> FitConfig:
+def config(wanted: str, encoder_steps: int = 30) -> FitConfig:
     """With ``mse_floor`` the constants are a compromise between the two lights, not one of them."""
     few = {"steps": 0, "curve_steps": 20, "pixels": 512, "batch": 64, "mse_floor": 1e-3, "prior_steps": 40}
-    settings: dict[str, Any] = {**few, "encoder_training": quick, "encoders": wanted}
+    settings: dict[str, Any] = {**few, "encoder_steps": encoder_steps, "encoders": wanted}
     return FitConfig(atoms=2, reach=1.0, shading="off", isp=SETTINGS, **settings)
 
 
@@ -74,7 +77,8 @@ def test_auto_drops_them_where_it_does_not(exact_pair: Callable[..., Pair]) -> N
 def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     exact_pair: Callable[..., Pair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = config("auto", replace(QUICK, steps=1, fewest_frames=4))
+    settings = config("auto", encoder_steps=1)
+    monkeypatch.setattr(encoders, "FEWEST_FRAMES", 4)
     fitted: list[set[str]] = []
     judged: list[tuple[set[str], set[str]]] = []
 
