@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, measure, networks, sensors, synth
+from benchmarks import augment, binning, crops, denoise, measure, sensors, synth
 from benchmarks.noisy_pairs import write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -34,25 +33,6 @@ def test_augmentation_is_compared_in_one_unit() -> None:
     assert "moved" not in rows["upi"], "what other methods move is not known"
 
 
-def test_a_network_is_timed_ready_augmented_in_workers_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    modes: list[str] = []
-
-    def compiled(network: torch.nn.Module, mode: str) -> torch.nn.Module:
-        modes.append(mode)
-        return network
-
-    monkeypatch.setattr(torch, "compile", compiled)
-    tiny = {"minutes": 0.0, "width": 4, "side": 16, "batch": 2, "crop": 32, "repeats": 1, "workers": 0}
-    args = argparse.Namespace(device=CPU, threads=1, compile=["default"], **tiny)
-    figures = networks.measure("DnCNN", args, {"depth": 3})
-    assert modes == ["default"] and all(f"images/s, augmented{label}" in figures for label in ("", ", default"))
-    assert figures["share of augmentation"] == pytest.approx(1 - figures["images/s, augmented"] / figures["images/s"])
-    srgb = torch.zeros(2, 3, 32, 32, dtype=torch.uint8)
-    seen: list[torch.Size] = []
-    assert networks.in_workers(lambda pair: seen.append(pair.noisy.shape), srgb, args) > 0
-    assert seen == 5 * [torch.Size([2, 4, 16, 16])], "one batch to start, four timed"
-
-
 def test_denoising_is_timed_whole_and_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
     denoise.main(["--megapixels", "0.01", "--repeats", "1", "--json", str(out)])
@@ -69,26 +49,6 @@ def test_pairs_on_disk_and_online_are_compared_with_decoding(tmp_path: Path) -> 
     assert list(rows) == ["decode", "online", "npz"] and rows["decode"]["times decoding"] == 1.0
     assert all(row["Mpix a processor second"] > 0 for row in rows.values())
     assert read_picture(tmp_path / "000001.jpg").shape == (3, 32, 48)
-
-
-def test_networks_are_trained_for_equal_minutes_and_drawn_beside_classical_filters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(networks, "PROBE", 2)
-    monkeypatch.setattr(networks, "MIDDLE", 64)
-    args = argparse.Namespace(
-        pictures="demo:", validation="demo:validation", bin=1, batch=2, crop=32, minutes=0.0, device=CPU,
-        precision="32-true", pmrid=None,
-    )  # fmt: skip
-    row = networks.trained("DnCNN", {"width": 4, "depth": 3}, args)
-    assert row["steps"] == 2, "no fewer than the probe's"
-    references = networks.references(args)
-    frame = networks.middles(args)[0]
-    assert frame.raw.shape == (1, 64, 64) and references.keys() == {"NonLocalMeans", "rawaug-small"}
-    assert references["NonLocalMeans"]["psnr"] > row["psnr"] > 0, "a network of two steps is below a filter"
-    rows = {"DnCNN": row | {"parameters": 100.0, "s/Mpix, 1 thread(s)": 0.5}}
-    networks.chart(rows, references, tmp_path / "chart.png")
-    assert read_picture(tmp_path / "chart.png").shape == (3, 480, 1080)
 
 
 def test_pieces_of_frames_are_drawn_beside_a_filter(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers import DnCNN, SelfEnsemble, TotalVariation, tiled
+from denoisers import DnCNN
 from rawaug import DictionaryISP, ISPConfig, RawAugment, RawPairs, wrap
 from rawaug.metrics import patch_psnr, psnr, ssim
 from rawaug.noise import EldNoise, FixedLevels, NoiseModel, PoissonGaussianNoise, SensorNoise, ShotReadNoise
@@ -237,14 +237,6 @@ def test_what_is_no_epoch_is_refused(epoch: Any) -> None:
         refused(lambda thing=thing: thing.set_epoch(epoch), r"an epoch is an integer from 0 to 2\^63 - 1")  # type: ignore[misc]
 
 
-def test_indices_beyond_the_dataset() -> None:
-    pairs = RawPairs(list(SRGB), AUGMENT, crop=8)
-    for index in (2, 2**63, 2**200, -(2**63) - 1):
-        refused(lambda index=index: pairs[index], "out of range", IndexError)  # type: ignore[misc]
-    refused(lambda: RawPairs([], AUGMENT)[0], "out of range", IndexError)
-    assert RawPairs([SRGB[0]], AUGMENT, crop=8, seed=2**80)[0].noisy.isfinite().all()
-
-
 # -- RAW --------------------------------------------------------------------------------------------------------------
 
 
@@ -279,70 +271,9 @@ def test_an_isp_of_another_type_says_so(convert: str) -> None:
     refused(lambda: getattr(copy.deepcopy(ISP), convert)().reverse(SRGB), r"call isp\.float\(\)")
 
 
-@pytest.mark.parametrize("name", list(NOISES))
-def test_noise_of_other_types(name: str) -> None:
-    model = NOISES[name]
-    assert noisy_of(model, PACKED.double()).dtype == torch.float64
-    for dtype in (torch.float16, torch.bfloat16, torch.uint8):
-        refused(lambda dtype=dtype: noisy_of(model, PACKED.to(dtype)), "packed float32 RAW")  # type: ignore[misc]
-
-
 # -- denoisers --------------------------------------------------------------------------------------------------------
 
-DENOISERS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "network": NET,
-    "tiled": lambda noisy, variance: tiled(NET, noisy, variance, tile=8, overlap=2),
-    "ensemble": SelfEnsemble(NET, "GRBG"),
-    "classical": TotalVariation(),
-}
-
-
-@pytest.mark.parametrize("name", list(DENOISERS))
-@pytest.mark.parametrize("size", [(1, 4, 2, 2), (1, 4, 2, 100), (0, 4, 8, 8)])
-@torch.no_grad()
-def test_denoisers_of_any_size(name: str, size: tuple[int, ...]) -> None:
-    for level in (0.0, 1.0):
-        noisy = torch.full(size, level)
-        denoised = DENOISERS[name](noisy, torch.full(size, 1e-4))
-        assert denoised.shape == size and torch.allclose(denoised, noisy, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", list(DENOISERS))
-def test_what_a_denoiser_cannot_take_is_refused_in_one_line(name: str) -> None:
-    denoise = DENOISERS[name]
-    refused(lambda: denoise((PACKED * 255).byte(), VARIANCE), "floating-point RAW")
-    refused(lambda: denoise(PACKED[:, :, :1], VARIANCE[:, :, :1]), "h >= 2")
-    refused(lambda: denoise(PACKED[:, :3], VARIANCE[:, :3]), r"\(2, 3, 12, 16\)|\(2, 3, 8, 8\)")
-    refused(lambda: denoise(PACKED[..., :0, :0], VARIANCE[..., :0, :0]), "h >= 2|at least 2 x 2")
-    if name != "classical":
-        refused(lambda: denoise(PACKED.double(), VARIANCE.double()), "is torch.float64 but the network is")
-
-
-@pytest.mark.parametrize("convert", ["half", "bfloat16", "double"])
-@pytest.mark.parametrize("domain", ["linear", "ksigma"])
-@torch.no_grad()
-def test_networks_of_other_types(convert: str, domain: str) -> None:
-    net = DnCNN(width=4, depth=2, domain=domain).eval()
-    noisy, variance = PACKED, 1e-3 * PACKED + 1e-3
-    full, half = net(noisy, variance), getattr(copy.deepcopy(net), convert)()
-    other = half(getattr(noisy, convert)(), getattr(variance, convert)())
-    assert other.dtype == getattr(noisy, convert)().dtype and (other - full).abs().max() < 0.05
-    refused(lambda: half(noisy, variance), "noisy is torch.float32 but the network is")
-
-
 # -- metrics ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("level", [0.0, 1.0])
-def test_metrics_of_flat_pictures(dtype: torch.dtype, level: float) -> None:
-    flat = torch.full((2, 1, 16, 16), level, dtype=dtype)
-    assert psnr(flat, flat).tolist() == [torch.inf] * 2
-    assert ssim(flat, flat).tolist() == [1.0, 1.0]
-    if level == 0:
-        faint = torch.full_like(flat, 2**-13)  # squared, less than half precision can hold
-        assert psnr(flat, faint).tolist() == pytest.approx([78.27] * 2, abs=0.01)
-        assert patch_psnr(flat, faint).tolist() == pytest.approx([78.27] * 2, abs=0.01)
 
 
 def test_metrics_refuse_what_has_no_score() -> None:

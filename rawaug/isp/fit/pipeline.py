@@ -29,7 +29,7 @@ from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.descent import Descent, cycle_error, decibels, reading_error
-from rawaug.isp.fit.encoders import Refit, gain_left_out, train_encoders, train_jointly
+from rawaug.isp.fit.encoders import FOLDS, Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
 from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
 from rawaug.isp.model import DictionaryISP
@@ -37,8 +37,6 @@ from rawaug.isp.stages import LensShading, Stage
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
 from rawaug.seeding import derived_seed
-
-FOLDS = 4
 
 
 def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:

@@ -128,20 +128,6 @@ def test_a_published_split_is_fitted_once_and_scored_on_every_test_frame(
         compare(settings(tmp_path, test="known", name="other"))
 
 
-def test_table_and_file_say_the_same(
-    laboratory: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = compare(settings(tmp_path, downstream=DownstreamConfig(methods=["dictionary"])))
-    stored = json.loads((tmp_path / "reconstruction" / "table.json").read_text())
-    assert stored["rows"] == rows and stored["settings"]["data"] == "known"
-    assert rows["dictionary"]["psnr_d"] == [40.0, 41.0]
-    assert laboratory.min_side == DownstreamConfig().train.crop  # no picture is too small for a crop
-    said = capsys.readouterr().out
-    for figure in ("45.50 ± 0.71", "15.50 ± 0.71", "75.50 ± 0.71", "33.00", "40.50 ± 0.71", "one of 8 frames left out"):
-        assert figure in said
-    assert f"{stored['mosaic_only_psnr']:.2f} dB (ceiling" in said
-
-
 def test_perturbed_frames_and_invisps_figure_have_rows_and_a_column(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
