@@ -271,8 +271,6 @@ def test_an_isp_of_another_type_says_so(convert: str) -> None:
     refused(lambda: getattr(copy.deepcopy(ISP), convert)().reverse(SRGB), r"call isp\.float\(\)")
 
 
-# -- denoisers --------------------------------------------------------------------------------------------------------
-
 # -- metrics ----------------------------------------------------------------------------------------------------------
 
 

@@ -148,7 +148,7 @@ def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], T
 
 
 @singledispatch
-def settings(model: BaselineISP, pair: Pair) -> dict[str, Any]:
+def settings(model: Any, pair: Pair) -> dict[str, Any]:
     """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
     balanced = model.balanced(pair.white_balance) if pair.balance_known else None
     return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})
