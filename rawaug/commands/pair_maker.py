@@ -104,14 +104,6 @@ class PairMaker:
         self.settings, self.max_pixels = settings, max_pixels
         self.augment = settings.drawing.make()
 
-    def origin(self, picture: Path, content: str) -> Origin:
-        """The origin of the pairs of a picture with this hash."""
-        drawing = self.settings.drawing
-        noise, cfa = drawing.noise_spec, self.augment.cfa
-        return Origin(
-            str(picture), content, drawing.isp, self.settings.isp_sha256, noise, cfa=cfa, form=drawing.form() or None
-        )
-
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """The origin of a picture's pairs, and an iterator over (number, pair)."""
         before, content = picture.stat(), sha256(picture)
@@ -125,7 +117,9 @@ class PairMaker:
                 params = self.augment.sample(srgb, draw_key(self.settings.seed, key, number))
                 yield number, self.augment.apply(srgb, params)
 
-        return self.origin(picture, content), made()
+        drawing = self.settings.drawing
+        isp, cfa, form = (drawing.isp, self.settings.isp_sha256), self.augment.cfa, drawing.form() or None
+        return Origin(str(picture), content, *isp, drawing.noise_spec, cfa=cfa, form=form), made()
 
 
 def noise_levels(pair: RawPair) -> dict[str, float]:

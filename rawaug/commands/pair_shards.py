@@ -16,7 +16,6 @@ made. A shard is there when ``.shards/shard-000012.json`` is, which is written l
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -31,7 +30,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, noise_levels, replayed
-from rawaug.files import parse_object, replacing, write_json
+from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.sampling_config import SamplingConfig
 
@@ -46,19 +45,9 @@ class ShardTask(Task):
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
         self.path, self.first, self.source, self.names, self.per_image = path, first, source, names, per_image
-        self.record = path.parent / ".shards" / f"{path.stem}.json"
-        known = self.known()
+        known = _known(path)
         self.pictures, self.existing = len(names), int(known.get("nsamples", 0))
         self.broken, self.todo = dict(known.get("broken", {})), not known
-
-    def known(self) -> dict[str, Any]:
-        """The record that marks the shard as complete; empty if there is none."""
-        if not self.record.is_file():
-            return {}
-        try:
-            return parse_object(self.record.read_text())
-        except ValueError as error:
-            raise ValueError(f"{self.record}: {error}; delete it to make the shard again") from None
 
     def make(self, maker: PairMaker) -> Outcome:
         """Write the shard and its record."""
@@ -75,8 +64,28 @@ class ShardTask(Task):
                     _add_sample(tar, f"{index:08d}_{number}", pair, _described(pair, maker, origin, name, number))
                     made += 1
         size = self.path.stat().st_size
-        write_json({"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}, self.record)
+        record = {"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}
+        write_json(record, _record(self.path))
         return Outcome(made, broken)
+
+
+def _path(out: Path, number: int) -> Path:
+    return out / f"shard-{number:06d}.tar"
+
+
+def _record(shard: Path) -> Path:
+    return shard.parent / ".shards" / f"{shard.stem}.json"
+
+
+def _known(shard: Path) -> dict[str, Any]:
+    """The record that marks a shard as complete; empty if there is none."""
+    record = _record(shard)
+    if not record.is_file():
+        return {}
+    try:
+        return parse_object(record.read_text())
+    except ValueError as error:
+        raise ValueError(f"{record}: {error}; delete it to make the shard again") from None
 
 
 def shard_tasks(
@@ -86,10 +95,9 @@ def shard_tasks(
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)
-    starts = range(0, len(names), per_shard)
     return [
-        ShardTask(out / f"shard-{k:06d}.tar", start, source, names[start : start + per_shard], per_image)
-        for k, start in enumerate(starts)
+        ShardTask(_path(out, k), start, source, names[start : start + per_shard], per_image)
+        for k, start in enumerate(range(0, len(names), per_shard))
     ]
 
 
@@ -97,10 +105,9 @@ def shard_settings(
     pictures: Sequence[Path], source: Path, per_image: int, per_shard: int, max_pixels: int
 ) -> dict[str, object]:
     """Settings that must not change between runs: adding a picture would shift all later shards."""
-    listed = os.fsencode("\n".join(_names(pictures, source)))  # names need not be UTF-8
     return {
         "pictures": len(pictures),
-        "names_sha256": hashlib.sha256(listed).hexdigest(),
+        "names_sha256": digest(os.fsencode("\n".join(_names(pictures, source)))),  # names need not be UTF-8
         "per_image": per_image,
         "per_shard": per_shard,
         "max_pixels": max_pixels,
@@ -120,9 +127,8 @@ def _described(pair: RawPair, maker: PairMaker, origin: Origin, name: str, numbe
 
 
 def _add_sample(tar: tarfile.TarFile, key: str, pair: RawPair, described: Mapping[str, Any]) -> None:
-    files = {"clean.npy": _npy(pair.clean), "json": json.dumps(described, sort_keys=True).encode()}
-    files["noisy.npy"] = _npy(pair.noisy)
-    for ending, content in sorted(files.items()):
+    text = json.dumps(described, sort_keys=True).encode()
+    for ending, content in {"clean.npy": _npy(pair.clean), "json": text, "noisy.npy": _npy(pair.noisy)}.items():
         entry = tarfile.TarInfo(f"{key}.{ending}")  # of nobody, at the epoch
         entry.size = len(content)
         tar.addfile(entry, io.BytesIO(content))
@@ -155,17 +161,16 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
     return replayed(AugmentParams.from_tensors(tensors), origin, described["picture"], picture, isp)
 
 
-def finish(tasks: Sequence[ShardTask], settings: Settings, out: Path) -> bool:
-    """Write the index and the dataset card once all shards exist; returns whether they do."""
-    if not all(task.record.is_file() for task in tasks):
-        return False
-    records = [task.known() for task in tasks]
+def finish(out: Path, count: int, settings: Settings) -> None:
+    """Write the index and the dataset card once all shards exist."""
+    records = [_known(_path(out, number)) for number in range(count)]
+    if not all(records):
+        return
     shards = [{key: record[key] for key in ("url", "nsamples", "filesize")} for record in records]
     index = {"__kind__": "wids-shard-index-v1", "wids_version": 1, "name": "rawaug pairs", "shardlist": shards}
     write_json(index, out / "index.json")
     with replacing(out / "README.md") as partial:
         partial.write_text(card(shards, settings), encoding="utf-8")
-    return True
 
 
 def _form(drawing: SamplingConfig) -> str:

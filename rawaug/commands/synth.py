@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -32,7 +32,6 @@ from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import LOCK, find_weights, locked, sha256
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.plugin.augment import Sampling
 from rawaug.plugin.sampling_config import SamplingConfig
 from rawaug.progress import progress
 
@@ -68,9 +67,9 @@ def run(
         shard: K/N makes part K of N, K from 1 to N, for job arrays; all N write to the same folder.
         per_shard: pictures per tar file, with --format webdataset.
     """
-    rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
     drawn = vars(drawing or SamplingConfig())
     noise = value_of(drawn["noise"]) if isinstance(drawn["noise"], str) else drawn["noise"]  # [shot_var, read_var]
+    rest: dict[str, Any] = {"workers": workers, "max_pixels": max_pixels, "shard": shard, "per_shard": per_shard}
     print_synthesis(synth(pictures, out, format, per_image, seed=seed, **rest, **drawn | {"noise": noise}))
 
 
@@ -91,9 +90,7 @@ def synth(
     out: str | Path,
     format: Format = "dng",
     per_image: int = 1,
-    isp: str = "universal",
-    noise: str | Sequence[float] = "cycleisp_sidd",
-    sampling: Sampling = "convex",
+    *,
     seed: int = 0,
     workers: int | None = None,
     max_pixels: int = MAX_PIXELS,
@@ -108,17 +105,13 @@ def synth(
         out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
         format: dng, npz, tiff, png or webdataset; dng for target raw, png for srgb only.
         per_image: pairs per picture; may grow from run to run, but not in shards.
-        isp: name of a shipped ISP, or an ISP's file.
-        noise: name of a preset or a measured camera, (shot_var, read_var), or ``"camera"``.
-        sampling: of camera settings, as in :class:`rawaug.RawAugment`.
         seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
         max_pixels: larger pictures are refused before they are decoded.
         shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
         per_shard: pictures in a tar file.
-        drawn: ``camera``, ``light``, ``tone``, ``exposure``, ``iso``, ``cfa``, ``target``, ``jpeg``, ``burst``,
-            ``motion`` and ``stops``, as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
+        drawn: ``isp``, ``noise``, ``camera``, ..., as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
 
     Raises:
         FileNotFoundError: if there is no such folder, picture or ISP.
@@ -130,25 +123,25 @@ def synth(
     source, out = Path(source).resolve(), Path(out)
     pictures = _pictures(source, out)
     source = source.parent if source.is_file() else source
-    settings = _settings(format, per_image, seed, isp=isp, noise=noise, sampling=sampling, **drawn)
+    settings = _settings(format, per_image, seed, drawn)
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
     cfa = PairMaker(settings, max_pixels).augment.cfa  # raises for a wrong name here, not in a worker
     if format == "dng" and cfa not in CFA.__members__:
         raise ValueError(f"format dng holds Bayer mosaics, not {cfa}; use npz, tiff or webdataset")
-    result = Synthesis(out)
+    stored, tasks = settings.stored(), list[Task]()
     with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
         if format == "webdataset":
-            shards = pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
-            fixed = pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
-            require_same_settings(out / "synth.json", _portable(settings) | fixed)
-            _work_off(shards[part - 1 :: parts], settings, max_pixels, workers, result)
-            pair_shards.finish(shards, settings, out)
+            tasks += pair_shards.shard_tasks(pictures, source, out, per_image, per_shard)
+            stored["isp"] = Path(settings.drawing.isp).name  # its path differs between machines
+            stored |= pair_shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
         else:
-            tasks = list(picture_tasks(pictures, source, out, per_image))
-            require_same_settings(out / "synth.json", settings.stored())
-            _work_off(tasks[part - 1 :: parts], settings, max_pixels, workers, result)
+            tasks += picture_tasks(pictures, source, out, per_image)
+        require_same_settings(out / "synth.json", stored)
+        result = _worked_off(out, tasks[part - 1 :: parts], settings, max_pixels, workers)
+        if format == "webdataset":
+            pair_shards.finish(out, len(tasks), settings)
     result.seconds = time.perf_counter() - start
     if result.pictures and len(result.broken) == result.pictures:
         count, reason = result.pictures, min(result.broken.values())
@@ -164,38 +157,33 @@ def part_of(shard: str) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _settings(format: Format, per_image: int, seed: int, **drawn: Any) -> Settings:
+def _settings(format: Format, per_image: int, seed: int, drawn: dict[str, Any]) -> Settings:
     if format not in get_args(Format) or per_image < 1:
         wanted = f"format must be one of {', '.join(get_args(Format))} and per_image at least 1"
         raise ValueError(f"{wanted}, got {format} and {per_image}")
-    target = drawn.get("target") or "raw"
+    drawing = SamplingConfig(**drawn)
+    isp, target = Path(drawing.isp), drawing.target or "raw"
     if target not in TARGETS.get(format, (target,)):
         able = [name for name in get_args(Format) if target in TARGETS.get(name, (target,))]
         raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(able)}")
-    isp = drawn["isp"]
-    drawing = SamplingConfig(**drawn | {"isp": str(isp) if not Path(isp).suffix else str(Path(isp).resolve())})
-    return Settings(format, drawing, sha256(find_weights(drawing.isp)), seed)
+    drawing = replace(drawing, isp=str(isp.resolve() if isp.suffix else isp))
+    return Settings(format, drawing, sha256(find_weights(isp)), seed)
 
 
-def _portable(settings: Settings) -> dict[str, object]:
-    """Settings without the path of the ISP's file, which differs between machines."""
-    return {**settings.stored(), "isp": Path(settings.drawing.isp).name}
-
-
-def _work_off(
-    tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None, result: Synthesis
-) -> None:
+def _worked_off(
+    out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None
+) -> Synthesis:
     """Run the unfinished tasks and add up their outcomes."""
-    result.pictures = sum(task.pictures for task in tasks)
-    result.existing = sum(task.existing for task in tasks)
+    result = Synthesis(out, sum(task.pictures for task in tasks), existing=sum(task.existing for task in tasks))
     for task in tasks:
         result.broken |= task.broken
     todo = [task for task in tasks if task.todo]
     outcomes = _done(todo, settings, max_pixels, workers)
-    for outcome in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
-        result.made += outcome.made
-        result.broken |= outcome.broken
+    for made, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
+        result.made += made
+        result.broken |= broken
     result.broken = dict(sorted(result.broken.items()))
+    return result
 
 
 def _pictures(source: Path, out: Path) -> list[Path]:
