@@ -27,7 +27,7 @@ from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.own_noise import own_noise_note
-from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, figures_of, levels_note, verdict
+from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, figures_of, formatted, levels_note, verdict
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -266,5 +266,4 @@ def _every_image(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> P
 
 def _both(image: Mapping[str, Any], suffix: str) -> str:
     """PSNR / SSIM, a dash for what is no number."""
-    figures = ((image.get(f"psnr{suffix}"), 2), (image.get(f"ssim{suffix}"), 4))
-    return " / ".join("-" if value is None else f"{value:.{digits}f}" for value, digits in figures)
+    return " / ".join(formatted(key, image.get(f"{key}{suffix}")) or "-" for key in ("psnr", "ssim"))

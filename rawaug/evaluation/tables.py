@@ -25,13 +25,36 @@ PANEL = 256
 
 ACROSS = 4
 """Panels side by side, at most: more make captions too small to read on a page."""
-
-METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
-"""Of an image: on the mosaic, and developed."""
-
-
 WIDTH = 140
 """Columns of a printed table where stdout is no terminal."""
+MATTERS = 0.05
+"""dB; a smaller gain is no reason to prefer an arm."""
+
+FIGURES = {
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "psnr_srgb": "PSNR, sRGB",
+    "ssim_srgb": "SSIM, sRGB",
+    "own_noise": "own noise",
+}
+"""Of an image, on the mosaic and developed; the last one is the references' share of the squared error."""
+METRICS = tuple(FIGURES)[:4]
+
+Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+"""By arm, one entry a seed: summaries by kind."""
+Columns = Mapping[str, tuple[str, str]]
+"""Of a table: which summary and which figure of it."""
+PLAIN: Columns = {name: ("plain", key) for key, name in FIGURES.items()}
+ENSEMBLE: Columns = {name: ("self_ensemble", key) for key, name in FIGURES.items()}
+QUARTERS: Columns = {
+    f"{FIGURES[key]}, {part} 25%": ("plain", f"{key}_{part}25") for key in METRICS for part in ("worst", "best")
+}
+PRINTED: Columns = {
+    **dict(list(PLAIN.items())[:2]),
+    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
+    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
+    **PLAIN,
+}
 
 
 @dataclass
@@ -79,42 +102,15 @@ def mean_and_spread(values: Sequence[float], digits: int) -> str:
     return mean if len(values) < 2 else f"{mean} ± {statistics.stdev(values):.{digits}f}"
 
 
-PLAIN = {
-    "PSNR (dB)": ("plain", "psnr"),
-    "SSIM": ("plain", "ssim"),
-    "PSNR, sRGB": ("plain", "psnr_srgb"),
-    "SSIM, sRGB": ("plain", "ssim_srgb"),
-    "own noise": ("plain", "own_noise"),
-}
-"""Columns of a table: which summary and which figure; the last one is the references' share of the squared error."""
-
-ENSEMBLE = {name: ("self_ensemble", key) for name, (_, key) in PLAIN.items()}
-
-COLUMNS = {
-    **dict(list(PLAIN.items())[:2]),
-    "PSNR, self-ensemble": ("self_ensemble", "psnr"),
-    "SSIM, self-ensemble": ("self_ensemble", "ssim"),
-    **dict(list(PLAIN.items())[2:]),
-}
-"""Those of the printed table."""
-
-QUARTERS = {
-    f"{figure}, {part}": ("plain", f"{key}_{part.replace(' ', '').rstrip('%')}")
-    for figure, key in (
-        ("PSNR (dB)", "psnr"),
-        ("SSIM", "ssim"),
-        ("PSNR, sRGB", "psnr_srgb"),
-        ("SSIM, sRGB", "ssim_srgb"),
-    )
-    for part in ("worst 25%", "best 25%")
-}
-"""Of a table of the page."""
-
-Runs = Mapping[str, Sequence[Mapping[str, Any]]]
+def formatted(key: str, value: float | None) -> str:
+    """A figure as tables have it; empty where there is none."""
+    if value is None:
+        return ""
+    return f"{value:.0%}" if key == "own_noise" else f"{value:.{_digits(key)}f}"
 
 
-MATTERS = 0.05
-"""dB; a smaller gain is no reason to prefer an arm."""
+def _digits(key: str) -> int:
+    return 2 if "psnr" in key else 4
 
 
 class Figures(NamedTuple):
@@ -125,9 +121,7 @@ class Figures(NamedTuple):
     best: set[tuple[str, int]]
 
 
-def figures_of(
-    results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Mapping[str, tuple[str, str]]
-) -> Figures:
+def figures_of(results: Runs, classical: Mapping[str, Mapping[str, Any]] | None, columns: Columns) -> Figures:
     """The noisy input, classical denoisers and the arms, without columns and methods that have no figure."""
     plain = next(iter(results.values()))[0]["plain"]
     noisy = {key.replace("_noisy", ""): value for key, value in plain.items() if "_noisy" in key}
@@ -141,8 +135,8 @@ def figures_of(
     best: set[tuple[str, int]] = set()
     for k, key in enumerate(keys):
         means = {name: round(statistics.fmean(row[k]), _digits(key)) for name, row in values.items() if row[k]}
-        means = {} if key == "own_noise" else means
-        best |= {(name, k) for name, mean in means.items() if len(means) > 1 and mean == max(means.values())}
+        if len(means) > 1 and key != "own_noise":
+            best |= {(name, k) for name, mean in means.items() if mean == max(means.values())}
     rows = {name: [_cell(key, found) for key, found in zip(keys, row, strict=True)] for name, row in values.items()}
     return Figures([list(columns)[k] for k in kept], rows, best)
 
@@ -152,13 +146,9 @@ def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[floa
 
 
 def _cell(key: str, values: Sequence[float]) -> str:
-    if key == "own_noise" and values:
-        return f"{statistics.fmean(values):.0%}"
-    return mean_and_spread(values, _digits(key)) if values else ""
-
-
-def _digits(key: str) -> int:
-    return 2 if "psnr" in key else 4
+    if len(values) > 1 and key != "own_noise":
+        return mean_and_spread(values, _digits(key))
+    return formatted(key, statistics.fmean(values) if values else None)
 
 
 def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
@@ -171,15 +161,15 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
         return ""
     arm = max(means, key=means.__getitem__)
     runs = [run["plain"] for run in results[arm]]
-    noisy = {**runs[0], "images": [{**image, "psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]}
-    noisy |= {key: runs[0][f"{key}_noisy"] for key in ("psnr", "psnr_srgb") if f"{key}_noisy" in runs[0]}
+    noisy = {key.removesuffix("_noisy"): value for key, value in runs[0].items() if key.endswith("_noisy")}
+    noisy["images"] = [{"psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]
     scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {"the noisy input": noisy}
     other = max(scored, key=lambda name: scored[name]["psnr"])
     gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
     gain = statistics.fmean(gains)
-    better = gain >= MATTERS
-    not_enough = f"{arm}, the best arm, scores {abs(gain):.2f} dB {'more' if gain >= 0 else 'less'}"
-    said = [f"{gain:+.2f} dB over {other}" if better else not_enough]
+    said = [f"{arm}, the best arm, scores {abs(gain):.2f} dB {'more' if gain >= 0 else 'less'}"]
+    if better := gain >= MATTERS:
+        said = [f"{gain:+.2f} dB over {other}"]
     if len(gains) > 1:
         spread = statistics.stdev(gains)
         said += [f"{'within' if abs(gain) <= spread else 'more than'} the noise of the seeds (± {spread:.2f} dB)"]
@@ -221,7 +211,7 @@ def levels_note(summary: Mapping[str, Any]) -> str:
 
 def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Methods x (PSNR, SSIM) on the mosaic, plain and self-ensemble, and on sRGB; one entry a seed in an arm's list."""
-    table = figures_of(results, classical, COLUMNS)
+    table = figures_of(results, classical, PRINTED)
     print_rows(title, ["arm", *table.columns], [[method, *cells] for method, cells in table.rows.items()])
     if note := levels_note(next(iter(results.values()))[0]["plain"]):
         print(note)
@@ -230,27 +220,18 @@ def print_table(results: Runs, title: str, classical: Mapping[str, Mapping[str, 
 def print_scores(result: Mapping[str, Any]) -> None:
     """The table of ``rawaug evaluate``."""
     denoiser = result["kind"] == "denoiser"
-    head = ["PSNR (dB)", "SSIM", "PSNR, sRGB", "SSIM, sRGB", "own noise"]
-    metrics = (*METRICS, "own_noise")[: (5 if "own_noise" in result else 4) if denoiser else 1]
-    images = [[_name_of(image), *_cells(image, "{}", metrics)] for image in result["images"]]
+    figures = [key for key in (FIGURES if denoiser else ("psnr",)) if key != "own_noise" or key in result]
+
+    def row(name: str, scores: Mapping[str, Any], form: str = "{}") -> list[str]:
+        return [name, *(formatted(key, scores.get(form.format(key))) for key in figures)]
+
+    images = [row(f"{one['name']}{' *' if one.get('levels_from_clean') else ''}", one) for one in result["images"]]
     shown = {"mean": "{}", "worst 25%": "{}_worst25", "best 25%": "{}_best25", "noisy": "{}_noisy"}
-    means = [[name, *_cells(result, key, metrics)] for name, key in shown.items() if key.format("psnr") in result]
+    means = [row(name, result, form) for name, form in shown.items() if form.format("psnr") in result]
     others = {"mean, without self-ensemble": result["plain"]} if "plain" in result else {}
-    others |= result.get("classical", {})
-    means += [[name, *_cells(scores, "{}", metrics)] for name, scores in others.items()]
+    means += [row(name, scores) for name, scores in (others | result.get("classical", {})).items()]
     title = "PSNR_d, RAW denoising" if denoiser else "PSNR_r, RAW reconstruction"
     title += f", self-ensemble of {result['views']} views" if result.get("self_ensemble") else ""
-    print_rows(f"{title}: {result['data']}", ["image", *head[: len(metrics)]], images, means)
+    print_rows(f"{title}: {result['data']}", ["image", *(FIGURES[key] for key in figures)], images, means)
     if note := levels_note(result):
         print(note)
-
-
-def _name_of(image: Mapping[str, Any]) -> str:
-    """With an asterisk where the noise levels were measured against the clean frame."""
-    return f"{image['name']} *" if image.get("levels_from_clean") else str(image["name"])
-
-
-def _cells(result: Mapping[str, Any], key: str, metrics: Sequence[str]) -> list[str]:
-    found = [(metric, result.get(key.format(metric))) for metric in metrics]
-    formats = {"psnr": ".2f", "psnr_srgb": ".2f", "own_noise": ".0%"}
-    return ["" if value is None else f"{value:{formats.get(metric, '.4f')}}" for metric, value in found]
