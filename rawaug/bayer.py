@@ -6,11 +6,10 @@ always in the order R, Gr, Gb, B (Gr is the green of the red row), so that a net
 
 A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` only moves pixels,
 :meth:`CFA.turned` says what the pattern becomes, and :func:`turn_keeping_cfa` crops a line where that brings it back.
-:class:`RandomCrop`, :class:`RandomTurn`, :class:`Pack` and :class:`Unpack` are the same as modules.
 
-:class:`Pattern` is any other array: X-Trans (Fujifilm; 6 x 6 sites, 20 green, 8 red, 8 blue, as LibRaw reads it from an
-origin where it begins with G B G G R G) and Quad-Bayer (each site of a Bayer cell is 2 x 2 pixels). Their RAW has no
-packed form: networks read the mosaic with the pattern as one-hot planes.
+:class:`Pattern` is any other array: X-Trans (Fujifilm; 6 x 6 sites, as LibRaw reads it from an origin where it begins
+with G B G G R G) and Quad-Bayer (each site of a Bayer cell is 2 x 2 pixels). Their RAW has no packed form: networks
+read the mosaic with the pattern as one-hot planes.
 """
 
 from __future__ import annotations
@@ -162,11 +161,7 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
 
 @lru_cache
 def demosaicing(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
-    """Four stencils ``(4, K, K)``, and which one makes a colour at a site: ``kinds[colour][row][column]``, 0 for none.
-
-    Raises:
-        ValueError: if the method is unknown.
-    """
+    """Four stencils ``(4, K, K)``, and which makes a colour at a site: ``kinds[colour][row][column]``, 0 for none."""
     if method not in STENCILS:
         raise ValueError(f"demosaicing {method!r} is unknown; use one of {', '.join(STENCILS)}")
     cross, along_row, diagonal = STENCILS[method]
@@ -214,7 +209,7 @@ def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
 
 def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
-    if top % 2 or left % 2 or height % 2 or width % 2:
+    if any(value % 2 for value in (top, left, height, width)):
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
     return _cropped(raw, top, left, height, width)
 
@@ -471,11 +466,8 @@ class Pattern:
         height, width = raw.shape[-2:]
         if height % self.period or width % self.period:
             raise ValueError(f"{height} x {width} must be multiples of {self.period} to turn {self.name}; crop it")
-        turned = turn(raw, view)
-        rows, columns = self.shift_after(view)
-        height, width = (
-            side - bool(shift) * self.period for side, shift in zip(turned.shape[-2:], (rows, columns), strict=True)
-        )
+        turned, (rows, columns) = turn(raw, view), self.shift_after(view)
+        height, width = turned.shape[-2] - bool(rows) * self.period, turned.shape[-1] - bool(columns) * self.period
         if height < 1 or width < 1:
             raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
         return turned[..., rows : rows + height, columns : columns + width]
@@ -519,9 +511,6 @@ PATTERNS: dict[str, Pattern] = {
 
 def pattern(name: str) -> Pattern:
     """The pattern of this name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
-
-    Raises:
-        ValueError: if there is none.
 
     Example:
         >>> pattern("QUAD-RGGB").rows

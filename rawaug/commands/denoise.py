@@ -166,16 +166,16 @@ def denoise_file(
         raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
-    for path in (out, *([] if preview is None else [Path(preview)])):
-        if path.exists() and not overwrite:
+    for path in (out, *filter(None, [preview])):
+        if Path(path).exists() and not overwrite:
             raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
         require_writable(path)
     if preview is not None and Path(preview).suffix.lower() not in (".jpg", ".jpeg", ".png"):
         raise ValueError(f"{preview}: the preview is a .jpg or .png")
-    method = _made(method)
+    method = _checked(method, strength)
     if preview is not None and method.linear:
         raise ValueError(f"--preview {preview}: is of mosaics; open a linear DNG in a RAW developer")
-    done = _denoise_file(source, out, method, noise, _checked(strength, method))
+    done = _denoise_file(source, out, method, noise, strength)
     if preview is not None:
         frame = read_raw(out)
         Path(preview).parent.mkdir(parents=True, exist_ok=True)
@@ -183,16 +183,14 @@ def denoise_file(
     return done
 
 
-def _made(method: FrameDenoiser | str | Path) -> FrameDenoiser:
-    return network_denoiser(method) if isinstance(method, (str, Path)) else method
-
-
-def _checked(strength: float, method: FrameDenoiser) -> float:
-    if method.linear and strength != 1.0:
+def _checked(method: FrameDenoiser | str | Path, strength: float) -> FrameDenoiser:
+    """What denoises, if it can be applied at this strength."""
+    made = network_denoiser(method) if isinstance(method, (str, Path)) else method
+    if made.linear and strength != 1.0:
         raise ValueError(f"--strength {strength}: of a linear DNG it is 1; there is no noisy full colour to mix in")
     if not 0.0 <= strength <= 1.0:
         raise ValueError(f"strength must be between 0 and 1, got {strength}; --noise takes higher levels")
-    return strength
+    return made
 
 
 def _denoise_file(
@@ -223,10 +221,7 @@ def _denoise_file(
 
 
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
-    """Clip, in place, what a digital number cannot hold; its share of the sites. It is none where black is high enough.
-
-    A camera with black level 0 has already clipped its noise there, so nothing is lost.
-    """
+    """Clip, in place, what a digital number cannot hold; its share of the sites."""
     below = 0
     for (i, j), black in zip(frame.cfa.sites, frame.black, strict=True):
         plane = mosaic[0, i::2, j::2]
@@ -259,8 +254,7 @@ def denoise_folder(
     source, out = Path(source), Path(out)
     targets = _targets(source, out)
     require_writable(out, folder=True)
-    made = _made(method)
-    strength = _checked(strength, made)
+    made = _checked(method, strength)
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)

@@ -15,13 +15,12 @@ from __future__ import annotations
 
 import json
 import logging
-import time
+import timeit
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +31,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
+from rawaug.errors import extra
 from rawaug.evaluation.contestants import feeds, session_of
 from rawaug.evaluation.scores import frozen_sample
 from rawaug.files import find_weights, read_header, replacing
@@ -43,36 +43,32 @@ from rawaug.seeding import keyed_generator
 
 TOLERANCE = 1e-4
 """Largest difference between ONNX Runtime and PyTorch, white at 1."""
-NEEDED = ("onnx", "onnxscript", "onnxruntime")
 NODES = 33
 """Of a .cube along each axis."""
 SIDE = 512
 """Mosaic pixels on the longer side of the frame on which both are run and timed."""
 
 
-def require_onnx(way_out: str = "") -> None:
-    """Raise ValueError if a package that writes or runs ONNX is missing; ``way_out`` ends the message."""
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        raise ValueError(f"export to ONNX needs {', '.join(missing)}: pip install 'rawaug[export]'{way_out}")
-
-
-def to_onnx(
+def write_onnx(
     model: nn.Module, inputs: dict[str, Tensor], output: str, path: Path, stated: Mapping[str, str] | None = None
-) -> None:
-    """One ONNX file of float32 of ``model(*inputs)``; height and width of four-dimensional inputs are free.
+) -> Any:
+    """Write ``model(*inputs)`` as ONNX of float32, with metadata; the ONNX Runtime session of it.
 
-    ``stated`` are its metadata.
+    Height and width of four-dimensional inputs are free.
     """
+    with extra("export"):
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
     with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
         warnings.simplefilter("ignore")
         shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
         program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
-        onnx = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
-        assert onnx is not None
-        onnx.model.metadata_props.update(stated or {})
-        onnx.save(str(path), external_data=False)
+        made = torch.onnx.export(program, input_names=list(inputs), output_names=[output], dynamo=True, verbose=False)
+        assert made is not None
+        made.model.metadata_props.update(stated or {})
+        made.save(str(path), external_data=False)
+    return session_of(path)
 
 
 @contextmanager
@@ -87,8 +83,9 @@ def errors_only(name: str) -> Iterator[None]:
         logger.setLevel(before)
 
 
-def require_equal(result: Any, expected: Tensor, path: Path) -> float:
-    """The largest difference between ONNX Runtime's result and PyTorch's, unless it is above :data:`TOLERANCE`."""
+def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:
+    """The largest difference between ONNX Runtime and PyTorch; ValueError if it is above :data:`TOLERANCE`."""
+    (result,) = session.run(None, feeds(list(inputs), list(inputs.values())))
     difference = (torch.from_numpy(result) - expected).abs().max().item()
     if not difference <= TOLERANCE:
         raise ValueError(f"{path}: ONNX Runtime differs from PyTorch by {difference:.1e}, more than {TOLERANCE}")
@@ -101,22 +98,20 @@ def export_isp(isp: DictionaryISP, out: str | Path, white_balance: Sequence[floa
     if out.suffix not in ("", *WRITERS):
         raise ValueError(f"{out}: an ISP is exported to {', '.join(WRITERS)}, or to a folder with all of them")
     files = [out] if out.suffix else [out / f"isp{suffix}" for suffix in WRITERS]
-    if any(file.suffix == ".onnx" for file in files):
-        require_onnx("; .json and .cube files can be written without, one by one")
     for file in files:
-        WRITERS[file.suffix](isp, file, white_balance)
+        with replacing(file) as partial:
+            WRITERS[file.suffix](isp, partial, file, white_balance)
     return files
 
 
-def _write_json(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+def _write_json(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
     table = isp.reverse_table(isp.typical_setting(white_balance), NODES)
     values = [[round(value, 7) for value in row] for row in table.tolist()]
     content = isp.description(white_balance) | {"lut": {"size": NODES, "fastest": "red", "values": values}}
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(content) + "\n")
+    partial.write_text(json.dumps(content) + "\n")
 
 
-def _write_cube(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+def _write_cube(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
     setting = isp.typical_setting(white_balance)
     gains = " ".join(f"{gain:.4f}" for gain in setting.gains[0].tolist())
     lines = [
@@ -127,28 +122,25 @@ def _write_cube(isp: DictionaryISP, path: Path, white_balance: Sequence[float] |
         "DOMAIN_MAX 1.0 1.0 1.0",
         *(" ".join(f"{value:.7f}" for value in row) for row in isp.reverse_table(setting, NODES).tolist()),
     ]
-    with replacing(path) as partial:
-        partial.write_text("\n".join(lines) + "\n")
+    partial.write_text("\n".join(lines) + "\n")
 
 
-def _write_onnx(isp: DictionaryISP, path: Path, white_balance: Sequence[float] | None) -> None:
+def _write_onnx(isp: DictionaryISP, partial: Path, path: Path, white_balance: Sequence[float] | None) -> None:
     setting = isp.typical_setting(white_balance)
     srgb = torch.rand(1, 3, 70, 90, generator=keyed_generator(0, "export"))
     inputs = {"srgb": srgb, "matrix": setting.matrix.detach(), "gains": setting.gains.detach()}
-    with replacing(path) as partial:
-        to_onnx(ReversePass(isp).eval(), inputs, "raw", partial)
-        (result,) = session_of(partial).run(None, feeds(list(inputs), list(inputs.values())))
-        with torch.no_grad():
-            expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
-        require_equal(result, expected, path)
+    session = write_onnx(ReversePass(isp).eval(), inputs, "raw", partial)
+    with torch.no_grad():
+        expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
+    difference_from(expected, session, inputs, path)
 
 
-WRITERS: dict[str, Callable[[DictionaryISP, Path, Sequence[float] | None], None]] = {
+WRITERS: dict[str, Callable[[DictionaryISP, Path, Path, Sequence[float] | None], None]] = {
     ".json": _write_json,
     ".cube": _write_cube,
     ".onnx": _write_onnx,
 }
-"""By extension."""
+"""By extension: an ISP to a file that gets another name."""
 
 
 class ReversePass(nn.Module):
@@ -172,15 +164,6 @@ def _places(image: Tensor) -> Tensor:
     height, width = rows[..., -1:, -1:], columns[..., -1:, -1:]
     half_diagonal = 0.5 * (height.square() + width.square()).sqrt()
     return torch.cat([rows - 0.5 - height / 2, columns - 0.5 - width / 2], dim=1) / half_diagonal
-
-
-class Exported(NamedTuple):
-    """What was written, the largest difference from PyTorch with white at 1, and seconds a mosaic megapixel."""
-
-    out: Path
-    difference: float
-    seconds_onnx: float
-    seconds_torch: float
 
 
 def run(
@@ -211,35 +194,34 @@ def run(
         return
     if white_balance is not None:
         raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
-    done = export(weights, out, frame)
-    print(f"{done.out}: {done.out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {done.difference:.1e}")
-    seconds = f"ONNX Runtime {done.seconds_onnx:.2f} s a megapixel, PyTorch {done.seconds_torch:.2f} s"
-    print(f"{seconds} ({torch.get_num_threads()} threads)")
+    print(export(weights, out, frame))
 
 
-def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None) -> Exported:
-    """Write ``denoiser`` to the ONNX file ``out``, whole or not at all; see :func:`run`."""
+def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None) -> str:
+    """Write a denoiser as ONNX; a line on its size, its difference from PyTorch and its time."""
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
-    require_onnx()
     model, info = denoisers.load(find(denoiser))
     names = ["noisy", "variance"][: 1 + model.reads_variance]
-    images = comparison_frame(frame)[: len(names)]
+    inputs = dict(zip(names, comparison_frame(frame), strict=False))
     example = torch.rand(1, model.channels, 70, 90)
     examples = dict(zip(names, (example, 1e-3 * example + 1e-5), strict=False))
     stated = {"stride": str(model.stride), "upscale": str(model.upscale), "info": json.dumps(info)}
     with replacing(out) as partial:
-        to_onnx(model, examples, "denoised", partial, stated)
-        session, values = session_of(partial), feeds(names, images)
+        session = write_onnx(model, examples, "denoised", partial, stated)
         with torch.inference_mode():
-            expected = model(*images)
-            seconds_torch = _fastest(lambda: model(*images))
-        (result,) = session.run(None, values)
-        difference = require_equal(result, expected, out)
+            expected = model(*inputs.values())
+            seconds_torch = _fastest(lambda: model(*inputs.values()))
+        difference = difference_from(expected, session, inputs, out)
+        values = feeds(names, list(inputs.values()))
         seconds_onnx = _fastest(lambda: session.run(None, values))
-    megapixels = images[0].numel() / 1e6
-    return Exported(out, difference, seconds_onnx / megapixels, seconds_torch / megapixels)
+    megapixels = inputs["noisy"].numel() / 1e6
+    return (
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.1e}\n"
+        f"ONNX Runtime {seconds_onnx / megapixels:.2f} s a megapixel, PyTorch {seconds_torch / megapixels:.2f} s "
+        f"({torch.get_num_threads()} threads)"
+    )
 
 
 def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
@@ -256,10 +238,5 @@ def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
     return packed, bayer.noise_variance(packed, shot_var, read_var)
 
 
-def _fastest(call: Callable[[], Any], repeats: int = 3) -> float:
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)
+def _fastest(call: Callable[[], Any]) -> float:
+    return min(timeit.repeat(call, number=1, repeat=3))

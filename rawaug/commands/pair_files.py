@@ -40,7 +40,7 @@ class PictureTask(Task):
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
         self.picture, self.key, self.stem = picture, key, stem
-        self.numbers = [k for k in range(per_image) if not params_file(_numbered(stem, k)).exists()]
+        self.numbers = [k for k in range(per_image) if not Path(f"{stem}_{k}.safetensors").exists()]
         self.pictures, self.existing, self.todo = 1, per_image - len(self.numbers), bool(self.numbers)
         self.broken = {}  # what cannot be read is tried again
 
@@ -51,7 +51,7 @@ class PictureTask(Task):
         except (OSError, ValueError) as error:
             return Outcome(0, {self.key: str(error)})
         for number, pair in pairs:
-            write_pair(_numbered(self.stem, number), pair, maker.augment, maker.settings.format, origin)
+            write_pair(Path(f"{self.stem}_{number}"), pair, maker.augment, maker.settings.format, origin)
         return Outcome(len(self.numbers), {})
 
 
@@ -78,15 +78,11 @@ def _short(name: str) -> str:
     return encoded[: LONGEST_STEM - 20].decode("utf-8", "ignore") + f"-{digest(encoded)[:16]}"
 
 
-def _numbered(stem: Path, number: int) -> Path:
-    return stem.with_name(f"{stem.name}_{number}")
-
-
 def write_pair(stem: Path, pair: RawPair, augment: RawAugment, format: Format, origin: Origin) -> None:
     """Write a pair and its parameters to files whose names begin with ``stem``."""
     _WRITERS[format](stem, pair, augment)
     header = {"format": "rawaug", "kind": "augment_params", "origin": json.dumps(origin.stored())}
-    write_tensors(pair.params.tensors(), header, params_file(stem))
+    write_tensors(pair.params.tensors(), header, f"{stem}.safetensors")
 
 
 def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
@@ -98,23 +94,23 @@ def _images(pair: RawPair, augment: RawAugment) -> dict[str, Tensor]:
 def _write_dngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     frames, stops = camera_frames(pair, augment)
     for end, frame in frames.items():
-        write_dng(_beside(stem, f"{end}.dng"), frame, baseline_exposure=stops)
+        write_dng(Path(f"{stem}{end}.dng"), frame, baseline_exposure=stops)
 
 
 def _write_npz(stem: Path, pair: RawPair, augment: RawAugment) -> None:
-    write_npz(_beside(stem, ".npz"), pair.clean, pair.noisy, _stated(pair, augment))
+    write_npz(Path(f"{stem}.npz"), pair.clean, pair.noisy, _stated(pair, augment))
 
 
 def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
         if augment.targets.target == "srgb":  # which viewers take integers for
             image = (image * 65535.0).round().to(torch.uint16)
-        write_tiff(_beside(stem, f"{end}.tif"), image, _stated(pair, augment))
+        write_tiff(Path(f"{stem}{end}.tif"), image, _stated(pair, augment))
 
 
 def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
-        write_png(_beside(stem, f"{end}.png"), image)
+        write_png(Path(f"{stem}{end}.png"), image)
 
 
 _WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {
@@ -123,11 +119,6 @@ _WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {
     "tiff": _write_tiffs,
     "png": _write_pngs,
 }
-
-
-def params_file(stem: Path) -> Path:
-    """The file of the pair's parameters."""
-    return _beside(stem, ".safetensors")
 
 
 def replay(params: str | Path, picture: str | Path | None = None, isp: str | Path | None = None) -> RawPair:
@@ -145,16 +136,10 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     Example:
         >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
     """
-    drawn = load_params(params)
-    header = read_header(params)
+    drawn, header = load_params(params), read_header(params)
     if "origin" not in header:
         raise ValueError(f"{params}: not written by rawaug synth; use RawAugment.apply")
-    origin = Origin(**json.loads(header["origin"]))
-    return replayed(drawn, origin, params, picture, isp)
-
-
-def _beside(stem: Path, ending: str) -> Path:
-    return stem.with_name(stem.name + ending)
+    return replayed(drawn, Origin(**json.loads(header["origin"])), params, picture, isp)
 
 
 def _stated(pair: RawPair, augment: RawAugment) -> dict[str, Any]:

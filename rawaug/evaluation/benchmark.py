@@ -11,11 +11,9 @@ figures of two people can be compared.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import product
+from itertools import chain, product
 from statistics import fmean
 from typing import Any
 
@@ -28,7 +26,8 @@ from rawaug.bayer import CFA, noise_variance
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import compared
-from rawaug.evaluation.tables import METRICS, Row
+from rawaug.evaluation.tables import METRICS, Row, both
+from rawaug.files import digest
 from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
 from rawaug.progress import progress
@@ -67,32 +66,27 @@ def strengths_of(
     return {f"ISO {iso:g}": noise_levels(noise, iso=iso) for iso in isos}
 
 
-@dataclass
-class Column:
-    """The noisy inputs of one strength under one condition, a sample a frame; frames that cannot be had are None."""
-
-    condition: str
-    strength: str
-    samples: list[Sample | None] = field(default_factory=list)
+Columns = dict[tuple[str, str], list[Sample | None]]
+"""By condition and strength the noisy inputs, a sample a frame; None where its levels cannot be estimated."""
 
 
 def columns_of(
     frames: Sequence[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
-) -> list[Column]:
+) -> Columns:
     """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
 
     Noise is put on whole frames, from which the levels are estimated.
     """
     strengths = strengths or strengths_of()
     of_sensors = [name for name in strengths if name in OF_SENSORS] or strengths
-    columns = {pair: Column(*pair) for pair in [*product((TOLD, ESTIMATED), strengths), *product((REAL,), of_sensors)]}
+    columns: Columns = {pair: [] for pair in [*product((TOLD, ESTIMATED), strengths), *product((REAL,), of_sensors)]}
     for frame in progress(frames, label="noise", unit="frame"):
         for name, levels in strengths.items():
             told, real = (noisy_sample(frame, name, levels, seed, real) for real in (False, True))
             for condition, sample in ((TOLD, told), (ESTIMATED, _estimated(told, frame.cfa)), (REAL, real)):
                 if (condition, name) in columns:
-                    columns[condition, name].samples.append(sample and middle_of(sample, crop))
-    return list(columns.values())
+                    columns[condition, name].append(sample and middle_of(sample, crop))
+    return columns
 
 
 def noisy_sample(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Sample:
@@ -120,14 +114,10 @@ def middle_of(sample: Sample, crop: int) -> Sample:
     return Sample(*(image[..., top : top + side, left : left + side].contiguous() for image in sample))
 
 
-def hash_of(columns: Sequence[Column]) -> str:
+def hash_of(columns: Columns) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, in steps of 2^-12, which processors do not round differently."""
-    digest = hashlib.sha256()
-    for column in columns:
-        for sample in column.samples:
-            if sample is not None:
-                digest.update((sample.noisy * 4096).round().to(torch.int32).numpy().tobytes())
-    return digest.hexdigest()[:8]
+    samples = filter(None, chain.from_iterable(columns.values()))
+    return digest(*((sample.noisy * 4096).round().to(torch.int32).numpy().tobytes() for sample in samples))[:8]
 
 
 def benchmark(
@@ -161,17 +151,17 @@ def benchmark(
     return {"frames": [frame.name for frame in frames], "seed": seed, "hash": hash_of(columns), "rows": rows}
 
 
-def _row(one: Contestant, frames: Sequence[Pair], columns: Sequence[Column]) -> dict[str, Any]:
-    first = next(sample for sample in columns[0].samples if sample is not None)
+def _row(one: Contestant, frames: Sequence[Pair], columns: Columns) -> dict[str, Any]:
+    first = next(filter(None, chain.from_iterable(columns.values())))
     megapixels = first.noisy.numel() / 1e6
     with FlopCounterMode(display=False) as counter:  # of what PyTorch computes; it warms up, too
         denoised_by(one, first, frames[0].cfa)
     gmac = counter.get_total_flops() / 2e9 / megapixels
     scores: dict[str, dict[str, dict[str, float]]] = {}
     seconds: list[float] = []
-    for column in progress(columns, label=one.name, unit="column"):
+    for (condition, strength), samples in progress(columns.items(), label=one.name, unit="column"):
         found, own, errors = [], [], []
-        for frame, sample in zip(frames, column.samples, strict=True):
+        for frame, sample in zip(frames, samples, strict=True):
             if sample is None:
                 continue
             start = time.perf_counter()
@@ -182,9 +172,8 @@ def _row(one: Contestant, frames: Sequence[Pair], columns: Sequence[Column]) -> 
                 own.append(noise_variance(sample.clean, *frame.own_noise).mean().item())
                 errors.append(10 ** (-found[-1][0] / 10))
         means: dict[str, float] = dict(zip(METRICS, map(fmean, zip(*found, strict=True)), strict=True)) if found else {}
-        scores.setdefault(column.condition, {})[column.strength] = means | {"frames": len(found)}
-        if own:
-            scores[column.condition][column.strength]["own_noise"] = sum(own) / sum(errors)
+        share = {"own_noise": sum(own) / sum(errors)} if own else {}
+        scores.setdefault(condition, {})[strength] = means | {"frames": len(found)} | share
     return {"gmac": round(gmac, 2) or None, "seconds": round(fmean(seconds), 3), "scores": scores}
 
 
@@ -212,10 +201,10 @@ def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str
         cells = {}
         for name, row in result["rows"].items():
             scores = row["scores"][condition]
-            cells[name] = [_both(scores[strength]) for strength in scored]
+            cells[name] = [both(scores[strength], "psnr", "psnr_srgb") for strength in scored]
             if condition == TOLD:
                 costs = ["" if row[key] is None else f"{row[key]:.2f}" for key in ("gmac", "seconds")]
-                cells[name] += [f"{scores[shown]['ssim']:.4f} / {scores[shown]['ssim_srgb']:.4f}", *costs]
+                cells[name] += [both(scores[shown], "ssim", "ssim_srgb"), *costs]
         yield f"{condition}: PSNR of RAW / sRGB in dB, {count} frame{'s' * (count != 1)}", head, cells
 
 
@@ -228,10 +217,6 @@ def costs_of(result: Mapping[str, Any]) -> dict[str, tuple[float | None, float, 
         for name, (gmac, scores) in scored.items()
         if name != "noisy input"
     }
-
-
-def _both(scores: Mapping[str, float]) -> str:
-    return f"{scores['psnr']:.2f} / {scores['psnr_srgb']:.2f}" if scores["frames"] else "-"
 
 
 def shown_of(strengths: Collection[str]) -> str:

@@ -27,7 +27,7 @@ from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.own_noise import own_noise_note
-from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, figures_of, formatted, levels_note, verdict
+from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, both, figures_of, levels_note, verdict
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -259,11 +259,6 @@ def _every_image(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> P
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:
-            cells = rows.setdefault(image["name"], [_both(image, "_noisy")])
-            cells.append(_both(image, ""))
+            cells = rows.setdefault(image["name"], [both(image, "psnr_noisy", "ssim_noisy")])
+            cells.append(both(image, "psnr", "ssim"))
     return Part("Every image", head=["image: PSNR (dB) / SSIM", "noisy input", *summaries], rows=rows)
-
-
-def _both(image: Mapping[str, Any], suffix: str) -> str:
-    """PSNR / SSIM, a dash for what is no number."""
-    return " / ".join(formatted(key, image.get(f"{key}{suffix}")) or "-" for key in ("psnr", "ssim"))

@@ -109,6 +109,11 @@ def formatted(key: str, value: float | None) -> str:
     return f"{value:.0%}" if key == "own_noise" else f"{value:.{_digits(key)}f}"
 
 
+def both(scores: Mapping[str, Any], first: str, second: str) -> str:
+    """Two figures in a cell, a dash for what is no number."""
+    return " / ".join(formatted(key, scores.get(key)) or "-" for key in (first, second))
+
+
 def _digits(key: str) -> int:
     return 2 if "psnr" in key else 4
 

@@ -60,12 +60,11 @@ def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
     frames = list(open_pairs("demo:test", split="test"))[:1]
     columns = columns_of(frames, crop=256)
     assert hash_of(columns) == hash_of(columns_of(frames, crop=256)) != hash_of(columns_of(frames, crop=256, seed=1))
-    for column in columns:
-        sample = column.samples[0]
-        if column.condition == "levels told" and sample is not None:
+    for (condition, strength), (sample,) in columns.items():
+        if condition == "levels told" and sample is not None:
             unclipped = sample.clean < 0.5
             measured = (sample.noisy - sample.clean)[unclipped].square().mean()
-            shot_var, read_var = STRENGTHS[column.strength]
+            shot_var, read_var = STRENGTHS[strength]
             assert measured.item() == pytest.approx(
                 (shot_var * sample.clean[unclipped] + read_var).mean().item(), rel=0.05
             )
@@ -73,11 +72,9 @@ def test_noise_has_the_stated_variance_and_the_same_bits_again() -> None:
 
 def test_noise_of_the_callers_is_that_of_evaluate() -> None:
     frame = replace(open_pairs("demo:test")[0], noisy=None, shot_var=None, read_var=None)
-    samples = {}
-    for column in columns_of([frame], crop=10_000, strengths=strengths_of("SonyA7S2", [1600, 6400])):
-        samples[column.condition, column.strength] = column.samples[0]
-    assert {strength for _, strength in samples} == {"ISO 1600", "ISO 6400"}
-    told = samples["levels told", "ISO 6400"]
+    columns = columns_of([frame], crop=10_000, strengths=strengths_of("SonyA7S2", [1600, 6400]))
+    assert {strength for _, strength in columns} == {"ISO 1600", "ISO 6400"}
+    (told,) = columns["levels told", "ISO 6400"]
     evaluated = frozen_sample(frame, noise_model("SonyA7S2", iso=6400), frame.cfa, seed=0)
     assert told is not None and torch.equal(told.noisy, evaluated.noisy)
     assert torch.allclose(told.variance, evaluated.variance)
