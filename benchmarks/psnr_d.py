@@ -100,7 +100,7 @@ def filtered(specs: Sequence[str], factor: int) -> DownstreamScore:
     """The row that needs no training."""
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
     frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test", bin=factor)]
-    scores = [s for s, *_ in score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, "")]
+    scores = list(score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, ""))
     return mean_of(scores)
 
 

@@ -121,7 +121,7 @@ def run(
 def _reconstruction(isp: DictionaryISP, pairs: Readable) -> dict[str, Any]:
     """The summary of an ISP."""
     frames = progress(pairs, label="evaluate", unit="image")
-    return summary([_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames])
+    return summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames)
 
 
 class _Test:
@@ -164,7 +164,7 @@ class _Test:
     def scores(self, method: Method, label: str) -> dict[str, Any]:
         """The summary of a method."""
         scored = score_method(method, self.pairs, self.levels, self.cfa, self.seed, label)
-        return summary([_finite(score) for score, *_ in scored])
+        return summary(map(_finite, scored))
 
     def page(self, data: str, result: Mapping[str, Any]) -> Page:
         """The scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""

@@ -122,17 +122,22 @@ def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
     return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
 
 
+def tested(method: Method, pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> tuple[Score, Sample, Tensor]:
+    """The scores of a frame, its test case and the method's result."""
+    pair = pair.with_levels()
+    sample = frozen_sample(pair, noise, cfa, seed)
+    denoised = method(pair, sample)
+    values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
+    levels = frozen_levels(pair, noise, seed) or (None, None)
+    return Score(pair.name, *values, *levels, pair.levels_from_clean or None), sample, denoised
+
+
 def score_method(
     method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
-) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
-    """Scores of every frame, with what was compared; one frame in memory at a time."""
-    for read in progress(pairs, label=label, unit="image"):
-        pair = read.with_levels()
-        sample = frozen_sample(pair, noise, cfa, seed)
-        denoised = method(pair, sample)
-        values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-        shot_var, read_var = frozen_levels(pair, noise, seed) or (None, None)
-        yield Score(pair.name, *values, shot_var, read_var, pair.levels_from_clean or None), pair, sample, denoised
+) -> Iterator[Score]:
+    """The scores of every frame, one in memory at a time."""
+    for pair in progress(pairs, label=label, unit="image"):
+        yield tested(method, pair, noise, cfa, seed)[0]
 
 
 def network_method(
@@ -142,18 +147,11 @@ def network_method(
     return lambda _, sample: denoise(model, sample, cfa, views, own, at_test)
 
 
-def score_denoiser(
-    model: Denoiser, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, views: int, label: str
-) -> Iterator[tuple[Score, Pair, Sample, Tensor]]:
-    """:func:`score_method` of a network."""
-    return score_method(network_method(model, cfa, views=views), pairs, noise, cfa, seed, label)
-
-
 def row_of(methods: Mapping[str, Method], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
     """Panels of a frame: noisy, denoised by each method, clean."""
     row = Row(pair, {}, {})
     for name, method in methods.items():
-        score, _, sample, denoised = next(score_method(method, [pair], noise, cfa, seed, f"picture, {name}"))
+        score, sample, denoised = tested(method, pair, noise, cfa, seed)
         row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
         row.panels[name] = denoised
         row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", name: f"{score.psnr:.2f} dB"}
@@ -219,17 +217,15 @@ def label_of(spec: Spec) -> str:
     return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
 
-def summary(scores: Sequence[Score]) -> dict[str, Any]:
+def summary(scores: Iterable[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
     ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score
     that is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
     """
-    images: list[dict[str, Any]] = [{"name": score.name} for score in scores]
+    scores, stated = list(scores), ("name", "shot_var", "read_var", "levels_from_clean")
+    images = [{key: value for key in stated if (value := getattr(score, key)) is not None} for score in scores]
     result: dict[str, Any] = {"images": images}
-    for image, score in zip(images, scores, strict=True):
-        stated = {key: getattr(score, key) for key in ("shot_var", "read_var", "levels_from_clean")}
-        image |= {key: value for key, value in stated.items() if value is not None}
     if flagged := sum(bool(score.levels_from_clean) for score in scores):
         result["levels_from_clean"] = flagged
     wrong: list[str] = []

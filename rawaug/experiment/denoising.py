@@ -258,7 +258,7 @@ class TrainingRun:
         for kind in missing:
             method = self.method(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
             scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
-            result[kind] = with_own_noise(summary([score for score, *_ in scored]), self.own)
+            result[kind] = with_own_noise(summary(scored), self.own)
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
@@ -313,8 +313,7 @@ class TrainingRun:
     @timed("other denoisers")
     def scored(self, name: str, method: Method, noise: NoiseModel, cfa: CFA) -> dict[str, Any]:
         """The scores of what is not trained here."""
-        scores = [score for score, *_ in score_method(method, self.test, noise, cfa, 0, name)]
-        return with_own_noise(summary(scores), self.own)
+        return with_own_noise(summary(score_method(method, self.test, noise, cfa, 0, name)), self.own)
 
     @timed("report")
     def pictured(self, page: Page, methods: Mapping[str, Method], noise: NoiseModel, cfa: CFA) -> Path:

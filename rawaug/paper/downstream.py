@@ -21,7 +21,7 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Sample, SomePairs
-from rawaug.evaluation.scores import Score, score_denoiser
+from rawaug.evaluation.scores import Score, network_method, score_method
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
@@ -106,8 +106,8 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
     pairs = (pair for frames, spec in chosen for pair in skip_broken(frames, spec))
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
-    scores = [score for score, *_ in score_denoiser(net, frames, noise_model(config.noise), cfa, 0, 1, "PSNR_d")]
-    return mean_of(scores)
+    method = network_method(net, cfa)
+    return mean_of(list(score_method(method, frames, noise_model(config.noise), cfa, 0, "PSNR_d")))
 
 
 def _crops(model: Method, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:

@@ -39,7 +39,7 @@ def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pai
     found = own_variances([reference], scored, noise, factor=factor)
     middle = Middles(Binned([replace(reference, raw=scene())], factor), 256)[0]
     truth = bayer.pack(middle.raw[None], CFA.GRBG)
-    scores = [score for score, *_ in score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")]
+    scores = score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")
     result = with_own_noise(summary(scores), found)
     assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
     assert own_noise_note({"perfect": result}).startswith("own noise of the references as a share of")

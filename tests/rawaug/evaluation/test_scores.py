@@ -62,7 +62,7 @@ def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest
     noise = noise_model((1e-2, 1e-4))
     pairs = [pair, measured]
     scored = score_method(lambda _, sample: sample.noisy * 0.99, pairs, noise, pair.cfa, 0, "marked")
-    result = summary([score for score, *_ in scored])
+    result = summary(scored)
     assert result["levels_from_clean"] == 1
     assert [image.get("levels_from_clean") for image in result["images"]] == [None, True]
     print_scores({"kind": "denoiser", "data": "demo", **result})
@@ -135,7 +135,7 @@ def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
     pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
     noise = noise_model((0.0, 1e-3))
     (scored,) = score_method(classical_method("Wavelet", noise, 0), [pair], noise, pair.cfa, 0, "Wavelet")
-    assert scored[0].psnr > (scored[0].psnr_noisy or 99.0) + 3.0
+    assert scored.psnr > (scored.psnr_noisy or 99.0) + 3.0
 
 
 def test_the_development_is_the_same_for_both() -> None:

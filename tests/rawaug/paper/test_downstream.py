@@ -14,7 +14,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import score_denoiser
+from rawaug.evaluation.scores import score_method
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -54,12 +54,12 @@ def scores(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callabl
     """The test frames of each call of :func:`psnr_d`, two small ones; one is measured whole and one in part."""
     seen: list[list[Pair]] = []
 
-    def score(net: Any, frames: list[Pair], *rest: Any) -> Any:
+    def score(method: Any, frames: list[Pair], *rest: Any) -> Any:
         seen.append(frames)
-        return score_denoiser(net, frames, *rest)
+        return score_method(method, frames, *rest)
 
     given.extend([frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))])
-    monkeypatch.setattr(downstream, "score_denoiser", score)
+    monkeypatch.setattr(downstream, "score_method", score)
     return seen
 
 
