@@ -88,7 +88,6 @@ def _launch(
 
 
 def _import(file: Path) -> None:
-    """Run a file that registers things of the user's own."""
     if not file.is_file():
         raise FileNotFoundError(f"--import {file}: no such file")
     spec = spec_from_file_location(file.stem, file)

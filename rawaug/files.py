@@ -168,7 +168,6 @@ def require_writable(path: str | Path, folder: bool = False) -> None:
 
 
 def write_json(value: Any, path: str | Path) -> None:
-    """Write JSON, whole or not at all."""
     text = to_json(value, indent=1)
     with replacing(path) as partial:
         partial.write_text(f"{text}\n", encoding="utf-8")
@@ -234,7 +233,6 @@ def find_weights(name: str | Path, *more: Path) -> Path:
 
 
 def shipped_isps() -> list[str]:
-    """Names of the ISPs that are shipped with the package."""
     return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
 
 
@@ -247,7 +245,6 @@ def digest(*parts: bytes) -> str:
 
 
 def sha256(path: str | Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
     return digest(Path(path).read_bytes())
 
 

@@ -184,7 +184,6 @@ def denoise_file(
 
 
 def _checked(method: FrameDenoiser | str | Path, strength: float) -> FrameDenoiser:
-    """What denoises, if it can be applied at this strength."""
     made = network_denoiser(method) if isinstance(method, (str, Path)) else method
     if made.linear and strength != 1.0:
         raise ValueError(f"--strength {strength}: of a linear DNG it is 1; there is no noisy full colour to mix in")
@@ -290,7 +289,6 @@ def _named(error: Exception, file: Path) -> str:
 
 
 def _levels_by_shot(files: Sequence[Denoised]) -> Shots:
-    """The mean levels of files, by camera and ISO where it is known."""
     found: dict[tuple[str, float | None], list[tuple[float, float]]] = {}
     for done in files:
         if done.iso is not None:

@@ -119,7 +119,6 @@ def run(
 
 
 def _reconstruction(isp: DictionaryISP, pairs: Readable) -> dict[str, Any]:
-    """The summary of an ISP."""
     frames = progress(pairs, label="evaluate", unit="image")
     return summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames)
 
@@ -162,7 +161,6 @@ class _Test:
         return result | ({"classical": filters} if filters else {})
 
     def scores(self, method: Method, label: str) -> dict[str, Any]:
-        """The summary of a method."""
         scored = score_method(method, self.pairs, self.levels, self.cfa, self.seed, label)
         return summary(map(_finite, scored))
 

@@ -116,7 +116,6 @@ def _estimated(frame: RawFrame) -> tuple[float, float, str]:
 
 
 def _published(frame: RawFrame, name: str) -> tuple[float, float]:
-    """The levels of a measured or published camera at the frame's ISO."""
     if not isinstance(noise_levels(name), (EldLevels, ProfileLevels)) and name not in camera_names():
         raise ValueError(f"noise {name!r} is no camera; use auto, profile, estimate, the name of one, or {_GIVEN}")
     if frame.iso is None:
@@ -145,7 +144,6 @@ def _checked_profile(frame: RawFrame, profile: tuple[float, float]) -> tuple[flo
 
 
 def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
-    """The law at the frame's ISO."""
     known = {law.camera, frame.camera} - {"unknown"}
     if len(known) > 1:
         raise ValueError(f"{frame.name}: is from {frame.camera}, but the noise law is of {law.camera}; use another")
@@ -168,7 +166,6 @@ def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
 
 
 def as_json(noise: Noise) -> Any:
-    """As ``denoise.json`` states it."""
     if isinstance(noise, MeasuredLevels):
         return noise.spec()
     return noise if isinstance(noise, str) else list(noise)

@@ -93,7 +93,6 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
 
 
 def _read(pictures: Sequence[str | Path], max_pixels: int) -> list[Tensor]:
-    """The pictures, all of the size of the first."""
     read: list[Tensor] = []
     for path in pictures:
         read.append(isolated(read_picture, path, max_pixels))

@@ -71,6 +71,5 @@ def _describe_isp(path: Path) -> str:
 
 
 def _curve(isp: DictionaryISP) -> str:
-    """A few codes of the tone curve, the mean of the channels."""
     means = isp.tone_curve().mean(dim=1)
     return ", ".join(f"{code} {means[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))

@@ -45,7 +45,6 @@ class PictureTask(Task):
         self.broken = {}  # what cannot be read is tried again
 
     def make(self, maker: PairMaker) -> Outcome:
-        """Write the missing pairs."""
         try:
             origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
         except (OSError, ValueError) as error:

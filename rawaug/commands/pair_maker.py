@@ -55,7 +55,6 @@ class Settings:
     seed: int
 
     def stored(self) -> dict[str, Any]:
-        """As JSON."""
         return {"format": self.format, "isp_sha256": self.isp_sha256, "seed": self.seed, **self.drawing.stored()}
 
 
@@ -73,7 +72,6 @@ class Origin:
     form: Mapping[str, Any] | None = None
 
     def stored(self) -> dict[str, Any]:
-        """As JSON."""
         return {key: value for key, value in vars(self).items() if value is not None}
 
 
@@ -131,7 +129,6 @@ def noise_levels(pair: RawPair) -> dict[str, float]:
 def replayed(
     drawn: AugmentParams, origin: Origin, label: object, picture: str | Path | None, isp: str | Path | None
 ) -> RawPair:
-    """The pair of these parameters, bit for bit."""
     augment = RawAugment.from_pretrained(
         str(isp or origin.isp), noise=origin.noise, cfa=origin.cfa, **origin.form or {}
     )

@@ -50,7 +50,6 @@ class ShardTask(Task):
         self.broken, self.todo = dict(known.get("broken", {})), not known
 
     def make(self, maker: PairMaker) -> Outcome:
-        """Write the shard and its record."""
         made, broken = 0, dict[str, str]()
         with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
             for index, name in enumerate(self.names, self.first):
@@ -91,7 +90,6 @@ def _known(shard: Path) -> dict[str, Any]:
 def shard_tasks(
     pictures: Sequence[Path], source: Path, out: Path, per_image: int, per_shard: int = PER_SHARD
 ) -> list[ShardTask]:
-    """One task for each shard."""
     if per_shard < 1:
         raise ValueError(f"per_shard must be at least 1, got {per_shard}")
     names = _names(pictures, source)

@@ -67,7 +67,6 @@ def run(
 
 
 def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
-    """Top, left, height and width of what is shown."""
     height, width = (min(side, _MAXIMUM) for side in srgb.shape[-2:])
     top, left = ((side - size) // 4 * 2 for side, size in zip(srgb.shape[-2:], (height, width), strict=True))
     return top, left, height, width

@@ -124,7 +124,6 @@ def print_keys(settings: type[Any], content: Mapping[str, Any]) -> None:
 
 
 def _given(words: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Keys and values of ``--key value`` and ``--key=value``."""
     rest = iter(words)
     for word in rest:
         key, equals, value = word.partition("=")

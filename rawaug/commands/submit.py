@@ -81,7 +81,6 @@ def _sidd_denoised(benchmark: SiddBenchmark, method: FrameDenoiser) -> Iterator[
 
 
 def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
-    """The noise levels of a frame by its blocks."""
     try:
         estimate = estimate_noise(torch.cat([block.mosaic for block in blocks], dim=-1), blocks[0].cfa)
     except ValueError as error:

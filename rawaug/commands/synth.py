@@ -150,7 +150,6 @@ def synth(
 
 
 def part_of(shard: str) -> tuple[int, int]:
-    """K and N of ``"K/N"``."""
     first, _, second = shard.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
         raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")
@@ -173,7 +172,6 @@ def _settings(format: Format, per_image: int, seed: int, drawn: dict[str, Any]) 
 def _worked_off(
     out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None
 ) -> Synthesis:
-    """Run the unfinished tasks and add up their outcomes."""
     result = Synthesis(out, sum(task.pictures for task in tasks), existing=sum(task.existing for task in tasks))
     for task in tasks:
         result.broken |= task.broken
@@ -198,7 +196,6 @@ _maker: PairMaker
 
 
 def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
-    """Yield the outcome of each task as it finishes."""
     workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
     if workers < 1:
         _prepare(settings, max_pixels)

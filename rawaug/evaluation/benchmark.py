@@ -178,7 +178,6 @@ def _row(one: Contestant, frames: Sequence[Pair], columns: Columns) -> dict[str,
 
 
 def denoised_by(one: Contestant, sample: Sample, cfa: CFA) -> Tensor:
-    """The denoiser's result, checked."""
     try:
         with torch.inference_mode():
             denoised = one.run(sample.noisy.clone(), sample.variance.clone(), cfa)

@@ -216,7 +216,6 @@ def _of_function(spec: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
 
 
 def _positional(function: Callable[..., Any]) -> int:
-    """How many arguments a function takes by place, without those that have a default."""
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = inspect.signature(function).parameters.values()
     return sum(one.kind in kinds and one.default is one.empty for one in parameters)

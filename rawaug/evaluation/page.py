@@ -110,7 +110,6 @@ class Page:
         self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
 
     def add_frame(self, row: Row, cfa: CFA) -> None:
-        """One test frame."""
         first = not any(part.heading == "Pictures" for part in self.parts)
         clean = list(row.panels.values())[-1]
         exposure = exposure_of(clean, row.pair)
@@ -129,7 +128,6 @@ class Page:
         self.parts.append(Part("Pictures" if first else "", row.pair.name, figures=figures))
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
-        """The file, with ``settings`` at its end."""
         import yaml
         from jinja2 import Environment, PackageLoader
 
@@ -149,7 +147,6 @@ def command_line() -> str:
 
 
 def levels_range(summary: Mapping[str, Any]) -> str:
-    """Lowest and highest noise levels of the frames; empty where they are not known."""
     said = []
     for key in ("shot_var", "read_var"):
         values = [image[key] for image in summary["images"] if key in image]

@@ -161,7 +161,6 @@ class TrainingRun:
         return range(self.recipe.seed, self.recipe.seed + self.recipe.seeds)
 
     def place(self, arm: str, seed: int) -> Path:
-        """The folder of an arm's files."""
         return self.folder / f"seed{seed}" / arm
 
     def pattern(self, arm: str, isp: DictionaryISP) -> CFA:
@@ -193,7 +192,6 @@ class TrainingRun:
 
     @timed("training")
     def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
-        """The denoiser of one arm."""
         recipe, place = self.recipe, self.place(arm, seed)
         path = place / "denoiser.safetensors"
         config, network, start = recipe.loop_of(arm), recipe.network_of(arm), self.starts[arm]
@@ -264,7 +262,6 @@ class TrainingRun:
         return {kind: result[kind] for kind in KINDS if kind in result}
 
     def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
-        """The denoiser of an arm as it is tested."""
         at_test, where = self.estimators[arm].at_test, find_device(self.recipe.device)
         return network_method(model.to(where), isp.cfa, self.pattern(arm, isp), views, at_test)
 
@@ -312,7 +309,6 @@ class TrainingRun:
 
     @timed("other denoisers")
     def scored(self, name: str, method: Method, noise: NoiseModel, cfa: CFA) -> dict[str, Any]:
-        """The scores of what is not trained here."""
         return with_own_noise(summary(score_method(method, self.test, noise, cfa, 0, name)), self.own)
 
     @timed("report")

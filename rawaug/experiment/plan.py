@@ -123,7 +123,6 @@ def with_given_pairs(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Rec
 
 
 def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
-    """Open the data of a recipe."""
     data, clean = recipe.data, not recipe.self_supervised
     test = _opened(data, given.get("test", data.test), "test", True)
     pairs = _opened(data, given.get("pairs", data.pairs), "train", clean)
@@ -167,7 +166,6 @@ def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, cle
 
 
 def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:
-    """So many of so many frames of a source, and the names of the first ones."""
     names = names_of(frames)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{len(names)} of {available} of {source}: {', '.join(names[:most])}{more}"

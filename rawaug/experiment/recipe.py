@@ -245,11 +245,9 @@ class Recipe:
                 raise ValueError(f"arms.{label}: {error}") from None
 
     def network_of(self, arm: str) -> DenoiserConfig:
-        """The arm's network, else the recipe's."""
         return self.arms[arm].denoiser or self.denoiser
 
     def loop_of(self, arm: str) -> TrainConfig:
-        """How the arm is trained."""
         own = self.arms[arm]
         steps = None if own.steps is None else min(own.steps, self.train.steps)
         given: dict[str, Any] = {"learning_rate": own.learning_rate, "weigh": own.weigh, "steps": steps}
@@ -271,7 +269,6 @@ class Recipe:
 
 
 def read_recipe(file: str | Path) -> dict[str, Any]:
-    """The content of a recipe's file."""
     import yaml
 
     if (size := Path(file).stat().st_size) > MOST_BYTES:
@@ -289,7 +286,6 @@ def read_recipe(file: str | Path) -> dict[str, Any]:
 
 
 def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
-    """The kind of experiment that a recipe names."""
     kind = content.get("experiment", "training")
     if not isinstance(kind, str) or kind not in EXPERIMENTS:
         raise ValueError(f"{file}: unknown experiment {kind!r:.80}; use one of {', '.join(EXPERIMENTS)}")
@@ -311,7 +307,6 @@ def recipe_list() -> str:
 
 
 def _listed() -> list[tuple[str, Path]]:
-    """Those at the top first."""
     return sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))
 
 

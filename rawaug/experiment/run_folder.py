@@ -23,7 +23,6 @@ FREE_ANYWHERE = SAME_WEIGHTS | {"memory_mb"}
 
 
 def run_folder(settings: Any) -> Path:
-    """The folder of a run."""
     out, name = Path(settings.out), Path(settings.name)
     if name.is_absolute() or ".." in name.parts or not name.parts:
         raise ValueError(

@@ -46,7 +46,6 @@ def histograms(drawn: Drawn) -> np.ndarray:
 
 
 def tone_curve(drawn: Drawn) -> np.ndarray:
-    """The drawn tone curve over the tone atoms."""
     figure, tone = _figure()
     isp, setting = drawn.augment.isp, drawn.pair.params.isp
     code = np.arange(256)
@@ -156,7 +155,6 @@ def _plain_numbers(axis: Any, *scales: Any) -> None:
 
 
 def _pixels(figure: Any) -> np.ndarray:
-    """The drawn figure, uint8 ``(H, W, 3)``."""
     figure.canvas.draw()
     return np.array(figure.canvas.buffer_rgba())[..., :3]
 

@@ -64,7 +64,6 @@ def as_html(panels: Sequence[Panel]) -> str:
 
 
 def message(text: str) -> str:
-    """What went wrong."""
     return str(Markup('<div class="message" role="alert">{}</div>').format(escape(text)))
 
 
@@ -183,7 +182,6 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
 
 
 def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
-    """The uploaded picture in the list, and chosen."""
     return gr.update(choices=[*choices, (Path(uploaded).name, uploaded)], value=uploaded)
 
 
@@ -262,6 +260,5 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 def address(open_: socket.socket) -> str:
-    """What a browser opens."""
     host, port = open_.getsockname()[:2]
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

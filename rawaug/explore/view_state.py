@@ -79,7 +79,6 @@ def _baked(isp: str, camera: str | None, cfa: str | None, form: tuple[tuple[str,
 
 @lru_cache(maxsize=4)
 def loaded(isp: str) -> DictionaryISP:
-    """The ISP of this name or file."""
     return DictionaryISP.from_pretrained(isp)
 
 

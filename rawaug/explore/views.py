@@ -245,14 +245,12 @@ def _centre(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[int
 
 
 def _crop(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
-    """The central part of a picture, a mosaic or packed RAW."""
     scale = 2 if image.shape[-3] == PACKED else 1
     top, left, height, width = (place // scale for place in _centre(image, size))
     return image[..., top : top + height, left : left + width]
 
 
 def _thumbnail(srgb: Tensor) -> Tensor:
-    """uint8 ``(3, H, W)``, reduced by a whole factor to about :data:`_THUMBNAIL`."""
     factor = max(1, max(srgb.shape[-2:]) // _THUMBNAIL)
     if factor == 1:
         return srgb
