@@ -27,7 +27,18 @@ from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
 from rawaug.evaluation.own_noise import own_noise_note
-from rawaug.evaluation.tables import ENSEMBLE, PLAIN, QUARTERS, Row, Runs, both, figures_of, levels_note, verdict
+from rawaug.evaluation.tables import (
+    ENSEMBLE,
+    PLAIN,
+    QUARTERS,
+    Row,
+    Runs,
+    both,
+    figures_of,
+    first_runs,
+    levels_note,
+    verdict,
+)
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -85,9 +96,12 @@ class Page:
 
         It opens with the verdict and the ``facts``, ``Noise`` as in a recipe; ``arms`` says what the methods are.
         """
-        plain = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
         first = next(iter(results.values()))[0]["plain"]
-        about = {"Command": command_line(), **(facts or {}), "Own noise": own_noise_note(plain)}
+        about = {
+            "Command": command_line(),
+            **(facts or {}),
+            "Own noise": own_noise_note(first_runs(results, classical)),
+        }
         if noise := about.pop("Noise", None):
             named = noise if isinstance(noise, str) else json.dumps(noise)
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
@@ -186,7 +200,7 @@ def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
     The loss is the mean since the row before. Thin lines are the thirds of the validation frames with least (dotted),
     middling and most noise (dash-dotted). A curve of one point is a dot. What no log has is left out.
     """
-    rows = {(arm, k): _read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
+    rows = {(arm, k): read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
     colours = {arm: f"C{k % 10}" for k, arm in enumerate(logs)}
     return {title: _draw_curve(key, title, rows, colours) for key, title in CURVES.items() if _has(key, rows.values())}
 
@@ -194,7 +208,8 @@ def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
 Log = Sequence[Mapping[str, str]]
 
 
-def _read_log(path: Path) -> Log:
+def read_log(path: Path) -> Log:
+    """The rows of a training's ``log.csv``."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -252,7 +267,7 @@ def _png(figure: Any) -> bytes:
 
 def _every_image(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> Part:
     """PSNR / SSIM of every image by every method, on the mosaic; an arm's first seed."""
-    summaries = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+    summaries = first_runs(results, classical)
     rows: dict[str, list[str]] = {}
     for summary in summaries.values():
         for image in summary["images"]:

@@ -146,6 +146,11 @@ def figures_of(results: Runs, classical: Mapping[str, Mapping[str, Any]] | None,
     return Figures([list(columns)[k] for k in kept], rows, best)
 
 
+def first_runs(results: Runs, classical: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """The summary of every method, of an arm that of its first seed."""
+    return {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
+
+
 def _values(runs: Sequence[Mapping[str, Any]], kind: str, key: str) -> list[float]:
     return [run[kind][key] for run in runs if key in run.get(kind, {})]
 

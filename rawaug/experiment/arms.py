@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -11,13 +10,14 @@ from typing import Any
 
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
+from rawaug.evaluation.page import read_log
 from rawaug.evaluation.scores import frozen_sample, label_of
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, SRGB_NOISE, name_and_settings
+from rawaug.registry import ESTIMATORS, SRGB_NOISE
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised, Supervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
@@ -45,12 +45,11 @@ def methods_of(recipe: Recipe) -> dict[str, str]:
 def _explained(recipe: Recipe, label: str) -> str:
     arm, network = recipe.arms[label], recipe.network_of(label)
     begun = f"{network.name} from random weights" if network.start is None else f"{network.start}, trained further"
-    real = "real pairs" if arm.sees_clean else "real noisy frames"
-    made = "RAW made from pictures"
+    real, made = "real pairs" if arm.sees_clean else "real noisy frames", "RAW made from pictures"
     mixed = f"{real}, with {made} as {arm.augmented:.0%} of a batch"
-    name, settings = name_and_settings(arm.estimator)
-    how = "" if arm.sees_clean else f", by {' '.join([name, *(f'{key}={value}' for key, value in settings.items())])}"
-    return f"{begun}, on {real if not arm.augmented else made if arm.augmented == 1.0 else mixed}{how}"
+    how = "" if arm.sees_clean else f", by {label_of(arm.estimator)}"
+    frames = {0.0: real, 1.0: made}.get(arm.augmented, mixed)
+    return f"{begun}, on {frames}{how}"
 
 
 def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
@@ -83,14 +82,13 @@ def training_stream(
     crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
     real: Source | None = None
     made: Source | None = None
-    if arm.srgb_noise is not None:
-        made = NoisyPictures(pictures, SRGB_NOISE.make(arm.srgb_noise), crop, arm.zoom)
-        return TrainingStream(None, made, recipe.train.batch, 1.0, seed)
     augment: RawAugment | None = None
     if arm.augmented:
         draws: dict[str, Any] = {"exposure": arm.exposure, "target": recipe.target, "jpeg": arm.jpeg}
         augment = RawAugment(isp, noise, arm.sampling, arm.strength, **draws)
-    if isinstance(estimator, SelfSupervised):
+    if arm.srgb_noise is not None:
+        made = NoisyPictures(pictures, SRGB_NOISE.make(arm.srgb_noise), crop, arm.zoom)
+    elif isinstance(estimator, SelfSupervised):
         if frames and arm.augmented < 1.0:
             real = NoisyCrops(frames, estimator, crop, isp.cfa)
         if augment:
@@ -127,14 +125,8 @@ def chosen(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -
         folders: of the runs, each with a folder for each candidate.
         best: whether the weights of the best validation are kept, else those of the last.
     """
-    scores: dict[str, dict[str, float]] = {}
+    found: dict[str, dict[str, float]] = {}
     for label, arm in candidates.items():
-        found = [_score(folder / label / "log.csv", best) for folder in folders]
-        scores.setdefault(arm, {})[label] = fmean(found)
-    return {arm: dict(sorted(found.items(), key=lambda one: -one[1])) for arm, found in scores.items()}
-
-
-def _score(log: Path, best: bool) -> float:
-    with log.open(newline="") as file:
-        scores = [float(row["psnr"]) for row in csv.DictReader(file)]
-    return max(scores) if best else scores[-1]
+        logs = ([float(row["psnr"]) for row in read_log(folder / label / "log.csv")] for folder in folders)
+        found.setdefault(arm, {})[label] = fmean(max(log) if best else log[-1] for log in logs)
+    return {arm: dict(sorted(scores.items(), key=lambda one: -one[1])) for arm, scores in found.items()}

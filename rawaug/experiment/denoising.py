@@ -33,7 +33,7 @@ from rawaug.evaluation.scores import (
     score_method,
     summary,
 )
-from rawaug.evaluation.tables import Row, draw, print_table, verdict
+from rawaug.evaluation.tables import Row, draw, first_runs, print_table
 from rawaug.experiment.arms import (
     chosen,
     estimator_of,
@@ -144,7 +144,7 @@ class TrainingRun:
             noise = noise_for(isp, recipe.noise)
             if _leads() and not models:
                 self.own = own_variances(self.references, self.test, noise, 0, self.data.bin)
-                _say(*filter(None, [added_noise_note(self.own)]))
+                _say(added_noise_note(self.own))
             if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
                 parts = {"pairs": self.pairs, "validation": self.validation}
                 self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
@@ -276,10 +276,10 @@ class TrainingRun:
         """``results.json``, the table, the picture, and the page with all of it."""
         recipe, cfa = self.recipe, isp.cfa
         others = self.untrained(noise, cfa)
-        classical: dict[str, Any] = {}
-        everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
         candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
         searches = chosen(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
+        classical: dict[str, Any] = {}
+        everything: dict[str, Any] = {"recipe": asdict(recipe), "results": results, "classical": classical}
         everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         write_json(everything, self.folder / "results.json")
@@ -294,9 +294,7 @@ class TrainingRun:
         page = Page.of_scores(title, results, classical, facts, about)
         picture = self.pictured(page, methods, noise, cfa)
         print_table(results, title, classical)
-        _say(*filter(None, [verdict(results, classical)]))
-        methods_scores = {**classical, **{arm: runs[0]["plain"] for arm, runs in results.items()}}
-        _say(*filter(None, [own_noise_note(methods_scores)]))
+        _say(page.lead, own_noise_note(first_runs(results, classical)))
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")
         searched = [
             f"{arm}, by validation: " + ", ".join(f"{name} {score:.2f} dB" for name, score in found.items())
@@ -336,9 +334,9 @@ class TrainingRun:
 
 
 def _say(*lines: str) -> None:
-    """Print, in the process that writes."""
-    if lines and _leads():
-        print("\n".join(lines))
+    """Print what is not empty, in the process that writes."""
+    if any(lines) and _leads():
+        print("\n".join(filter(None, lines)))
 
 
 def _leads() -> bool:
