@@ -18,20 +18,14 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     return a, (a + 0.1 * torch.randn(a.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
 
 
-def test_psnr_equals_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> None:
+def test_psnr_and_ssim_equal_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> None:
     a, b = images
     for k in range(2):
-        expected = peak_signal_noise_ratio(a[k].numpy(), b[k].numpy(), data_range=1)
+        one, other = a[k, 0].numpy(), b[k, 0].numpy()
+        expected = peak_signal_noise_ratio(one, other, data_range=1)
         assert psnr(a, b)[k].item() == pytest.approx(expected, abs=1e-9)
-
-
-def test_ssim_equals_scikit_image(images: tuple[torch.Tensor, torch.Tensor]) -> None:
-    a, b = images
-    for k in range(2):
-        _, full = structural_similarity(
-            a[k, 0].numpy(), b[k, 0].numpy(), data_range=1, gaussian_weights=True, sigma=1.5,
-            use_sample_covariance=False, full=True,
-        )  # fmt: skip
+        settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
+        _, full = structural_similarity(one, other, data_range=1, **settings)
         assert ssim(a, b)[k].item() == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
 
 

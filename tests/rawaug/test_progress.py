@@ -44,12 +44,6 @@ def test_a_terminal_gets_a_bar_and_keeps_it_if_asked() -> None:
         assert (screen.getvalue()[-1] == "\r") != leave
 
 
-def test_what_is_not_shown_prints_nothing() -> None:
-    screen = Terminal()
-    list(progress(range(3), label="read", unit="frame", shown=False, stream=screen))
-    assert screen.getvalue() == ""
-
-
 def test_what_is_nested_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0.02")
     log = io.StringIO()
@@ -60,8 +54,9 @@ def test_what_is_nested_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) ->
     assert any(line.startswith("frame: ") for line in lines) and lines[-1].startswith("evaluate: 3/3 images")
 
 
-def test_quiet_is_quiet() -> None:
+def test_what_is_quiet_or_not_shown_prints_nothing() -> None:
     screen = Terminal()
+    list(progress(range(3), label="read", unit="frame", shown=False, stream=screen))
     with quiet():
         bar = progress(range(3), label="train", unit="step", stream=screen)
         bar.set_postfix_str("loss 1", refresh=False)
