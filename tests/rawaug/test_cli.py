@@ -35,18 +35,6 @@ QUICK_RUN = [
 ]  # fmt: skip
 
 
-@pytest.mark.usefixtures("tiny")
-def test_fit_evaluate_info(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    weights, scores = str(tmp_path / "isp.safetensors"), tmp_path / "isp.json"
-    assert main(["fit", "tiny:train", "--out", weights, *QUICK_FIT]) == 0
-    assert main(["evaluate", weights, "--data", "tiny:validation", "--json", str(scores)]) == 0
-    assert json.loads(scores.read_text())["kind"] == "isp"
-    capsys.readouterr()
-    assert main(["info", weights]) == 0
-    text = capsys.readouterr().out
-    assert "colour atoms" in text and "train_00_astronaut" in text
-
-
 def test_preview_draws_two_figures(tmp_path: Path, refused: Callable[..., str]) -> None:
     picture = tmp_path / "picture.png"
     write_picture(picture, demo_pictures(3)[2][:, 64:160, 64:192])
@@ -75,16 +63,13 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     plain = json.loads((place / "evaluation.json").read_text())
     assert plain["plain"]["psnr"] > 20 and "self_ensemble" not in plain  # written as it came
     assert main([*command, "--self-ensemble", "false"]) == 0
-    text = capsys.readouterr().out
-    assert "augmented" in text and "picture.png" in text
-    results = json.loads((tmp_path / "fewshot" / "results.json").read_text())
-    assert set(results["results"]) == set(arms)
-    assert not any("self_ensemble" in runs[0] for runs in results["results"].values())
+    listed = capsys.readouterr().out.strip().splitlines()
+    results = json.loads((tmp_path / "fewshot" / "results.json").read_text())["results"]
+    assert set(results) == set(arms) and not any("self_ensemble" in runs[0] for runs in results.values())
     assert (tmp_path / "fewshot" / "picture.png").stat().st_size > 10_000
-    best = max(results["results"], key=lambda arm: results["results"][arm][0]["plain"]["psnr"])
+    best = max(results, key=lambda arm: results[arm][0]["plain"]["psnr"])
     weights = tmp_path / "fewshot" / "seed0" / best / "denoiser.safetensors"
-    *listed, last = text.strip().splitlines()
-    assert last == f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {weights}"
+    assert listed[-1] == f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {weights}"
     assert f"denoiser, real: {place / 'denoiser.safetensors'}" in listed
     assert any(re.match(r"time: fit \d+ s, training \d+ s, scores of the arms \d+ s", line) for line in listed)
     assert any(line.startswith("Use ") for line in listed)
@@ -101,18 +86,15 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
     assert main([*other, "--overwrite", "--self-ensemble", "false"]) == 0
     assert (place / "denoiser.safetensors").stat().st_mtime_ns != before
     assert len(list(place.glob("events.out.tfevents.*"))) == 1
-    assert main(["evaluate", str(weights), "--data", "tiny:validation", "--self-ensemble"]) == 0
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("fit demo:train --out x.safetensors --pix 512", "Unknown option: --pix."),
         ("fit demo:train --out x.safetensors --learning-rat 1", "Did you mean --learning-rate?"),
         ("fit demo:train --out x.safetensors --pixels many", "Invalid value for --pixels: unable"),
         ("fit demo:train --out x.safetensors --tone curves", 'Invalid value "curves" for --tone'),
         ("fit demo:train", "--out"),
-        ("data check x --frist 2", "Did you mean --first?"),
         ("data chek", 'Did you mean "check"?'),
         ("denoize a.dng", 'Unknown command "denoize". Did you mean "denoise"?'),
         ("denoise a.dng", "OUT"),
@@ -121,7 +103,6 @@ def test_run_is_resumable_and_ends_with_table_and_picture(
         ("run fewshot x", "x: too many arguments"),
         ("run fewshot --seeds", "--seeds needs a value"),
         ("run fewshot --train.learning 1", "train.learning: no such key (nearest: train.learning_rate)"),
-        ("run fewshot --train.stepz=3", "train.stepz: no such key (nearest: train.steps)"),
         ("run fewshot --arms.real.augmneted 1", "arms.real.augmneted: no such key (nearest: arms.NAME.augmented)"),
         ("run fewshot --arms.real.augmented 7", "arms.real: augmented must be a number from 0.0 to 1.0, got 7"),
         ("run fewshot --data.count few", "data.count: input should be a valid integer"),
@@ -133,17 +114,6 @@ def test_what_is_misspelt_missing_or_too_much_is_named(words: str, said: str, re
     assert said in refused(*words.split())
 
 
-def test_the_listing_says_what_the_docstrings_say() -> None:
-    for name, summary in COMMANDS.items():
-        assert import_module(f"rawaug.commands.{name}").run.__doc__.startswith(summary), name
-
-
-def test_keys_of_a_recipe_are_listed_with_its_values(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "fewshot", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "--train.learning-rate" in text and "--arms.NAME.augmented" in text and ":class:" not in text
-
-
 @pytest.mark.parametrize("command", ["", *COMMANDS, "data check"])
 def test_every_option_says_what_it_does(command: str) -> None:
     found = reduce(lambda above, word: above[word], command.split(), app) if command else app.meta
@@ -152,11 +122,8 @@ def test_every_option_says_what_it_does(command: str) -> None:
     assert all(said.values()), said
     shared = [text for text in said.values() if list(said.values()).count(text) > 1]
     assert set(shared) <= {"pixels of each frame in a step."}, "the text of a whole group of options"
-
-
-@pytest.mark.parametrize("kind", EXPERIMENTS)
-def test_every_key_of_a_recipe_says_what_it_does(kind: str) -> None:
-    assert not [key.name for key in keys_of(settings_of(kind)) if not key.meaning]
+    for kind in EXPERIMENTS if command == "run" else ():
+        assert not [key.name for key in keys_of(settings_of(kind)) if not key.meaning], kind
 
 
 def test_help_is_quick() -> None:
@@ -174,7 +141,9 @@ def test_help_is_quick() -> None:
     pytest.fail(f"rawaug --help took {seconds} s of a processor")
 
 
-def test_it_is_a_module_too() -> None:
+def test_the_listing_says_what_the_docstrings_say_and_it_is_a_module_too() -> None:
+    for name, summary in COMMANDS.items():
+        assert import_module(f"rawaug.commands.{name}").run.__doc__.startswith(summary), name
     done = subprocess.run([sys.executable, "-m", "rawaug", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("rawaug 0.")
 
@@ -220,20 +189,21 @@ def test_evaluate_finds_what_is_wrong_before_it_reads(
 
 @pytest.mark.usefixtures("tiny")
 def test_bad_input_is_one_line(tmp_path: Path, refused: Callable[..., str], bayer_dng: Callable[..., Path]) -> None:
-    out = ["--out", str(tmp_path / "x.safetensors")]
-    assert "nowhere" in refused("fit", tmp_path / "nowhere", *out)
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert "no RAW file" in refused("fit", empty, *out)
-    assert "bogus" in refused("fit", "bogus:x", *out)
-    assert ".safetensors" in refused("fit", "demo:train", "--out", tmp_path / "x.pt")
-    assert "no picture" in refused("run", "fewshot", *QUICK_RUN, "--out", tmp_path, "--data.pictures", empty)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.safetensors").write_bytes(b"not weights")
     whole = bayer_dng(tmp_path / "cut.dng", np.full((64, 64), 500, np.uint16))
     whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    assert "cut.dng" in refused("fit", whole, *out)
-    (tmp_path / "bad.safetensors").write_bytes(b"not weights")
-    assert "bad.safetensors" in refused("evaluate", tmp_path / "bad.safetensors", "--data", "demo:test")
-    assert "gone.safetensors" in refused("info", tmp_path / "gone.safetensors")
+    for words, said in (
+        (("fit", tmp_path / "nowhere", "--out", "x.safetensors"), "nowhere"),
+        (("fit", tmp_path / "empty", "--out", "x.safetensors"), "no RAW file"),
+        (("fit", "bogus:x", "--out", "x.safetensors"), "bogus"),
+        (("fit", "demo:train", "--out", tmp_path / "x.pt"), ".safetensors"),
+        (("fit", whole, "--out", "x.safetensors"), "cut.dng"),
+        (("run", "fewshot", *QUICK_RUN, "--out", tmp_path, "--data.pictures", tmp_path / "empty"), "no picture"),
+        (("evaluate", tmp_path / "bad.safetensors", "--data", "demo:test"), "bad.safetensors"),
+        (("info", tmp_path / "gone.safetensors"), "gone.safetensors"),
+    ):
+        assert said in refused(*words)
 
 
 def test_whole_frames_take_memory_in_huge_pages_unless_told_otherwise(

@@ -101,7 +101,8 @@ def test_the_commands_write_and_print_and_refuse(
     assert main(["info", "rawaug-small", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["name"] == "PMRID"
     assert main(["info", "canon-powershot"]) == 0
-    assert "tone and gamma, grey code to linear: 16 0.0" in capsys.readouterr().out
+    described = capsys.readouterr().out
+    assert "tone and gamma, grey code to linear: 16 0.0" in described and "colour atoms" in described
     assert main(["export", "canon-powershot", str(tmp_path / "a.cube"), "--white-balance", "[2.0, 1.0, 1.6]"]) == 0
     assert "a.cube: 1.1 MB" in capsys.readouterr().out
     for arguments, message in (

@@ -67,10 +67,17 @@ def test_files_and_folders_are_fitted_together(
 
 
 def test_what_cannot_be_fitted_together_is_named(tmp_path: Path, shoot: Shoot, refused: Callable[..., str]) -> None:
-    one, out = shoot("one.dng"), ["--out", tmp_path / "x.safetensors"]
-    assert "demo:train: a kind:path dataset cannot be combined" in refused("fit", one, "demo:train", *out)
-    assert "gone.dng" in refused("fit", one, tmp_path / "gone.dng", *out)
-    assert "gone" in refused("fit", one, "--held-out", tmp_path / "gone", *out)
+    one, two, out = shoot("shots/one.dng"), shoot("shots/two.dng"), ["--out", tmp_path / "x.safetensors", *QUICK]
+    (tmp_path / "link.dng").symlink_to(one)
+    for words, said in (
+        ((one, "demo:train"), "demo:train: a kind:path dataset cannot be combined"),
+        ((one, tmp_path / "gone.dng"), "gone.dng"),
+        ((one, "--held-out", tmp_path / "gone"), "gone"),
+        *(((one, "--held-out", held), "one.dng is also fitted") for held in (one, two.parent, tmp_path / "link.dng")),
+        ((two.parent, "--held-out", two), "two.dng is also fitted"),
+        (("demo:train", "--held-out", "demo:train"), "train_00_astronaut is also fitted"),
+    ):
+        assert said in refused("fit", *words, *out)
     assert not (tmp_path / "x.safetensors").exists() and not list(tmp_path.glob("*.state"))
 
 
@@ -88,15 +95,10 @@ def test_held_out_frames_are_scored_and_leave_no_trace_in_the_fit(
     assert all(5.0 < value < 70.0 for value in scores[-1].values())
     said = capsys.readouterr().out
     assert f"held out: {scores[-1]['blind']:.2f} dB blind, {scores[-1]['as_shot']:.2f} dB with" in said
+    pair, isp = rawaug.data.RawFolder(unseen)[0], DictionaryISP.from_pretrained(tmp_path / "watched.safetensors")
+    for known, key in enumerate(scores[-1]):  # the last score is that of the file
+        assert scores[-1][key] == pytest.approx(psnr_r(isp, pair, white_balance=bool(known)), abs=0.006)
     assert "held_out" not in alone.info
-
-
-def test_the_last_score_is_that_of_the_file(tmp_path: Path, shoot: Shoot) -> None:
-    out, unseen = tmp_path / "x.safetensors", shoot("unseen.dng", 264)
-    scores = fit(out, shoot("a.dng"), "--held-out", unseen).info["held_out"]
-    pair, isp = rawaug.data.RawFolder(unseen)[0], DictionaryISP.from_pretrained(out)
-    assert scores[-1]["blind"] == pytest.approx(psnr_r(isp, pair), abs=0.006)
-    assert scores[-1]["as_shot"] == pytest.approx(psnr_r(isp, pair, white_balance=True), abs=0.006)
 
 
 def test_a_stopped_fit_goes_on_from_its_state_and_removes_it(
@@ -150,27 +152,11 @@ def test_the_cameras_jpeg_is_taken_unless_it_is_refused(tmp_path: Path, shoot: S
 
 def test_pairs_are_fitted_as_they_are() -> None:
     pairs, other = rawaug.data.demo_pairs("train", count=2), rawaug.data.demo_pairs("validation", count=1)
+    unknown = replace(pairs[0], color_known=False)
+    with pytest.raises(ValueError, match="train_00_astronaut: its white balance and colour matrix are unknown"):
+        rawaug.fit([unknown], progress=False, noise="off", **SETTINGS)
     isp = rawaug.fit(pairs, progress=False, noise="off", held_out=other, **SETTINGS)
     assert isp.info["frames"] == [pair.name for pair in pairs] and len(isp.info["held_out"]) == 2
-
-
-def test_held_out_frames_that_are_also_fitted_are_refused(
-    tmp_path: Path, shoot: Shoot, refused: Callable[..., str]
-) -> None:
-    one, two = shoot("shots/one.dng"), shoot("shots/two.dng")
-    (tmp_path / "link.dng").symlink_to(one)
-    out = ["--out", tmp_path / "x.safetensors", *QUICK]
-    for held_out in (one, tmp_path / "shots", tmp_path / "link.dng"):
-        assert "one.dng is also fitted" in refused("fit", one, "--held-out", held_out, *out)
-    assert "two.dng is also fitted" in refused("fit", tmp_path / "shots", "--held-out", two, *out)
-    assert "train_00_astronaut is also fitted" in refused("fit", "demo:train", "--held-out", "demo:train", *out)
-    assert not (tmp_path / "x.safetensors").exists()
-
-
-def test_a_frame_of_unknown_colour_is_refused() -> None:
-    unknown = [replace(pair, color_known=False) for pair in rawaug.data.demo_pairs("train", count=1)]
-    with pytest.raises(ValueError, match="train_00_astronaut: its white balance and colour matrix are unknown"):
-        rawaug.fit(unknown, progress=False, noise="off", steps=2, pixels=256, batch=64)
 
 
 def test_pairs_that_do_not_state_their_cfa_and_levels_are_fitted_by_given_ones(

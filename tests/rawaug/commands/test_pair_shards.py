@@ -93,17 +93,13 @@ def test_the_pairs_are_those_of_other_formats(pictures: Path, whole: Path, tmp_p
     described = json.loads(sample["json"])
     assert (described["picture"], described["number"], described["cfa"]) == ("b.c.d.png", 1, "RGGB")
     assert (described["height"], described["width"]) == (16, 18)
+    replayed = replay_sample(described, pictures)
+    assert np.array_equal(replayed.noisy.numpy(), np.load(io.BytesIO(sample["noisy.npy"])))
     assert described["shot_var"] == pytest.approx(FIXED[0]) and described["isp"] == "universal"
 
 
-def test_a_sample_is_replayed_bit_for_bit_and_only_from_its_picture(
-    pictures: Path, whole: Path, tmp_path: Path
-) -> None:
-    sample = samples(whole)["00000004_1"]
-    described = json.loads(sample["json"])
-    pair = replay_sample(described, pictures)
-    assert np.array_equal(np.load(io.BytesIO(sample["noisy.npy"])), pair.noisy.numpy())
-    assert np.array_equal(np.load(io.BytesIO(sample["clean.npy"])), pair.clean.numpy())
+def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path, tmp_path: Path) -> None:
+    described = json.loads(samples(whole)["00000004_1"]["json"])
     (tmp_path / "sub").mkdir()
     (tmp_path / described["picture"]).write_bytes((pictures / "z.png").read_bytes())
     with pytest.raises(ValueError, match=r"sub/a\.png: the picture .* has changed since"):
@@ -124,15 +120,11 @@ def test_bursts_of_developed_pictures_are_replayed(pictures: Path, tmp_path: Pat
 
 
 def test_index_and_card_count_what_is_there(whole: Path) -> None:
-    index = json.loads((whole / "index.json").read_text())
-    assert index["__kind__"] == "wids-shard-index-v1"
-    assert [(shard["url"], shard["nsamples"]) for shard in index["shardlist"]] == [
-        ("shard-000000.tar", 4),
-        ("shard-000001.tar", 6),
-        ("shard-000002.tar", 4),
+    shards = json.loads((whole / "index.json").read_text())["shardlist"]
+    assert [(shard["url"], shard["nsamples"]) for shard in shards] == [
+        (f"shard-00000{k}.tar", n) for k, n in enumerate((4, 6, 4))
     ]
-    assert all((whole / shard["url"]).stat().st_size == shard["filesize"] for shard in index["shardlist"])
-    assert sum(shard["nsamples"] for shard in index["shardlist"]) == len(samples(whole)) == 14
+    assert all((whole / shard["url"]).stat().st_size == shard["filesize"] for shard in shards)
     assert "14 noisy/clean RAW pairs in 3 WebDataset shards" in (whole / "README.md").read_text()
 
 

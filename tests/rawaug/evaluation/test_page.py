@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from html.parser import HTMLParser
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +20,6 @@ from rawaug.data.pairs import Pair
 from rawaug.evaluation.page import WINDOW, Page, draw_curves, encode_png, most_detailed
 from rawaug.evaluation.tables import Row
 
-VOID = {"img", "meta", "br"}
-
-
-class Elements(HTMLParser):
-    """Tags in order, the text, and whether every tag is closed where it should be."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.text, self.source = "", text
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
 
 def scores(psnr: float) -> dict[str, Any]:
     keys = {"psnr": psnr, "ssim": 0.91, "psnr_srgb": 30.0, "ssim_srgb": 0.8}
@@ -54,7 +30,7 @@ def scores(psnr: float) -> dict[str, Any]:
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> Elements:
+def page(tmp_path: Path) -> str:
     log = tmp_path / "log.csv"
     log.write_text("step,loss,psnr,samples_per_second\n2,0.1,30,9\n4,0.05,31,9\n")
     results = {"real": [{"plain": scores(40.123), "self_ensemble": scores(41.0)}]}
@@ -65,31 +41,31 @@ def page(tmp_path: Path) -> Elements:
     pair = Pair("a <frame>", torch.zeros(3, 200, 800, dtype=torch.uint8), raw, CFA.GRBG, (2, 1, 1.6), torch.eye(3))
     packed = bayer.pack(raw[None], CFA.GRBG)
     made.add_frame(Row(pair, {"noisy": packed, "real": packed, "clean": packed}, {"real": "40.12 dB"}), CFA.GRBG)
-    text = made.write(tmp_path / "new" / "report.html", {"steps": 4}).read_text(encoding="utf-8")
-    assert not re.search(r"(?:src|href)=[\"'](?!data:)", text)  # nothing is fetched
-    return Elements(text)
+    return made.write(tmp_path / "new" / "report.html", {"steps": 4}).read_text(encoding="utf-8")
 
 
-def test_it_is_well_formed_and_says_what_was_measured(page: Elements) -> None:
-    assert page.open == []
+def test_it_stands_alone_and_says_what_was_measured(page: str) -> None:
+    assert not re.search(r"(?:src|href)=[\"'](?!data:)", page), "nothing is fetched"
+    assert all(page.count(f"<{tag}") == page.count(f"</{tag}>") for tag in ("table", "figure", "dl", "h2", "body"))
+    text = unescape(re.sub(r"<[^>]*>", "", page))
     for said in ("a & b", "a <frame>", "40.12", "37.50", "41.00", "Wavelet", "worst 25%", "steps: 4", "noisy input"):
-        assert said in page.text
+        assert said in text
 
 
-def test_it_opens_with_the_verdict_and_marks_the_best(page: Elements) -> None:
-    assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frames, one seed" in page.text
-    assert "a U-Net" in page.text and "else upi; shot_var 0.001 to 0.001" in page.text
-    cells = re.findall(r'<td class="best">([^<]*)', page.source)
+def test_it_opens_with_the_verdict_and_marks_the_best(page: str) -> None:
+    assert "Use real: +2.62 dB over Wavelet, higher on 1 of 1 frames, one seed" in page
+    assert "a U-Net" in page and "else upi; shot_var 0.001 to 0.001" in page
+    cells = re.findall(r'<td class="best">([^<]*)', page)
     assert "40.12" in cells and "37.50" not in cells and "41.00" not in cells  # the only self-ensemble is no best one
-    heads = re.findall(r"<thead>.*?</thead>", page.source, re.DOTALL)
+    heads = re.findall(r"<thead>.*?</thead>", page, re.DOTALL)
     assert [head.count("self-ensemble") for head in heads] == [0, 0, 0, 0]  # a heading of its own says so
 
 
-def test_its_pictures_open_and_have_the_promised_sizes(page: Elements) -> None:
-    sources = [str(attributes["src"]) for tag, attributes in page.found if tag == "img"]
-    pictures = [Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))) for source in sources]
-    assert [picture.size for picture in pictures[2:]] == [(2 * WINDOW, 2 * WINDOW)] * 3 + [(640, 160)]
-    assert all(attributes.get("alt") for tag, attributes in page.found if tag == "img")
+def test_its_pictures_open_and_have_the_promised_sizes(page: str) -> None:
+    images = re.findall(r'<img alt="([^"]+)" src="data:image/png;base64,([^"]+)">', page)
+    assert len(images) == page.count("<img")
+    sizes = [Image.open(io.BytesIO(base64.b64decode(png))).size for _, png in images]
+    assert sizes[2:] == [(2 * WINDOW, 2 * WINDOW)] * 3 + [(640, 160)]
 
 
 def test_the_window_is_where_the_detail_is() -> None:
@@ -116,12 +92,9 @@ def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
         assert (pixels == (31, 119, 180)).all(axis=2).sum() > legend_alone + 20
 
 
-def test_nothing_is_wider_than_a_phone_but_what_scrolls(page: Elements) -> None:
-    classes = [attributes.get("class") for _, attributes in page.found]
-    tables = [k for k, (tag, _) in enumerate(page.found) if tag == "table"]
-    assert len(tables) == 4 and all(classes[k - 1] == "table" for k in tables)
-    (style,) = re.findall(r"<style>(.*?)</style>", page.source, re.DOTALL)
-    assert re.search(r"\.table \{ overflow-x: auto", style) and "img { max-width: 100%" in style
+def test_nothing_is_wider_than_a_phone_but_what_scrolls(page: str) -> None:
+    assert page.count('<div class="table"><table>') == page.count("<table>") == 4
+    (style,) = re.findall(r"<style>(.*?)</style>", page, re.DOTALL)
+    assert ".table { overflow-x: auto" in style and "img { max-width: 100%" in style
     assert all(int(width) < 400 for width in re.findall(r"[^-]width: (\d+)px", style))
-    viewport = next(attributes["content"] for _, attributes in page.found if attributes.get("name") == "viewport")
-    assert viewport == "width=device-width, initial-scale=1"
+    assert 'name="viewport" content="width=device-width, initial-scale=1"' in page

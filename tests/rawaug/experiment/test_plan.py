@@ -28,8 +28,6 @@ from rawaug.io import write_picture
 from rawaug.training.config import TrainConfig
 
 ARMS = {"real": ArmConfig()}
-ONE_ARM = ["--arms", '{"real": {"augmented": 0.5}}', "--denoiser.settings", '{"width": 4, "scales": 2}']
-BARE = ["--classical", "[]", "--untouched", "[]", "--isp.pixels", "256", "--device", "cpu", "--train.crop", "32"]
 
 
 def write_pairs(folder: Path, names: list[str]) -> Path:
@@ -75,6 +73,9 @@ def test_own_pairs_are_all_used_and_a_part_of_them_is_held_out(own: Path, data: 
     unwatched = replace(mine, data=replace(mine.data, validation=None))
     assert with_own_pairs(unwatched, content, {"data.pairs"}).data.validation is None
 
+    elsewhere = Recipe(arms=ARMS, data=DataConfig(pairs="sidd:/elsewhere", count=56, validation=None))
+    assert with_own_pairs(elsewhere, read_recipe(find_recipe("sidd/fewshot")), {"data.pairs"}) == elsewhere
+
     recipe = with_own_pairs(mine, content, {"data.pairs"})
     plan = plan_of(recipe)
     assert names_of(plan.pairs) == [f"shot{k}" for k in range(6)] and names_of(plan.validation) == ["shot6"]
@@ -109,18 +110,6 @@ def test_limits_of_reading_are_keys_of_data(data: DataConfig, tmp_path: Path) ->
         DataConfig(max_pixels=0)
 
 
-def test_the_same_kind_of_data_elsewhere_keeps_its_regime() -> None:
-    recipe = Recipe(arms=ARMS, data=DataConfig(pairs="sidd:/elsewhere", count=56, validation=None))
-    assert with_own_pairs(recipe, read_recipe(find_recipe("sidd/fewshot")), {"data.pairs"}) == recipe
-
-
-def test_a_single_pair_is_trained_on_and_nothing_is_held_out(data: DataConfig) -> None:
-    recipe = Recipe(arms=ARMS, data=data)
-    plan = plan_of(recipe, pairs=demo_pairs("train", count=1))
-    assert len(plan.pairs) == 1 and not plan.validation
-    assert "final weights are kept" in plan.lines(recipe)[1]
-
-
 def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfig) -> None:
     pairs, test = demo_pairs("train"), demo_pairs("test", count=2)
     recipe = Recipe(arms=ARMS, data=replace(data, count=None, test_count=1, validation_crop=None, test_crop=None))
@@ -129,6 +118,9 @@ def test_pairs_from_python_are_divided_and_seen_by_their_content(data: DataConfi
     other = replace(pairs[4], raw=pairs[4].raw * 0.5)
     changed = plan_of(recipe, pairs=[*pairs[:4], other], test=test)
     assert stamps(plan.validation) != stamps(changed.validation) and stamps(plan.pairs) == stamps(changed.pairs)
+    single = plan_of(recipe, pairs=pairs[:1])
+    assert len(single.pairs) == 1 and not single.validation, "nothing is held out"
+    assert "final weights are kept" in single.lines(recipe)[1]
     with pytest.raises(ValueError, match=r"data\.test: train_00_astronaut is also in data\.pairs"):
         plan_of(recipe, pairs=pairs, test=pairs[:1])
     assert names_of(plan_of(recipe, pairs=pairs, validation=test[1:], test=test[:1]).pairs) == names_of(pairs)
@@ -180,26 +172,16 @@ def test_settings_of_pairs_need_pairs() -> None:
     assert DataConfig(test="pairs:x", cfa="RGGB").settings_of("pairs:x")["cfa"] == "RGGB"
 
 
-def test_a_dry_run_says_what_is_used_tries_it_and_writes_nothing(
-    own: Path, data: DataConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["run", "fewshot", "--data.pairs", f"pairs:{own}", "--data.test", data.test]
-    command += ["--data.pictures", str(data.pictures), "--dry-run", "--out", str(tmp_path / "runs")]
-    assert main([*command, *ONE_ARM, *BARE]) == 0
-    said = capsys.readouterr().out
-    assert "train     6 of 7 of pairs:" in said and "held out: shot6" in said
-    assert "no problems found" in said
-    assert not (tmp_path / "runs").exists()
-
-
 def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run"]) == 0
     lines = recipe_list().splitlines()
     assert recipe_list() in capsys.readouterr().out
     assert len(lines) == len(shipped_recipes()) >= 10 and all(len(line.split(maxsplit=1)[1]) > 30 for line in lines)
-    for name, shown in (("unsupervised", " 4000"), ("pretrain", '"PMRID"')):
-        main(["run", name, "--help"])
-        assert shown in capsys.readouterr().out
+    for name, value in (("unsupervised", " 4000"), ("pretrain", '"PMRID"')):
+        assert main(["run", name, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert value in shown and "--train.learning-rate" in shown and "--arms.NAME.augmented" in shown
+        assert ":class:" not in shown
 
 
 def test_an_arm_has_a_rate_and_a_weighing_of_its_own_and_at_most_its_own_steps() -> None:
