@@ -383,13 +383,6 @@ class Pack(nn.Module):
         return pack(mosaic, self.cfa)
 
 
-class Unpack(Pack):
-    """:func:`unpack` as a module, the inverse of :class:`Pack`."""
-
-    def forward(self, packed: Tensor) -> Tensor:
-        return unpack(packed, self.cfa)
-
-
 @dataclass(frozen=True)
 class Pattern:
     """A colour filter array.

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from cyclopts import Parameter, Token
+from cyclopts import Parameter
 
 from rawaug.files import yaml_value
 
@@ -19,9 +18,5 @@ def value_of(text: str) -> Any:
     return text if isinstance(value, dict) and not text.lstrip().startswith("{") else value
 
 
-def _converted(_: Any, tokens: Sequence[Token]) -> Any:
-    return value_of(tokens[0].value)
-
-
-YAML = Parameter(converter=_converted, n_tokens=1, json_list=False, metavar="VALUE")
+YAML = Parameter(converter=lambda _, tokens: value_of(tokens[0].value), n_tokens=1, json_list=False, metavar="VALUE")
 """One argument of several forms: a name, a list as ``[1e-3, 1e-5]``, or ``{name: ..., settings: {...}}``."""

@@ -212,10 +212,10 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
         session = write_onnx(model, examples, "denoised", partial, stated)
         with torch.inference_mode():
             expected = model(*inputs.values())
-            seconds_torch = _fastest(lambda: model(*inputs.values()))
+            seconds_torch = min(timeit.repeat(lambda: model(*inputs.values()), number=1, repeat=3))
         difference = difference_from(expected, session, inputs, out)
         values = feeds(names, list(inputs.values()))
-        seconds_onnx = _fastest(lambda: session.run(None, values))
+        seconds_onnx = min(timeit.repeat(lambda: session.run(None, values), number=1, repeat=3))
     megapixels = inputs["noisy"].numel() / 1e6
     return (
         f"{out}: {out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.1e}\n"
@@ -236,7 +236,3 @@ def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
     packed = bayer.pack(raw.mosaic[None, :, top : top + SIDE, left : left + SIDE], raw.cfa).contiguous()
     shot_var, read_var = raw.noise_profile or (1e-3, 1e-5)
     return packed, bayer.noise_variance(packed, shot_var, read_var)
-
-
-def _fastest(call: Callable[[], Any]) -> float:
-    return min(timeit.repeat(call, number=1, repeat=3))

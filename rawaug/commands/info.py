@@ -64,12 +64,9 @@ def _describe_isp(path: Path) -> str:
     lines.append(f"  colour atoms (sRGB to camera, rows of {rows}):")
     for matrix in isp.colour.atoms().tolist():
         lines.append("    " + " | ".join(" ".join(f"{value:6.3f}" for value in row) for row in matrix))
-    lines.append(f"  tone and gamma, grey code to linear: {_curve(isp)}")
+    curve = isp.tone_curve().mean(dim=1)
+    codes = ", ".join(f"{code} {curve[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))
+    lines.append(f"  tone and gamma, grey code to linear: {codes}")
     lines += [f"  {text}" for stage in isp.ordered_stages if (text := stage.describe())]
     lines += [f"  {key}: {dumps(value)}" for key, value in isp.info.items()]
     return "\n".join(lines)
-
-
-def _curve(isp: DictionaryISP) -> str:
-    means = isp.tone_curve().mean(dim=1)
-    return ", ".join(f"{code} {means[code].item():.4f}" for code in (16, 32, 64, 128, 192, 255))

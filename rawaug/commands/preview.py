@@ -66,20 +66,15 @@ def run(
     print(f"{stages}\n{atoms}")
 
 
-def _centre(srgb: Tensor) -> tuple[int, int, int, int]:
-    height, width = (min(side, _MAXIMUM) for side in srgb.shape[-2:])
-    top, left = ((side - size) // 4 * 2 for side, size in zip(srgb.shape[-2:], (height, width), strict=True))
-    return top, left, height, width
-
-
 @torch.no_grad()
 def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> Any:
     with extra("train"):
         from matplotlib.figure import Figure
 
-    top, left, height, width = _centre(whole)
-    isp, sensor = augment.isp, pattern(augment.cfa)
-    srgb, frame = bayer.crop(whole, top, left, height, width), (whole.shape[-2], whole.shape[-1])
+    isp, sensor, frame = augment.isp, pattern(augment.cfa), (whole.shape[-2], whole.shape[-1])
+    height, width = (min(side, _MAXIMUM) for side in frame)
+    top, left = (frame[0] - height) // 4 * 2, (frame[1] - width) // 4 * 2
+    srgb = bayer.crop(whole, top, left, height, width)
     place = place_in_frame(height, width, (top, left), frame)
     setting = isp.reverse(srgb[None], place=place).params
     panels = stage_pictures(augment, srgb, setting, place)

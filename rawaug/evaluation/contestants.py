@@ -207,15 +207,11 @@ def _of_function(spec: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
         raise ValueError(f"{spec}: cannot be imported: {error}") from None
     finally:
         sys.path.pop(0)
-    reads_variance = _positional(function) > 1
+    parameters = inspect.signature(function).parameters.values()
+    placed = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
+    reads_variance = sum(one.default is one.empty for one in placed) > 1
 
     def run(noisy: Tensor, variance: Tensor, _: CFA) -> Tensor:
         return torch.as_tensor(function(noisy, variance) if reads_variance else function(noisy)).to(noisy)
 
     return run
-
-
-def _positional(function: Callable[..., Any]) -> int:
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    parameters = inspect.signature(function).parameters.values()
-    return sum(one.kind in kinds and one.default is one.empty for one in parameters)

@@ -12,7 +12,7 @@ import io
 import json
 import shlex
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -202,7 +202,8 @@ def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:
     """
     rows = {(arm, k): read_log(path) for arm, paths in logs.items() for k, path in enumerate(paths)}
     colours = {arm: f"C{k % 10}" for k, arm in enumerate(logs)}
-    return {title: _draw_curve(key, title, rows, colours) for key, title in CURVES.items() if _has(key, rows.values())}
+    drawn = {key: title for key, title in CURVES.items() if any(row.get(key) for log in rows.values() for row in log)}
+    return {title: _draw_curve(key, title, rows, colours) for key, title in drawn.items()}
 
 
 Log = Sequence[Mapping[str, str]]
@@ -212,10 +213,6 @@ def read_log(path: Path) -> Log:
     """The rows of a training's ``log.csv``."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _has(key: str, logs: Iterable[Log]) -> bool:
-    return any(row.get(key) for rows in logs for row in rows)
 
 
 def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colours: Mapping[str, str]) -> bytes:

@@ -301,13 +301,10 @@ def shipped_recipes() -> dict[str, Path]:
 
 def recipe_list() -> str:
     """The shipped recipes, a line each: name and what its file opens with."""
-    known = {name: file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, file in _listed()}
+    shipped = sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))  # those at the top first
+    known = {name: file.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ") for name, file in shipped}
     width = max(map(len, known)) + 2
     return "\n".join(f"  {name:<{width}}{title}" for name, title in known.items())
-
-
-def _listed() -> list[tuple[str, Path]]:
-    return sorted(shipped_recipes().items(), key=lambda item: ("/" in item[0], item[0]))
 
 
 def find_recipe(name: str) -> Path:

@@ -35,7 +35,8 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
     """The folder of a run, checked: it can be written, and is empty or this run's."""
     folder = run_folder(settings)
     require_writable(folder, folder=True)
-    if overwrite or not folder.is_dir() or not _filled(folder):
+    rests = (LOCK, ".partial")  # what a run has as it begins, or left when it was killed there
+    if overwrite or not folder.is_dir() or all(file.name.endswith(rests) for file in folder.iterdir()):
         return folder
     advice = "give this run another --name, or --overwrite to replace that one"
     stamp = folder / STAMP
@@ -45,8 +46,9 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
         known = dict(_flat(json.loads(stamp.read_text())))
     except json.JSONDecodeError as error:
         raise ValueError(f"{stamp}: not valid JSON ({error.msg}); {advice}") from None
-    asked = dict(_flat(_as_json(settings)))
-    changed = [key for key in sorted(known | asked) if known.get(key) != asked.get(key) and not _free(key)]
+    asked = dict(_flat(json.loads(json.dumps(asdict(settings)))))
+    changed = [key for key in sorted(known | asked) if known.get(key) != asked.get(key)]
+    changed = [key for key in changed if key not in FREE and key.rpartition(".")[2] not in FREE_ANYWHERE]
     if changed:
         differences = ", ".join(f"{key} {known.get(key)}, now {asked.get(key)}" for key in changed[:3])
         more = f", and {len(changed) - 3} more" if len(changed) > 3 else ""
@@ -57,18 +59,8 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
 def claim(settings: Any, overwrite: bool = False) -> Path:
     """:func:`require_free`, and the settings written there."""
     folder = require_free(settings, overwrite)
-    write_json(_as_json(settings), folder / STAMP)
+    write_json(asdict(settings), folder / STAMP)
     return folder
-
-
-def _as_json(settings: Any) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
-    return content
-
-
-def _filled(folder: Path) -> bool:
-    """Whether there is more than what a run has as it begins, or left when it was killed there."""
-    return any(file.name != LOCK and file.suffix != ".partial" for file in folder.iterdir())
 
 
 def _flat(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -78,7 +70,3 @@ def _flat(value: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]
             yield from _flat(inner, f"{above}{key}.")
         else:
             yield f"{above}{key}", inner or None if isinstance(inner, Mapping) else inner
-
-
-def _free(key: str) -> bool:
-    return key in FREE or key.rpartition(".")[2] in FREE_ANYWHERE

@@ -66,7 +66,7 @@ def colours(drawn: Drawn) -> np.ndarray:
     for matrices, size, alpha, edge in ((atoms[:_ATOMS], 12, 0.35, "none"), (setting.matrix[None], 110, 1.0, "black")):
         seen = (patches @ matrices.mT).flatten(0, 1)
         share = seen / seen.sum(dim=1, keepdim=True)
-        shown = _shown(patches.repeat(len(matrices), 1))
+        shown = encode_srgb(patches.repeat(len(matrices), 1)).numpy()
         colour.scatter(share[:, 0], share[:, 1], s=size, c=shown, alpha=alpha, edgecolors=edge)
     colour.set(xlabel="R / (R + G + B)", ylabel="G / (R + G + B)")
     count = f"{_ATOMS} of {len(atoms)}" if len(atoms) > _ATOMS else str(len(atoms))
@@ -125,11 +125,6 @@ def _by_colour(drawn: Drawn, raw: Tensor) -> list[Tensor]:
     mosaic = raw if len(raw) == 1 else drawn.augment.mosaic(raw)
     values = [mosaic[0][plane > 0] for plane in bayer.pattern(drawn.augment.cfa).planes(*mosaic.shape[-2:])]
     return [of_colour[:: max(1, -(-len(of_colour) // _MOST))] for of_colour in values]
-
-
-def _shown(linear: Tensor) -> np.ndarray:
-    shown: np.ndarray = encode_srgb(linear.clamp(0, 1)).numpy()
-    return shown
 
 
 def _figure() -> tuple[Any, Any]:

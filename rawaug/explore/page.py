@@ -177,12 +177,13 @@ def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
     for name, control in made.items():
         control.elem_id = name
     shown = {"show_progress": "hidden", "api_visibility": "private"}
-    upload.upload(partial(_added, gr, choices), upload, made["picture"], **shown)
+    upload.upload(
+        lambda file: gr.update(choices=[*choices, (Path(file).name, file)], value=file),
+        upload,
+        made["picture"],
+        **shown,
+    )
     return made
-
-
-def _added(gr: Any, choices: Sequence[tuple[str, str]], uploaded: str) -> Any:
-    return gr.update(choices=[*choices, (Path(uploaded).name, uploaded)], value=uploaded)
 
 
 def _tab(gr: Any, name: str, outputs: dict[str, Any]) -> Any:

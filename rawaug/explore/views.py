@@ -64,7 +64,8 @@ def pair(look: Look) -> list[Panel]:
 def stages(look: Look) -> list[Panel]:
     """The picture between the stages of the ISP, small; linear images through the sRGB curve."""
     made = drawn(look)
-    small = even_sided(_thumbnail(made.srgb))
+    factor = max(1, max(made.srgb.shape[-2:]) // _THUMBNAIL)
+    small = even_sided(F.avg_pool2d(made.srgb[None].float(), factor)[0].round().to(torch.uint8))
     shown = stage_pictures(made.augment, small, _batched(made.pair.params.isp))
     return [Panel(title, _to_uint8(image)) for title, image in shown.items()]
 
@@ -94,8 +95,9 @@ def raw(look: Look) -> list[Panel]:
     values = made.pair.clean.flatten()
     gains = 1.0 / values[:: max(1, len(values) // 2**14)].quantile(0.99).clamp_min(1e-3)
     coloured = sensor.planes(*near.shape[-2:]) * encode_srgb((near * gains).clamp(0, 1))
+    sites = _to_uint8(coloured).repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)
     panels = [
-        Panel(f"{sensor.name}: {near.shape[-2]} x {near.shape[-1]} sites, each in its colour", _enlarged(coloured)),
+        Panel(f"{sensor.name}: {near.shape[-2]} x {near.shape[-1]} sites, each in its colour", sites),
         Panel("histograms", figures.histograms(made)),
     ]
     if made.augment.pattern is None:
@@ -250,18 +252,7 @@ def _crop(image: Tensor, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
     return image[..., top : top + height, left : left + width]
 
 
-def _thumbnail(srgb: Tensor) -> Tensor:
-    factor = max(1, max(srgb.shape[-2:]) // _THUMBNAIL)
-    if factor == 1:
-        return srgb
-    return F.avg_pool2d(srgb[None].float(), factor)[0].round().to(torch.uint8)
-
-
 def _to_uint8(image: Tensor) -> np.ndarray:
     """Floats ``(3, H, W)`` in [0, 1] to uint8 ``(H, W, 3)``."""
     shown: np.ndarray = (image.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
     return np.ascontiguousarray(shown)
-
-
-def _enlarged(image: Tensor) -> np.ndarray:
-    return _to_uint8(image).repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)
