@@ -166,8 +166,8 @@ def denoise_file(
         raise ValueError(f"{out}: the output is a DNG; give a name ending in .dng")
     if out.resolve() == source.resolve():
         raise ValueError(f"{out}: is the input file; give another name")
-    for path in (out, *filter(None, [preview])):
-        if Path(path).exists() and not overwrite:
+    for path in (out, *([] if preview is None else [Path(preview)])):
+        if path.exists() and not overwrite:
             raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
         require_writable(path)
     if preview is not None and Path(preview).suffix.lower() not in (".jpg", ".jpeg", ".png"):

@@ -128,8 +128,8 @@ def tested(method: Method, pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -
     sample = frozen_sample(pair, noise, cfa, seed)
     denoised = method(pair, sample)
     values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-    levels = frozen_levels(pair, noise, seed) or (None, None)
-    return Score(pair.name, *values, *levels, pair.levels_from_clean or None), sample, denoised
+    shot_var, read_var = frozen_levels(pair, noise, seed) or (None, None)
+    return Score(pair.name, *values, shot_var, read_var, pair.levels_from_clean or None), sample, denoised
 
 
 def score_method(
