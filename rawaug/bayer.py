@@ -136,14 +136,11 @@ STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
 
 
 def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
-    """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``: stage f6; each site keeps the colour that it measured.
+    """Mosaic ``(B, 1, H, W)``, sides even, to ``(B, 3, H, W)``: stage f6; each site keeps the colour that it measured.
 
-    Args:
-        raw: sides even, and at least 4 for ``malvar``.
-        cfa: its pattern.
-        method: ``bilinear``, or ``malvar``: the missing colour follows its neighbours, corrected by the Laplacian of
-            the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
-            Bayer-patterned color images", ICASSP 2004).
+    ``method`` is ``bilinear``, or ``malvar`` (sides of at least 4): the missing colour follows its neighbours, corrected
+    by the Laplacian of the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing
+    of Bayer-patterned color images", ICASSP 2004).
     """
     _require_channels(raw, 1, "a mosaic")
     _require_even(*raw.shape[-2:])
@@ -215,10 +212,9 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
 
 
 def _cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
-    if min(top, left) < 0 or min(height, width) < 1 or top + height > raw.shape[-2] or left + width > raw.shape[-1]:
-        raise ValueError(
-            f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {tuple(raw.shape[-2:])}"
-        )
+    sides = tuple(raw.shape[-2:])
+    if min(top, left) < 0 or min(height, width) < 1 or top + height > sides[0] or left + width > sides[1]:
+        raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {sides}")
     return raw[..., top : top + height, left : left + width]
 
 
@@ -229,11 +225,8 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
     of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
     independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
-
     With ``together`` the four sites of a new cell are means over the same area, as a pixel of full colour needs them.
-
-    Raises:
-        ValueError: if the CFA is not Bayer's (X-Trans), or a side is not a multiple of 2 ``factor``.
+    ValueError if the CFA is not Bayer's, or a side is not a multiple of 2 ``factor``.
 
     Example:
         >>> bin_mosaic(torch.rand(1, 16, 24), "GRBG", 4).shape
@@ -295,8 +288,7 @@ class _Transform(nn.Module, ABC):
         return super().apply(raw) if params is None else self._apply_params(raw, params)
 
     @abstractmethod
-    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
-        """``apply`` with parameters."""
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor: ...
 
 
 class RandomCrop(_Transform):
@@ -305,11 +297,8 @@ class RandomCrop(_Transform):
     One draw serves all that is in the tensor: noisy and clean, stacked, are cropped alike.
 
     Args:
-        size: even side, or (height, width), in mosaic pixels.
+        size: even side, or (height, width), in mosaic pixels, at most those of the mosaics.
         seed: of its own draws, where no generator is passed.
-
-    Raises:
-        ValueError: if the size is odd, or, on use, if the mosaic is smaller.
 
     Example:
         >>> crop = RandomCrop(4)
@@ -447,10 +436,7 @@ class Pattern:
     def turn_keeping(self, raw: Tensor, view: int) -> Tensor:
         """Turn ``(..., H, W)`` as :func:`turn` does, and crop to the whole cells of the pattern.
 
-        A side is one cell shorter where the pattern had moved.
-
-        Raises:
-            ValueError: if a side has no whole cells, or too few.
+        A side, which must have whole cells, is one cell shorter where the pattern had moved.
 
         Example:
             >>> pattern("XTRANS").turn_keeping(torch.rand(1, 1, 24, 36), view=1).shape  # mirrored

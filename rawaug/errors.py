@@ -1,8 +1,6 @@
 """Errors as one line that says what to do: a library that is not installed, or a machine that is short of something.
 
-Where a worker was killed, or shared memory, file descriptors or memory have run out, PyTorch raises a RuntimeError of
-several lines: no fault of a program, so no traceback either. Names of files, which may hold any byte but ``/`` and NUL,
-are made printable for terminals, logs and tables.
+Names of files, which may hold any byte but ``/`` and NUL, are made printable for terminals, logs and tables.
 """
 
 from __future__ import annotations

@@ -54,10 +54,7 @@ def yaml_value(text: str) -> Any:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an error.
-
-    Two writers of one file take turns. What a killed process left is removed by the next.
-    """
+    """Yield a path beside ``path``, which it replaces when the block ends without an error; two writers take turns."""
     from filelock import FileLock
 
     path = Path(path)
@@ -136,14 +133,13 @@ def _finite(value: Any) -> Any:
 def parse_object(text: str) -> dict[str, Any]:
     """A JSON object from a file of others; ValueError if it is anything else, or a number in it is not finite."""
 
-    def refuse(number: str) -> float:
-        raise ValueError(f"{number} is not a finite number")
-
     def finite(number: str) -> float:
-        return float(number) if math.isfinite(float(number)) else refuse(number)
+        if not math.isfinite(float(number)):
+            raise ValueError(f"{number} is not a finite number")
+        return float(number)
 
     try:
-        value = json.loads(text, parse_constant=refuse, parse_float=finite)
+        value = json.loads(text, parse_constant=finite, parse_float=finite)
     except json.JSONDecodeError as error:
         raise ValueError(f"not JSON: {error}") from None
     except RecursionError:
@@ -203,9 +199,8 @@ def read_tensors(
 
 def read_header(path: str | Path) -> dict[str, str]:
     """The header of a rawaug file, without its tensors."""
-    header, _ = _opened(
-        path, "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again", tensors=False
-    )
+    advice = "give one written by rawaug fit, rawaug run or denoisers.save, or copy it again"
+    header, _ = _opened(path, advice, tensors=False)
     if header.get("format") != "rawaug" or "kind" not in header:
         raise ValueError(f"{path}: not a rawaug file; give one written by rawaug fit or rawaug run")
     return header
@@ -225,9 +220,8 @@ def find_weights(name: str | Path, *more: Path) -> Path:
     """The file of weights ``name``: a path, or the name of an ISP that is shipped with the package."""
     folders = (WEIGHTS, *more)
     paths = [Path(name)] if Path(name).suffix else [folder / f"{name}.safetensors" for folder in folders]
-    for path in paths:
-        if path.is_file():
-            return path
+    if (found := next(filter(Path.is_file, paths), None)) is not None:
+        return found
     shipped = ", ".join(sorted(p.stem for folder in folders for p in folder.glob("*.safetensors")))
     raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped name ({shipped})")
 
@@ -238,10 +232,7 @@ def shipped_isps() -> list[str]:
 
 def digest(*parts: bytes) -> str:
     """SHA-256 of the parts, one after the other, in hexadecimal."""
-    result = hashlib.sha256()
-    for part in parts:
-        result.update(part)
-    return result.hexdigest()
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def sha256(path: str | Path) -> str:

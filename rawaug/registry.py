@@ -46,35 +46,29 @@ def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
     """
     if isinstance(spec, str):
         return spec, {}
-    if not isinstance(spec, Mapping):
-        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {spec!r}")
-    settings = spec.get("settings") or {}
-    if not isinstance(spec.get("name"), str) or not isinstance(settings, Mapping) or spec.keys() - {"name", "settings"}:
-        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {dict(spec)}")
-    return spec["name"], dict(settings)
+    given = dict(spec) if isinstance(spec, Mapping) else {}
+    settings = given.get("settings") or {}
+    if (
+        not isinstance(given.get("name"), str)
+        or not isinstance(settings, Mapping)
+        or given.keys() - {"name", "settings"}
+    ):
+        raise ValueError(f"expected a name or {{name: ..., settings: {{...}}}}, got {given or spec!r}")
+    return given["name"], dict(settings)
 
 
 def checked_settings(
     label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Keyword arguments for ``function``: lists, which is what YAML and JSON have, become tuples.
-
-    Args:
-        label: opens the messages.
-        function: or class, whose signature says what it takes.
-        settings: the keyword arguments to check.
-        given: arguments that the caller passes besides.
+    """Keyword arguments for a function or class, lists as tuples; the caller passes those that are ``given`` besides.
 
     Raises:
         ValueError: if one is unknown, missing, or not of the plain type that the signature names.
     """
     parameters = inspect.signature(function).parameters
     takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    for key in settings:
-        if key not in takes:
-            raise ValueError(
-                f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{nearest(key, takes)}"
-            )
+    for key in [key for key in settings if key not in takes]:
+        raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{nearest(key, takes)}")
     for key in takes:
         if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
             raise ValueError(f"{label} needs the setting {key!r}")
@@ -82,15 +76,7 @@ def checked_settings(
 
 
 def require_between(key: str, value: object, least: float, most: float) -> None:
-    """Refuse a number that nobody means, before anything is built with it.
-
-    Args:
-        key: of the setting, which opens the message.
-        value: a whole number where both bounds are, else any number.
-        least, most: the bounds, both allowed.
-
-    Raises:
-        ValueError: if it is out of bounds, or no such number.
+    """Refuse a number out of bounds before anything is built with it; it must be whole where both bounds are.
 
     Example:
         >>> require_between("width", 10**9, 1, 4096)
