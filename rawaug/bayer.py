@@ -138,9 +138,9 @@ STENCILS: dict[str, tuple[Tensor, Tensor, Tensor]] = {
 def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
     """Mosaic ``(B, 1, H, W)``, sides even, to ``(B, 3, H, W)``: stage f6; each site keeps the colour that it measured.
 
-    ``method`` is ``bilinear``, or ``malvar`` (sides of at least 4): the missing colour follows its neighbours, corrected
-    by the Laplacian of the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing
-    of Bayer-patterned color images", ICASSP 2004).
+    ``method`` is ``bilinear``, or ``malvar`` (sides of at least 4): the missing colour follows its neighbours,
+    corrected by the Laplacian of the known one (H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for
+    demosaicing of Bayer-patterned color images", ICASSP 2004).
     """
     _require_channels(raw, 1, "a mosaic")
     _require_even(*raw.shape[-2:])

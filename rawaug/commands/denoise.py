@@ -149,9 +149,7 @@ def denoise_file(
         out: the DNG to write; its folder is made.
         method: what denoises, as :func:`frame_denoiser` makes it; or a network's file, or the name of a shipped one.
         noise: see :data:`Noise`; ignored by networks without a noise map.
-        strength: in [0, 1], the share of what the denoiser changes that is applied.
-        preview: picture of the result to write besides, developed by LibRaw.
-        overwrite: replace what is there.
+        strength, preview, overwrite: as in :func:`run`.
 
     Raises:
         FileNotFoundError, OSError: if a file is missing or cannot be read or written.

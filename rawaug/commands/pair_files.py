@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rawaug.commands.pair_maker import Format, Origin, Outcome, PairMaker, Task, noise_levels, replayed
+from rawaug.commands.pair_maker import Format, Origin, PairMaker, noise_levels, replayed
 from rawaug.data.formats import write_npz, write_png, write_tiff
 from rawaug.files import digest, read_header, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
@@ -35,23 +35,24 @@ _BLACK_STEP = 256
 _SHADING_NODES = (25, 33)
 
 
-class PictureTask(Task):
+class PictureTask:
     """The missing pairs of one picture; its name in the folder is the key of its draws."""
 
     def __init__(self, picture: Path, key: str, stem: Path, per_image: int) -> None:
         self.picture, self.key, self.stem = picture, key, stem
         self.numbers = [k for k in range(per_image) if not Path(f"{stem}_{k}.safetensors").exists()]
         self.pictures, self.existing, self.todo = 1, per_image - len(self.numbers), bool(self.numbers)
-        self.broken = {}  # what cannot be read is tried again
+        self.broken: dict[str, str] = {}  # what cannot be read is tried again
 
-    def make(self, maker: PairMaker) -> Outcome:
+    def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
+        """Write the missing pairs; their number, and the reason if the picture cannot be read."""
         try:
             origin, pairs = maker.pairs(self.picture, self.key, self.numbers)
         except (OSError, ValueError) as error:
-            return Outcome(0, {self.key: str(error)})
+            return 0, {self.key: str(error)}
         for number, pair in pairs:
             write_pair(Path(f"{self.stem}_{number}"), pair, maker.augment, maker.settings.format, origin)
-        return Outcome(len(self.numbers), {})
+        return len(self.numbers), {}
 
 
 def picture_tasks(pictures: Sequence[Path], source: Path, out: Path, per_image: int) -> Iterator[PictureTask]:

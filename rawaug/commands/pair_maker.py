@@ -7,11 +7,10 @@ made with are kept in it, so that it never holds files of two settings.
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from rawaug import __version__
 from rawaug.files import find_weights, sha256, write_json
@@ -73,26 +72,6 @@ class Origin:
 
     def stored(self) -> dict[str, Any]:
         return {key: value for key, value in vars(self).items() if value is not None}
-
-
-class Outcome(NamedTuple):
-    """Result of a task: the number of pairs made, and the reason for each picture that could not be read."""
-
-    made: int
-    broken: dict[str, str]
-
-
-class Task(ABC):
-    """A unit of work for one process."""
-
-    pictures: int
-    existing: int
-    broken: Mapping[str, str]
-    todo: bool
-
-    @abstractmethod
-    def make(self, maker: PairMaker) -> Outcome:
-        """Write the missing files."""
 
 
 class PairMaker:

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.commands.pair_maker import Origin, Outcome, PairMaker, Settings, Task, noise_levels, replayed
+from rawaug.commands.pair_maker import Origin, PairMaker, Settings, noise_levels, replayed
 from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.sampling_config import SamplingConfig
@@ -40,7 +40,7 @@ PER_SHARD = 500
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
 
 
-class ShardTask(Task):
+class ShardTask:
     """One shard: its path, the index of its first picture, and the names of its pictures."""
 
     def __init__(self, path: Path, first: int, source: Path, names: Sequence[str], per_image: int) -> None:
@@ -49,7 +49,8 @@ class ShardTask(Task):
         self.pictures, self.existing = len(names), int(known.get("nsamples", 0))
         self.broken, self.todo = dict(known.get("broken", {})), not known
 
-    def make(self, maker: PairMaker) -> Outcome:
+    def make(self, maker: PairMaker) -> tuple[int, dict[str, str]]:
+        """Write the shard; the number of its pairs, and the reason for each picture that cannot be read."""
         made, broken = 0, dict[str, str]()
         with replacing(self.path) as partial, tarfile.open(partial, "w", format=tarfile.USTAR_FORMAT) as tar:
             for index, name in enumerate(self.names, self.first):
@@ -65,7 +66,7 @@ class ShardTask(Task):
         size = self.path.stat().st_size
         record = {"url": self.path.name, "nsamples": made, "filesize": size, "broken": broken}
         write_json(record, _record(self.path))
-        return Outcome(made, broken)
+        return made, broken
 
 
 def _path(out: Path, number: int) -> Path:

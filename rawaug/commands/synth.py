@@ -24,9 +24,9 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.commands import OPTIONS, pair_shards, value_of
-from rawaug.commands.pair_files import picture_tasks, replay
-from rawaug.commands.pair_maker import TARGETS, Format, Outcome, PairMaker, Settings, Task, require_same_settings
-from rawaug.commands.pair_shards import PER_SHARD, replay_sample
+from rawaug.commands.pair_files import PictureTask, picture_tasks, replay
+from rawaug.commands.pair_maker import TARGETS, Format, PairMaker, Settings, require_same_settings
+from rawaug.commands.pair_shards import PER_SHARD, ShardTask, replay_sample
 from rawaug.data.folders import PICTURE_EXTENSIONS, files_in
 from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
@@ -34,6 +34,10 @@ from rawaug.files import LOCK, find_weights, locked, sha256
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.sampling_config import SamplingConfig
 from rawaug.progress import progress
+
+Task = PictureTask | ShardTask
+Outcome = tuple[int, dict[str, str]]
+"""Of a task: the pairs made, and the reason for each picture that could not be read."""
 
 __all__ = ["Synthesis", "print_synthesis", "replay", "replay_sample", "synth"]
 
@@ -105,12 +109,9 @@ def synth(
         out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
         format: dng, npz, tiff, png or webdataset; dng for target raw, png for srgb only.
         per_image: pairs per picture; may grow from run to run, but not in shards.
-        seed: random seed.
         workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
             spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
-        max_pixels: larger pictures are refused before they are decoded.
-        shard: ``"K/N"`` for part K of N; every Nth picture, or every Nth tar file.
-        per_shard: pictures in a tar file.
+        seed, max_pixels, shard, per_shard: as in :func:`run`.
         drawn: ``isp``, ``noise``, ``camera``, ..., as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
 
     Raises:
