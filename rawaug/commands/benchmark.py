@@ -50,9 +50,6 @@ def run(
         device: device for networks: cpu, cuda, ...
         json: write the result as JSON to this file.
         report: write an HTML page with tables and crops to this file.
-
-    Raises:
-        FileNotFoundError, ValueError: if a denoiser or a frame cannot be read, or a denoiser fails.
     """
     for path in filter(None, (json, report)):
         require_writable(path)

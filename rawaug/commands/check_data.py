@@ -16,9 +16,6 @@ def run(path: str, /, *, first: int | None = None, settings: Annotated[PairSetti
         path: a folder, a RAW file, a submission to SIDD, or pairs:PATH.
         first: read at most this many items of each kind.
         settings: of pairs:PATH.
-
-    Raises:
-        ValueError: if a file is damaged.
     """
     report = check(path, first, **vars(settings or PairSettings()))
     print(report)

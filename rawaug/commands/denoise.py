@@ -86,10 +86,6 @@ def run(
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
         overwrite: replace existing results.
-
-    Raises:
-        ValueError: if a file of a folder could not be denoised, after all others; if a folder's output is named as a
-            file, or a preview is asked of it.
     """
     method = frame_denoiser(denoiser, classical, self_ensemble, device, linear)
     law = stored_noise(noise, denoiser or (JOINT if linear else DEFAULT))

@@ -79,10 +79,6 @@ def run(
 
     Returns:
         What ``--json`` writes.
-
-    Raises:
-        FileNotFoundError, ValueError: if a file is missing or not rawaug's, a name is unknown, what is asked for
-            is for denoisers and the file is an ISP's, no frame can be read, or a result is not finite.
     """
     for path in filter(None, (json, report)):
         require_writable(path)

@@ -28,12 +28,7 @@ def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 
 
 
 def choices(pictures: str | None) -> tuple[list[Path], list[str]]:
-    """The files that can be chosen, and their names on the page.
-
-    Raises:
-        FileNotFoundError: if there is no such file or folder.
-        ValueError: if the folder contains no picture.
-    """
+    """The files that can be chosen, and their names on the page."""
     if pictures is None:
         files = demo_files()
         return files, [f"{file.stem} (built in)" for file in files]

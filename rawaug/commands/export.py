@@ -181,10 +181,6 @@ def run(
         out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
         frame: RAW file whose middle is used to compare a denoiser with its ONNX; by default a generated frame.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
-
-    Raises:
-        FileNotFoundError, ValueError: if the weights or the frame cannot be read, ``out`` has another extension, an
-            option is of the other kind, a package is missing, or ONNX Runtime and PyTorch differ.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
         if frame is not None:

@@ -44,10 +44,6 @@ def run(
         isp: ISP file of the camera, or the name of a shipped ISP.
         overwrite: replace the output file if it exists.
         max_pixels: a larger picture is refused before it is decoded.
-
-    Raises:
-        FileNotFoundError, OSError: if a file is missing or damaged.
-        ValueError: if pictures differ in size, or an exposure is missing, the same as another, or beyond 30 stops.
     """
     target = Path(out)
     require_writable(target)
@@ -76,11 +72,7 @@ def hdr(
 
 
 def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> list[float]:
-    """Stops of each picture: as given, else of EXIF relative to the median; a single picture has 0.
-
-    Raises:
-        ValueError: if they are missing, or given for another number of pictures.
-    """
+    """Stops of each picture: as given, else of EXIF relative to the median; a single picture has 0."""
     if ev is not None and len(ev) != len(pictures):
         raise ValueError(f"--ev: one exposure for each picture is needed, got {len(ev)} for {len(pictures)}")
     if ev is not None:
@@ -93,13 +85,9 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
 
 
 def _read(pictures: Sequence[str | Path], max_pixels: int) -> list[Tensor]:
-    read: list[Tensor] = []
-    for path in pictures:
-        read.append(isolated(read_picture, path, max_pixels))
-        (height, width), (first_height, first_width) = read[-1].shape[1:], read[0].shape[1:]
-        if (height, width) != (first_height, first_width):
-            raise ValueError(
-                f"{path}: is {height} x {width}, but {pictures[0]} is {first_height} x {first_width}; "
-                "align and crop them to one size"
-            )
+    read = [isolated(read_picture, path, max_pixels) for path in pictures]
+    for path, picture in zip(pictures, read, strict=True):
+        if picture.shape != read[0].shape:
+            size, first = (f"{one.shape[1]} x {one.shape[2]}" for one in (picture, read[0]))
+            raise ValueError(f"{path}: is {size}, but {pictures[0]} is {first}; align and crop them to one size")
     return read

@@ -39,9 +39,6 @@ def run(
         keys: list the keys of the recipe, as --help after its name does.
         dry_run: show which data would be used and try every stage once on it, without keeping results.
         overwrite: replace a run of this name that has other settings.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such recipe, or a key or its value is wrong.
     """
     if not recipe:
         print(f"rawaug run RECIPE [--key value ...], where RECIPE is a YAML file or one of\n\n{recipe_list()}\n")

@@ -52,9 +52,6 @@ def run(
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
-
-    Raises:
-        ValueError: if there is no such benchmark, or the noise of a frame is neither published nor can be estimated.
     """
     kind, _, path = benchmark.partition(":")
     if kind not in SUBMISSIONS or not path:
