@@ -127,14 +127,7 @@ def benchmark(
     seed: int = 0,
     strengths: Mapping[str, NoiseLevels] | None = None,
 ) -> dict[str, Any]:
-    """Scores of every denoiser, beside those of the noisy input.
-
-    Args:
-        contestants: the denoisers, with names of their own.
-        frames: the references; with ``own_noise``, its share of each squared error is in the scores.
-        crop: side of the middle that is scored, in pixels of the mosaic.
-        seed: of the noise.
-        strengths: noise levels by name; see :func:`strengths_of`.
+    """Scores of every denoiser, by its name, on the middles of the references, beside those of the noisy input.
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by

@@ -70,13 +70,11 @@ def contestant(spec: str, device: torch.device | str = "cpu") -> Contestant:
 
 def published_pmrid(path: str | Path) -> denoisers.PMRID:
     """PMRID with the weights of its authors."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"pmrid: {path}: no such file")
     model = denoisers.PMRID()
     try:
         model.load_state_dict(read_tensors(path, _AGAIN)[1])
     except RuntimeError as error:
-        raise ValueError(f"pmrid: {path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
+        raise ValueError(f"{path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
     return model.eval()
 
 
@@ -142,13 +140,8 @@ def _of_filter(name: str) -> Callable[[Tensor, Tensor, CFA], Tensor]:
 class OnnxNetwork(nn.Module):
     """A network in an ONNX file, run by ONNX Runtime on the CPU, one picture after the other.
 
-    Args:
-        path: as ``rawaug export`` writes it, which states the CFA and the stride; or any that takes noisy packed RAW
-            ``(1, 4, h, w)``, and its variance or not.
-
-    Raises:
-        FileNotFoundError, MissingExtra: if there is no such file, or no ONNX Runtime.
-        ValueError: if the file cannot be used.
+    ``rawaug export`` writes such a file, which states the CFA and the stride; any will do that takes noisy packed RAW
+    ``(1, 4, h, w)``, and its variance or not.
     """
 
     def __init__(self, path: Path) -> None:

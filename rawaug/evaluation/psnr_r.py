@@ -22,16 +22,10 @@ STRIP = 256
 
 @torch.no_grad()
 def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches: int | None = None) -> float:
-    """PSNR_r of one frame; of an unregistered pair at the resolution of block averages.
+    """PSNR_r of one frame, with its as-shot ``white_balance`` if asked; of an unregistered pair that of block averages.
 
-    Args:
-        isp: the ISP.
-        pair: the frame.
-        white_balance: use the frame's as-shot white balance.
-        patches: score this many patches of a registered frame (:func:`windows_of`); None scores all.
-
-    Raises:
-        ValueError: if the pair's picture is not in the camera's colours, as SIDD's blocks without their sRGB files.
+    With ``patches``, so many of a registered frame are scored (:func:`windows_of`). ValueError if the picture is not in
+    the camera's colours, as SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
     given = pair.white_balance if white_balance else None
@@ -54,10 +48,7 @@ def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
 
 @torch.no_grad()
 def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
-    """The RAW ``(1, 1, H, W)`` reconstructed from the pair's sRGB under ``params``, within [0, 1], in its pattern.
-
-    Strip by strip, to bound memory.
-    """
+    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, in [0, 1], strip by strip to bound memory."""
     height, width = pair.raw.shape[-2:]
     strips = []
     for top in range(0, height, STRIP):
@@ -68,10 +59,7 @@ def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
 
 
 def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
-    """Corners of ``count`` random non-overlapping patches of the frame, keyed by its name; all if None.
-
-    As in :func:`rawaug.metrics.patch_psnr`, a side shorter than a patch is the patch's side.
-    """
+    """Corners of ``count`` random patches of the frame, keyed by its name; all of :func:`patch_psnr`'s if None."""
     rows, columns = (range(0, max(side - PATCH, 0) + 1, PATCH) for side in pair.raw.shape[-2:])
     every = [(top, left) for top in rows for left in columns]
     if count is None or count >= len(every):

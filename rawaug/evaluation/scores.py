@@ -84,9 +84,7 @@ def denoise(
     own: CFA | None = None,
     at_test: Callable[[Run], Run] | None = None,
 ) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large, averaged over ``views`` of it.
-
-    A network that demosaics gives linear RGB ``(1, 3, 2h, 2w)``.
+    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large; linear RGB if it demosaics.
 
     Args:
         cfa: of the sample's mosaic.
@@ -94,9 +92,6 @@ def denoise(
         own: the pattern that the model was trained for, if another: the mosaic is continued by a mirrored line on the
             sides where the patterns differ, and the result cropped.
         at_test: what the estimator of the training puts around the network.
-
-    Returns:
-        The denoised RAW or RGB, on the CPU.
     """
     if own is not None and own != cfa:
         rows, columns = cfa.shift_to(own)
@@ -220,8 +215,8 @@ def label_of(spec: Spec) -> str:
 def summary(scores: Iterable[Score]) -> dict[str, Any]:
     """Per image, mean, worst and best 25%; what does not apply is left out.
 
-    ``levels_from_clean`` is the number of images whose noise levels were measured against the clean frame. A score
-    that is no number, such as the PSNR of two equal frames, is left out too and named under ``no_numbers``.
+    ``levels_from_clean`` counts the images whose noise levels were measured against the clean frame; ``no_numbers``
+    names scores that are none, such as the PSNR of two equal frames.
     """
     scores, stated = list(scores), ("name", "shot_var", "read_var", "levels_from_clean")
     images = [{key: value for key in stated if (value := getattr(score, key)) is not None} for score in scores]

@@ -162,10 +162,7 @@ def _cell(key: str, values: Sequence[float]) -> str:
 
 
 def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which method to use: the arm of the highest mean PSNR against the best of the others, or of the noisy input.
-
-    Several seeds give the noise of the difference; of one the frames on which it is above 0 are counted.
-    """
+    """Which method to use: the arm of the highest mean PSNR against the best of the others, or of the noisy input."""
     means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
     if not means:
         return ""

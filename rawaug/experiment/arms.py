@@ -62,10 +62,7 @@ def in_pattern(isp: DictionaryISP, cfa: CFA) -> DictionaryISP:
 
 
 def frames_of(recipe: Recipe, pairs: Sequence[Pair], isp: DictionaryISP) -> Sequence[Any]:
-    """The real frames as the arms take them: the pairs, or a :class:`NoisyFrame` of each where no arm sees clean ones.
-
-    Arms and seeds share them, so that the signal of a noisy frame is estimated once.
-    """
+    """The real frames as the arms take them: pairs, or a :class:`NoisyFrame` of each where no arm sees clean ones."""
     return [noisy_frame(pair, isp.info.get("noise")) for pair in pairs] if recipe.self_supervised else pairs
 
 
@@ -118,12 +115,8 @@ def validation_samples(
 def chosen(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:
     """The candidates of every arm with a search, with their mean validation PSNR over the runs, the highest first.
 
-    No test frame has a say: the score is the one by which a training keeps its weights.
-
-    Args:
-        candidates: candidate to its arm.
-        folders: of the runs, each with a folder for each candidate.
-        best: whether the weights of the best validation are kept, else those of the last.
+    ``candidates`` is a candidate to its arm, ``best`` whether the best validation counts, else the last. No test frame
+    has a say.
     """
     found: dict[str, dict[str, float]] = {}
     for label, arm in candidates.items():

@@ -39,16 +39,10 @@ _NAMED = 6
 
 @dataclass(frozen=True)
 class Plan:
-    """The data of a run.
+    """The data of a run: what is fitted and trained on, what chooses the weights, what the result is scored on.
 
-    Attributes:
-        pairs: what is fitted and trained on.
-        validation: what chooses the weights; empty for RAW made from the pictures.
-        test: what the result is scored on.
-        references: the test frames as they are read, before they are binned and cropped.
-        pictures: sRGB, to augment with.
-        available: number of frames that ``pairs``, ``validation`` and ``test`` were taken from.
-        held_out: whether ``validation`` is a part of the user's own pairs.
+    ``references`` are the test frames before they are binned and cropped, ``available`` the number of frames that
+    ``pairs``, ``validation`` and ``test`` were taken from; ``held_out`` says that ``validation`` is a part of ``pairs``.
     """
 
     pairs: Sequence[Pair]
@@ -81,10 +75,7 @@ class Plan:
     def read(self) -> tuple[Plan, list[str]]:
         """The plan without the frames that cannot be read, those of ``pairs`` in memory; and lines that name them.
 
-        All frames are read once: a damaged one is better found now than after the training.
-
-        Raises:
-            ValueError: if of ``pairs``, ``validation`` or ``test`` none can be read.
+        All are read once: a damaged frame is better found now than after the training.
         """
         parts = {key: Readable(getattr(self, key)) for key in ("pairs", "validation", "test")}
         found = list(parts["pairs"])

@@ -144,11 +144,7 @@ class ArmConfig:
             raise ValueError(f"estimator: {error}") from None
 
     def candidates(self, label: str) -> dict[str, ArmConfig]:
-        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``.
-
-        Raises:
-            ValueError: if the search has not one key with values, or it is no setting of the estimator.
-        """
+        """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``."""
         if self.search is None:
             return {label: self}
         name, settings = name_and_settings(self.estimator)

@@ -75,10 +75,7 @@ def colours(drawn: Drawn) -> np.ndarray:
 
 
 def noise(drawn: Drawn) -> list[np.ndarray]:
-    """Variance of noisy minus clean against the clean signal, by colour, and the law that was drawn.
-
-    Two figures: linear axes and logarithmic ones.
-    """
+    """Variance of noisy minus clean against the clean signal, by colour, and its law; linear and logarithmic."""
     pair = drawn.pair
     ramp = torch.logspace(-4, 0, 100)
     params = {name: value[None] for name, value in pair.params.noise.items()}

@@ -126,12 +126,7 @@ def _code(look: Look) -> dict[str, str]:
 
 
 def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
-    """The page as Gradio's Blocks.
-
-    Args:
-        pictures: that can be chosen besides uploaded ones.
-        names: of these; their files' by default.
-    """
+    """The page as Gradio's Blocks, with pictures to choose from besides uploaded ones."""
     os.environ["GRADIO_ANALYTICS_ENABLED"] = "False"
     with extra("explore"):
         import gradio as gr

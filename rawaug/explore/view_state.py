@@ -46,11 +46,7 @@ class Drawn(NamedTuple):
 
 
 def drawn(look: Look, number: int = 0) -> Drawn:
-    """The pair of this number, as ``rawaug synth`` makes it of the picture.
-
-    Raises:
-        OSError, ValueError: if the picture cannot be read, or a setting is wrong; in one line.
-    """
+    """The pair of this number, as ``rawaug synth`` makes it of the picture."""
     return _drawn(look, number, Path(look.picture).stat().st_mtime_ns)
 
 

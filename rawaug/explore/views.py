@@ -139,11 +139,7 @@ def draws(look: Look) -> list[Panel]:
 
 
 def denoised(look: Look) -> list[Panel]:
-    """Noisy on the left, denoised by the shipped network on the right, both developed.
-
-    Raises:
-        ValueError: if the pattern is not Bayer's.
-    """
+    """Noisy on the left, denoised by the shipped network on the right, both developed."""
     made = drawn(look)
     if made.augment.pattern is not None:
         raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
