@@ -42,7 +42,7 @@ class Plan:
     """The data of a run: what is fitted and trained on, what chooses the weights, what the result is scored on.
 
     ``references`` are the test frames before they are binned and cropped, ``available`` the number of frames that
-    ``pairs``, ``validation`` and ``test`` were taken from; ``held_out`` says that ``validation`` is a part of ``pairs``.
+    ``pairs``, ``validation`` and ``test`` were taken from; with ``held_out``, ``validation`` is a part of ``pairs``.
     """
 
     pairs: Sequence[Pair]
