@@ -186,8 +186,7 @@ def read_tensors(
 ) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Header and tensors of a safetensors file, on the CPU; those named in ``infinite`` may hold infinity.
 
-    Raises:
-        ValueError: if it cannot be read, or a value is not finite; ``advice`` ends the message.
+    ValueError if it cannot be read, or a value is not finite; ``advice`` ends the message.
     """
     header, tensors = _opened(path, advice, tensors=True)
     for name, tensor in tensors.items():

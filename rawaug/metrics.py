@@ -32,20 +32,15 @@ def _compared(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(a: Tensor, b: Tensor) -> Tensor:
-    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal.
-
-    Raises:
-        ValueError: if shapes differ, a picture has no values, or they are not floating point.
-    """
+    """PSNR in dB of each picture of a batch: ``(B, ...)`` to ``(B,)``; infinite where the two are equal."""
     a, b = _compared(a, b)
     return -10.0 * ((a - b) ** 2).flatten(1).mean(1).log10()
 
 
 def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
-    """PSNR_r: the mean over non-overlapping ``patch`` x ``patch`` pieces of ``(B, 1, H, W)``, ``(B,)``.
+    """PSNR_r: the mean over whole ``patch`` x ``patch`` pieces of ``(B, 1, H, W)`` from the top left, ``(B,)``.
 
-    Whole patches from the top left; the remainder at the right and the bottom is left out. A side shorter than a patch
-    is the patch's side.
+    A side shorter than a patch is the patch's side.
     """
     a, b = _compared(a, b)
     size = (min(patch, a.shape[-2]), min(patch, a.shape[-1]))
@@ -54,11 +49,7 @@ def patch_psnr(a: Tensor, b: Tensor, patch: int = PATCH) -> Tensor:
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """SSIM of each picture of a batch: ``(B, C, H, W)`` to ``(B,)``.
-
-    Raises:
-        ValueError: as :func:`psnr`, and if a side is shorter than the window.
-    """
+    """SSIM of each picture of a batch: ``(B, C, H, W)``, no side shorter than the window, to ``(B,)``."""
     a, b = _compared(a, b)
     if a.ndim != 4 or min(a.shape[-2:]) < WINDOW:
         raise ValueError(f"SSIM needs (B, C, H, W) with sides of at least {WINDOW}, got {tuple(a.shape)}")

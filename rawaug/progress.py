@@ -51,15 +51,8 @@ def progress(
 ) -> Any:
     """``items``, counted as they are iterated over; ``set_postfix_str(text, refresh=False)`` adds to what is shown.
 
-    Args:
-        items: what is iterated over.
-        label: heads the bar.
-        unit: of what is counted, singular.
-        total: how many there are, where ``items`` has no length.
-        initial: how many were done before.
-        leave: keep the finished bar in the terminal.
-        shown: False prints nothing at all.
-        stream: in place of stderr.
+    ``unit`` is singular; ``total`` is for items without a length, ``initial`` for what was done before. A finished bar
+    stays in the terminal if ``leave``; nothing is printed unless ``shown``.
     """
     stream = stream or sys.stderr
     settings: dict[str, Any] = {"desc": label, "unit": unit, "total": total, "initial": initial}

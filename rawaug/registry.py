@@ -123,11 +123,7 @@ class Registry(Mapping[str, Any]):
         self._unimported = list(packages)
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Decorator: the class or function is found by ``name`` from now on.
-
-        Raises:
-            ValueError: if another thing has the name.
-        """
+        """Decorator: the class or function is found by ``name``, which no other thing may have, from now on."""
 
         def add(thing: T) -> T:
             known = self._things.get(name, thing)
@@ -166,12 +162,7 @@ class Registry(Mapping[str, Any]):
         return next((name for name in (*self._things, *self) if self[name] is thing), None)
 
     def make(self, spec: Spec, **defaults: Any) -> Any:
-        """A new one, with its settings as keyword arguments; ``defaults`` stand where these say nothing.
-
-        Raises:
-            ValueError: if the name or a setting is unknown, one is missing, or of the wrong type; the class itself
-                may refuse a value too.
-        """
+        """A new one, with its settings as keyword arguments; ``defaults`` stand where these say nothing."""
         name, settings = name_and_settings(spec)
         return self[name](**{**defaults, **checked_settings(f"{self.kind} {name}", self[name], settings, defaults)})
 

@@ -126,12 +126,7 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
 
     Args:
         params: ``NAME.safetensors`` of a pair.
-        picture: the sRGB picture, if it has moved since.
-        isp: the ISP's file, if it has moved since.
-
-    Raises:
-        FileNotFoundError: if picture or ISP are not there.
-        ValueError: if they have changed since, or the file does not belong to a pair.
+        picture, isp: the sRGB picture and the ISP's file, if they have moved since; ValueError if they have changed.
 
     Example:
         >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP

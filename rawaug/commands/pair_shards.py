@@ -140,16 +140,12 @@ def _npy(tensor: Tensor) -> bytes:
 
 
 def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str | Path | None = None) -> RawPair:
-    """The pair ``(4, h, w)`` of a sample, bit for bit as in its shard.
+    """The pair ``(4, h, w)`` of a sample's JSON, bit for bit as in its shard.
 
     Args:
         described: the sample's JSON.
-        pictures: the folder that the shards were made from.
+        pictures: the folder that the shards were made from; ValueError if the picture has changed since.
         isp: the ISP's file, unless it is a shipped one.
-
-    Raises:
-        FileNotFoundError: if picture or ISP are not there.
-        ValueError: if they have changed since.
 
     Example:
         >>> pair = replay_sample(sample["json"], "photographs")  # doctest: +SKIP

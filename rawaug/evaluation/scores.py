@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import Stabilised
-from denoisers.network import Denoiser
+from denoisers.network import PACKED, Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned
 from rawaug.data.development import develop_packed, exposure_of
@@ -34,8 +34,6 @@ from rawaug.seeding import keyed_generator
 Run = Callable[..., Tensor]
 """``run(noisy, variance) -> denoised``, packed RAW."""
 SHOWN_FAULTS = 5
-RGB = 3
-"""Channels of full colour."""
 
 Method = Callable[[Pair, Sample], Tensor]
 """Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
@@ -98,10 +96,9 @@ def denoise(
         mosaics = (bayer.unpack(x, cfa) for x in (sample.noisy, sample.variance))
         noisy, variance = (bayer.pack(F.pad(x, (columns, columns, rows, rows), mode="reflect"), own) for x in mosaics)
         denoised = denoise(model, Sample(noisy, noisy, variance), own, views, at_test=at_test)
-        full_colour = denoised.shape[1] == RGB
-        image = denoised if full_colour else bayer.unpack(denoised, own)
-        image = image[..., rows : image.shape[-2] - rows, columns : image.shape[-1] - columns]
-        return image if full_colour else bayer.pack(image, cfa)
+        packed = denoised.shape[1] == PACKED
+        image = aligned(bayer.unpack(denoised, own) if packed else denoised, own, cfa)
+        return bayer.pack(image, cfa) if packed else image
     run: Run = partial(denoisers.tiled, model, each=counted("tile"))
     if at_test is not None:
         run = at_test(run)

@@ -57,20 +57,16 @@ class Plan:
         """What is used of what, a line each."""
         data, (pairs, validation, test) = recipe.data, self.available
         part = f"{data.pairs}, held out" if self.held_out else data.validation
-        camera = (
-            f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
-            if recipe.camera is None
-            else f"{recipe.camera}, unchanged"
-        )
+        fitted = f"fitted to {len(self.pairs)} frame{'s' * (len(self.pairs) != 1)}"
         watched = "no frames: monitored on RAW made from the pictures; the final weights are kept"
         found = {
             "train": used(self.pairs, pairs, data.pairs) if self.pairs else "no RAW frames",
             "validate": used(self.validation, validation, part, MOST_HELD_OUT) if self.validation else watched,
             "test": used(self.test, test, data.test),
             "pictures": f"{len(self.pictures)} of {data.pictures}",
-            "ISP": camera,
+            "ISP": fitted if recipe.camera is None else f"{recipe.camera}, unchanged",
         }
-        return [f"{what:<10}{used}" for what, used in found.items()]
+        return [f"{what:<10}{said}" for what, said in found.items()]
 
     def read(self) -> tuple[Plan, list[str]]:
         """The plan without the frames that cannot be read, those of ``pairs`` in memory; and lines that name them.
@@ -151,9 +147,7 @@ def some(
 
 
 def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
-    if spec is None:
-        return []
-    return open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
+    return [] if spec is None else open_pairs(spec, split, clean, data.max_pixels, **data.settings_of(spec))
 
 
 def used(frames: Sequence[Pair], available: int, source: Any, most: int = _NAMED) -> str:

@@ -24,13 +24,7 @@ from rawaug.registry import NOISE
 
 @dataclass(frozen=True)
 class Look:
-    """A picture, what is drawn for it, and the seed.
-
-    Args:
-        picture: its file.
-        drawing: which camera, light, tone, exposure and noise.
-        seed: of the draws, as that of ``rawaug synth``.
-    """
+    """A picture's file, what is drawn for it, and the seed of the draws, as that of ``rawaug synth``."""
 
     picture: str
     drawing: SamplingConfig = field(default_factory=SamplingConfig)
