@@ -237,12 +237,8 @@ def denoise_folder(
     """Denoise the RAW files of a folder and its subfolders to ``out/SUBFOLDER/STEM.dng``; existing results are skipped.
 
     A file that cannot be read, or whose decoder crashes or hangs, is named and counted; arguments are those of
-    :func:`denoise_file`.
-
-    Raises:
-        OSError: if a result cannot be written, such as to a full disk; those that were are kept.
-        ValueError: if the folder holds no RAW file or two of one stem, none can be denoised, or ``out`` holds results
-            of another denoiser or other settings.
+    :func:`denoise_file`. ValueError if the folder holds no RAW file or two of one stem, none can be denoised, or
+    ``out`` holds results of other settings; OSError if a result cannot be written.
     """
     source, out = Path(source), Path(out)
     targets = _targets(source, out)

@@ -101,7 +101,8 @@ def run(
         return result
 
     if kind == "isp":
-        result = written(_reconstruction(DictionaryISP.from_pretrained(file), pairs))
+        isp, frames = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
+        result = written(summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames))
     else:
         test = _Test(file, pairs, noise, seed, where, classical or ())
         result = written(test.result(frames, bin, views or (8 if self_ensemble else 1), written))
@@ -112,11 +113,6 @@ def run(
             print(f"page: {test.page(data, result).write(Path(report), about_page)}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
-
-
-def _reconstruction(isp: DictionaryISP, pairs: Readable) -> dict[str, Any]:
-    frames = progress(pairs, label="evaluate", unit="image")
-    return summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames)
 
 
 class _Test:

@@ -1,14 +1,10 @@
 """``rawaug export``: a denoiser as an ONNX file, an ISP as JSON, .cube and ONNX, for programs without PyTorch.
 
-A denoiser's inputs are ``noisy`` and, where the network reads it, ``variance`` = shot_var max(noisy, 0) + read_var, its
-output ``denoised``: float32 packed RAW (R, Gr, Gb, B) ``(1, 4, h, w)`` of any h, w >= 2. An ISP becomes
-
-- JSON: what ``rawaug info --json`` prints, and ``lut``, the table of the .cube.
-- .cube (Adobe's format, 33 nodes along each axis): sRGB to linear camera RGB, up to lens shading and mosaic.
-- ONNX: ``srgb (1, 3, h, w)`` of even sides in [0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and
-  ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``, packed R, Gr, Gb, B; the JSON has a typical matrix and gains.
-
-An ONNX file is run by ONNX Runtime and compared with PyTorch before it is left there.
+A denoiser maps ``noisy`` and, where the network reads it, its ``variance`` to ``denoised``: float32 packed RAW of any
+size. An ISP becomes JSON (``rawaug info --json`` and the table of the .cube), a .cube (Adobe's format, 33 nodes along
+each axis: sRGB to linear camera RGB, up to lens shading and mosaic), and ONNX: ``srgb (1, 3, h, w)`` of even sides in
+[0, 1], ``matrix (1, 3, 3)`` from linear sRGB to camera RGB and ``gains (1, 3)`` to ``raw (1, 4, h/2, w/2)``. An ONNX
+file is run by ONNX Runtime and compared with PyTorch before it is left there.
 """
 
 from __future__ import annotations

@@ -179,11 +179,8 @@ FILTER_TILE, FILTER_OVERLAP = 512, 32
 class FrameDenoiser:
     """Denoises the mosaic of a frame, given its noise levels.
 
-    Args:
-        run: packed RAW ``(1, 4, h, w)``, its levels and its CFA to what is denoised, packed or full colour.
-        settings: what the result depends on besides the frame and its levels, as JSON.
-        reads_levels: whether the levels are used.
-        linear: whether the result is full colour.
+    ``run`` maps packed RAW ``(1, 4, h, w)``, its levels and its CFA to packed RAW, or to full colour if ``linear``;
+    ``settings`` is what the result depends on besides, as JSON; ``reads_levels`` says whether the levels are used.
     """
 
     run: Callable[[Tensor, tuple[float, float], CFA], Tensor]

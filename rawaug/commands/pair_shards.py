@@ -1,17 +1,12 @@
 """RAW pairs in tar shards, as WebDataset and Hugging Face read them.
 
 ``shard-000012.tar`` has the pairs of pictures 12 n to 12 n + n - 1 of the sorted folder. A sample is three files of one
-key, ``PICTURE_NUMBER``:
+key, ``PICTURE_NUMBER``: ``KEY.clean.npy`` and ``KEY.noisy.npy``, float32 as :class:`rawaug.RawPair` has them, and
+``KEY.json``: picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters.
 
-==================  ==============================================================================================
-``KEY.clean.npy``   float32, as :class:`rawaug.RawPair` has it: packed ``(4, h, w)``, R, Gr, Gb, B, unless told else
-``KEY.noisy.npy``   the same with noise
-``KEY.json``        picture and ISP with their SHA-256, CFA, mosaic's height and width, noise levels, parameters
-==================  ==============================================================================================
-
-The bytes of a shard depend on its pictures and the settings alone; nothing in it says when, where or by whom it was
-made. A shard is there when ``.shards/shard-000012.json`` is, which is written last. Once all are, ``index.json``
-(sizes, as WebDataset's ``wids`` reads them) and the dataset card ``README.md`` are written.
+The bytes of a shard depend on its pictures and the settings alone. A shard is there when ``.shards/shard-000012.json``
+is, which is written last. Once all are, ``index.json`` (sizes, as WebDataset's ``wids`` reads them) and the dataset
+card ``README.md`` are written.
 """
 
 from __future__ import annotations

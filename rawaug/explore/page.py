@@ -1,7 +1,6 @@
 """The page: controls on one side, a tab for each view on the other; every change redraws the open tab alone.
 
-Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, fonts are the system's, and there
-are no analytics and no sharing.
+Nothing is loaded from elsewhere and nothing is sent: pictures are data in the page, fonts are the system's.
 """
 
 from __future__ import annotations
