@@ -225,7 +225,7 @@ def test_frames_that_cannot_be_read_are_named_and_the_rest_is_scored(
     figures, page = crops / "scores.json", crops / "page.html"
     arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--json", str(figures)]
     assert main([*arguments, "--report", str(page)]) == 2
-    assert "1.npy: cannot be read as an array" in capsys.readouterr().err
+    assert "1.npy: cannot be read as packed RAW" in capsys.readouterr().err
     result = json.loads(figures.read_text())
     assert [image["name"] for image in result["images"]] == ["0"] and len(result["broken"]) == 1 and page.is_file()
     (crops / "0.npy").write_bytes(b"")
