@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,8 @@ def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
         assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
         expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
         torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
+        again, other = (frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=k).noisy for k in (0, 1))
+        assert torch.equal(sample.noisy, again) and torch.equal(again, other) == (pair is captured)
 
 
 def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +74,7 @@ def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest
 
 
 def test_a_denoiser_that_does_nothing_scores_as_its_input(
-    identity: Path, middles: list[Pair], monkeypatch: pytest.MonkeyPatch
+    identity: Path, middles: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = evaluate(str(identity), data="given:")
     assert result["kind"] == "denoiser" and len(result["images"]) == 4
@@ -84,8 +87,11 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert result["psnr_srgb"] == pytest.approx(result["psnr_srgb_noisy"], abs=1e-3)
     shown: list[dict[str, Any]] = []
     monkeypatch.setattr("rawaug.commands.evaluate.print_scores", shown.append)
-    again = evaluate(str(identity), data="given:", self_ensemble=True)
+    again = evaluate(str(identity), data="given:", self_ensemble=True, report=str(tmp_path / "new" / "page.html"))
     assert shown == [result, again]  # known before the views are scored
+    assert again["plain"]["psnr"] == pytest.approx(again["psnr"], abs=1e-3)  # the network changes nothing
+    page = (tmp_path / "new" / "page.html").read_text()
+    assert page.count("<h3>") == 4 and "Self-ensemble" in page and f"{again['psnr']:.2f}" in page
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
@@ -97,14 +103,21 @@ def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path, middles: li
     assert not {"ssim", "psnr_noisy", "self_ensemble", "seed"} & set(result)
     assert len(result["weights_sha256"]) == 64 and result["version"]
     assert json.loads(figures.read_text()) == result
+    for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
+        with pytest.raises(ValueError, match="is an ISP"):
+            evaluate("universal-small", data="given:", **flags)
 
 
-def test_noise_without_a_capture_is_frozen_by_seed_and_name() -> None:
-    pair = demo_pairs("test", count=1)[0]
-    bare, noise = replace(pair, noisy=None, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
-    first = frozen_sample(bare, noise, pair.cfa, seed=0)
-    assert torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=0).noisy)
-    assert not torch.equal(first.noisy, frozen_sample(bare, noise, pair.cfa, seed=1).noisy)
+@pytest.mark.parametrize("kind", ["isp", "denoiser"])
+def test_the_first_result_that_is_not_finite_ends_it(kind: str, tmp_path: Path, refused: Callable[..., str]) -> None:
+    """Weights that are finite and make results that are not."""
+    isp, network = DictionaryISP.from_pretrained("canon-powershot"), denoisers.UNet(width=4, scales=2)
+    for weights in [*isp.get_submodule("stages").parameters(), *network.parameters()]:
+        weights.data.fill_(3e38)
+    file = tmp_path / "absurd.safetensors"
+    isp.save(file) if kind == "isp" else denoisers.save(network, file, {"cfa": "RGGB"})
+    said = refused("evaluate", file, "--data", "demo:test", "--quiet")
+    assert "test_00_coffee: the result is not finite" in said
 
 
 def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured() -> None:
@@ -145,22 +158,6 @@ def test_the_development_is_the_same_for_both() -> None:
     whole = compared(sample.noisy, sample.clean, pair.cfa, pair)
     half = compared(sample.noisy / 2, sample.clean / 2, pair.cfa, pair)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
-
-
-def test_the_page_and_the_plain_scores_stand_beside_the_ensemble(
-    identity: Path, tmp_path: Path, middles: list[Pair]
-) -> None:
-    del middles[2:]
-    result = evaluate(str(identity), data="given:", self_ensemble=True, report=str(tmp_path / "new" / "page.html"))
-    assert result["plain"]["psnr"] == pytest.approx(result["psnr"], abs=1e-3)  # the network changes nothing
-    page = (tmp_path / "new" / "page.html").read_text()
-    assert page.count("<h3>") == 2 and "Self-ensemble" in page and f"{result['psnr']:.2f}" in page
-
-
-def test_what_is_for_denoisers_is_refused_for_an_isp(middles: list[Pair]) -> None:
-    for flags in ({"self_ensemble": True}, {"noise": "upi"}, {"classical": ["Wavelet"]}, {"report": "a.html"}):
-        with pytest.raises(ValueError, match="is an ISP"):
-            evaluate("universal-small", data="given:", **flags)
 
 
 def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
