@@ -115,17 +115,14 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
         law.at(800)
     with pytest.raises(ValueError, match="depends on the ISO, which the file does not say"):
         law.at(None)
-    frame = noisy_frame(replace(pairs[1], noisy=None), isp.info["noise"])
-    assert (frame.shot_var, frame.read_var) == law.at(100)
-
-
-def test_two_cameras_are_not_pooled_nor_frames_without_an_iso_with_others(noisy_pair: Pair) -> None:
     for other, said in (
-        (at_iso(noisy_pair, 100, 2e-4, "Other 2"), r"2 cameras, Maker Model \(1\), Other 2 \(1\); measure each"),
-        (at_iso(noisy_pair, None, 2e-4), "1 of 2 frames have no ISO"),
+        (at_iso(noisy_pair, 100, 2e-4, "Other 2"), r"2 cameras, Maker Model \(2\), Other 2 \(1\); measure each camera"),
+        (at_iso(noisy_pair, None, 2e-4), "1 of 3 frames have no ISO"),
     ):
         with pytest.raises(ValueError, match=said):
-            measure_camera_noise([at_iso(noisy_pair, 100, 2e-4), other])
+            measure_camera_noise([*pairs, other])
+    frame = noisy_frame(replace(pairs[1], noisy=None), isp.info["noise"])
+    assert (frame.shot_var, frame.read_var) == law.at(100)
 
 
 def test_a_file_of_version_0_1_has_one_level_for_every_iso() -> None:

@@ -41,39 +41,27 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
-@pytest.mark.parametrize("format", ["dng", "npz", "tiff"])
-def test_every_format_replays_bit_for_bit(tmp_path: Path, pictures: Path, format: str) -> None:
-    result = synth(pictures, tmp_path, format=format, per_image=2, workers=0)  # type: ignore[arg-type]
+def test_every_picture_that_can_be_read_has_pairs_of_its_own(tmp_path: Path, pictures: Path) -> None:
+    result = synth(pictures, tmp_path, format="npz", per_image=2, workers=0)
     assert (result.pictures, result.made, result.existing) == (5, 8, 0)
     assert list(result.broken) == ["broken.jpg"] and "broken.jpg" in result.broken["broken.jpg"]
-    stems = sorted(str(file.relative_to(tmp_path).with_suffix("")) for file in tmp_path.rglob("*.safetensors"))
+    files = sorted(tmp_path.rglob("*.safetensors"))
+    stems = [str(file.relative_to(tmp_path).with_suffix("")) for file in files]
     assert stems == [f"{stem}_{k}" for stem in ("a_jpg", "a_png", "c", "sub/b") for k in (0, 1)]
-    first, pair = (replay(tmp_path / f"sub/b_{k}.safetensors") for k in (0, 1))
-    assert not torch.equal(first.clean, pair.clean) and not torch.equal(first.noisy, pair.noisy)
-    seeds = {replay(file).params.noise["seed"].item() for file in tmp_path.rglob("*.safetensors")}
+    first, second, *rest = (replay(file) for file in files)
+    assert not torch.equal(first.clean, second.clean) and not torch.equal(first.noisy, second.noisy)
+    seeds = {pair.params.noise["seed"].item() for pair in (first, second, *rest)}
     assert len(seeds) == 8, "pictures or numbers share their draws"
-    assert pair.clean.shape == (4, 48, 32)
-    for name, packed in (("clean", pair.clean), ("noisy", pair.noisy)):
-        stem = tmp_path / "sub" / "b_1"
-        if format == "npz":
-            with np.load(f"{stem}.npz") as file:
-                assert np.array_equal(file[name], packed.numpy())
-                assert file["shot_var"] == pair.params.noise["shot_var"].numpy() and str(file["cfa"]) == "RGGB"
-        elif format == "tiff":
-            mosaic = torch.from_numpy(tifffile.imread(f"{stem}_{name}.tif"))[None]
-            assert torch.equal(pack(mosaic, "RGGB"), packed)
-        else:
-            frame = read_raw(f"{stem}_{name}.dng")
-            step = 1 / (frame.white - frame.black[0])
-            assert torch.allclose(pack(frame.mosaic, frame.cfa), packed, atol=0.51 * step, rtol=0)
-            levels = (pair.params.noise["shot_var"].item(), pair.params.noise["read_var"].item())
-            assert frame.noise_profile == (levels if name == "noisy" else None)
+    with np.load(files[-1].with_suffix(".npz")) as file:
+        assert np.array_equal(file["clean"], rest[-1].clean.numpy()) and rest[-1].clean.shape == (4, 48, 32)
+        assert file["shot_var"] == rest[-1].params.noise["shot_var"].numpy() and str(file["cfa"]) == "RGGB"
 
 
 @pytest.mark.parametrize(
     ("target", "format", "ends"),
     [
         ("raw", "dng", {"_clean.dng", "_noisy_0.dng", "_noisy_1.dng"}),
+        ("raw", "tiff", {"_clean.tif", "_noisy_0.tif", "_noisy_1.tif"}),
         ("rgb", "tiff", {"_clean.tif", "_noisy_0.tif", "_noisy_1.tif"}),
         ("srgb", "tiff", {"_clean.tif", "_noisy_0.tif", "_noisy_1.tif"}),
         ("srgb", "png", {"_clean.png", "_noisy_0.png", "_noisy_1.png"}),
@@ -104,6 +92,9 @@ def test_bursts_of_every_target_replay(
         torch.testing.assert_close(pack(frame.mosaic, frame.cfa), noisy[1], atol=0.51 * step, rtol=0)
         with rawpy.imread(str(out / "b_0_noisy_0.dng")) as raw:
             assert raw.postprocess(use_camera_wb=True).shape == (96, 64, 3)
+    elif target == "raw":
+        mosaics = [torch.from_numpy(tifffile.imread(out / f"b_0_{end}.tif"))[None] for end in ("clean", "noisy_1")]
+        assert torch.equal(pack(mosaics[0], "RGGB"), pair.clean) and torch.equal(pack(mosaics[1], "RGGB"), noisy[1])
     else:
         clean = torch.from_numpy(tifffile.imread(out / "b_0_clean.tif").astype(np.float32)).permute(2, 0, 1)
         scale = 65535 if target == "srgb" else 1
@@ -133,8 +124,8 @@ def test_pairs_do_not_depend_on_what_was_there(tmp_path: Path, pictures: Path) -
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc to see the processes of a session")
-def test_a_killed_run_with_a_worker_goes_on_without_and_leaves_no_process(tmp_path: Path, pictures: Path) -> None:
-    many, out, whole = tmp_path / "many", tmp_path / "out", tmp_path / "whole"
+def test_a_killed_run_leaves_no_worker(tmp_path: Path, pictures: Path) -> None:
+    many, out = tmp_path / "many", tmp_path / "out"
     many.mkdir()
     for k in range(20):
         (many / f"{k}.png").write_bytes((pictures / "a.png").read_bytes())
@@ -142,7 +133,7 @@ def test_a_killed_run_with_a_worker_goes_on_without_and_leaves_no_process(tmp_pa
     process = multiprocessing.get_context("forkserver").Process(target=exec, args=(code, {"many": many, "out": out}))
     process.start()
     assert process.pid is not None
-    while len(list(out.glob("*.safetensors"))) < 5 and process.is_alive():
+    while not list(out.glob("*.safetensors")) and process.is_alive():
         time.sleep(0.01)
     process.kill()
     process.join()
@@ -150,11 +141,7 @@ def test_a_killed_run_with_a_worker_goes_on_without_and_leaves_no_process(tmp_pa
         if not others_in_session(process.pid):
             break
         time.sleep(0.1)
-    assert not others_in_session(process.pid)
-    assert 5 <= len(list(out.glob("*.safetensors"))) < 20
-    synth(many, out, workers=0)
-    synth(many, whole, workers=0)
-    assert contents(out) == contents(whole)
+    assert not others_in_session(process.pid) and len(list(out.glob("*.safetensors"))) < 20
 
 
 def others_in_session(session: int) -> list[str]:
