@@ -225,10 +225,6 @@ def find_weights(name: str | Path, *more: Path) -> Path:
     raise FileNotFoundError(f"{name}: not found; give a .safetensors file or a shipped name ({shipped})")
 
 
-def shipped_isps() -> list[str]:
-    return sorted(path.stem for path in WEIGHTS.glob("*.safetensors"))
-
-
 def digest(*parts: bytes) -> str:
     """SHA-256 of the parts, one after the other, in hexadecimal."""
     return hashlib.sha256(b"".join(parts)).hexdigest()

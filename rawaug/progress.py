@@ -24,13 +24,7 @@ _LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} elapsed, {remaining} lef
 
 @contextmanager
 def quiet(yes: bool = True) -> Iterator[None]:
-    """Print no progress within the block.
-
-    Example:
-        >>> with quiet():
-        ...     list(progress(range(3), label="count", unit="number"))
-        [0, 1, 2]
-    """
+    """Print no progress within the block."""
     token = _quiet.set(yes)
     try:
         yield

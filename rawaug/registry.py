@@ -158,7 +158,6 @@ class Registry(Mapping[str, Any]):
         return len(list(iter(self)))
 
     def name_of(self, thing: Any) -> str | None:
-        """The name that a thing is registered under, or None."""
         return next((name for name in (*self._things, *self) if self[name] is thing), None)
 
     def make(self, spec: Spec, **defaults: Any) -> Any:

@@ -48,7 +48,6 @@ from rawaug.io.raw import develop
 from rawaug.progress import progress
 from rawaug.registry import Spec
 
-_NO_NOISE = (0.0, 0.0)
 UNREADABLE = (".braw", ".crm", ".gpr", ".r3d", ".x3f")
 """Extensions of RAW that the decoder does not read."""
 
@@ -196,7 +195,7 @@ def _denoise_file(
 ) -> Denoised:
     start = time.perf_counter()
     frame = read(source)
-    shot_var, read_var, noise_source = levels_of(frame, noise) if method.reads_levels else (*_NO_NOISE, "not needed")
+    shot_var, read_var, noise_source = levels_of(frame, noise) if method.reads_levels else (0.0, 0.0, "not needed")
     image = method(frame, (shot_var, read_var))
     out.parent.mkdir(parents=True, exist_ok=True)
     if method.linear:

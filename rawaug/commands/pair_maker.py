@@ -100,7 +100,6 @@ class PairMaker:
 
 
 def noise_levels(pair: RawPair) -> dict[str, float]:
-    """``shot_var`` and ``read_var`` of a pair, as far as its noise model has them."""
     noise = pair.params.noise
     return {key: noise[key].item() for key in ("shot_var", "read_var") if key in noise}
 

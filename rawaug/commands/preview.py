@@ -124,10 +124,8 @@ def _tone_curves(axis: Any, isp: DictionaryISP) -> None:
     for line, name in zip(isp.linear(grey.expand(1, 3, 1, 256))[0, :, 0], ("red", "green", "blue"), strict=True):
         axis.plot(grey.numpy(), line.numpy(), color=f"tab:{name}")
     axis.set(xlabel="sRGB grey", ylabel="x2", aspect="equal")
-    atoms = (
-        "inverse tone curve and gamma" if isp.tone is None else f"{isp.config.tone_atoms} tone atoms, the typical one"
-    )
-    axis.set_title(atoms, fontsize=9)
+    typical = f"{isp.config.tone_atoms} tone atoms, the typical one"
+    axis.set_title("inverse tone curve and gamma" if isp.tone is None else typical, fontsize=9)
 
 
 def _swatches(axis: Any, isp: DictionaryISP) -> None:

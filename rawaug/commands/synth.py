@@ -122,7 +122,9 @@ def synth(
     """
     start = time.perf_counter()
     source, out = Path(source).resolve(), Path(out)
-    pictures = _pictures(source, out)
+    if source.is_dir() and out.resolve().is_relative_to(source):
+        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
+    pictures = files_in(source, "picture", PICTURE_EXTENSIONS)
     source = source.parent if source.is_file() else source
     settings = _settings(format, per_image, seed, drawn)
     if workers is not None and workers < 0:
@@ -183,12 +185,6 @@ def _worked_off(
         result.broken |= broken
     result.broken = dict(sorted(result.broken.items()))
     return result
-
-
-def _pictures(source: Path, out: Path) -> list[Path]:
-    if source.is_dir() and out.resolve().is_relative_to(source):
-        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
-    return files_in(source, "picture", PICTURE_EXTENSIONS)
 
 
 # -- processes --------------------------------------------------------------------------------------------------------

@@ -120,7 +120,6 @@ class Page:
         return page
 
     def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
-        """Figures as :func:`draw_curves` makes them."""
         self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
 
     def add_frame(self, row: Row, cfa: CFA) -> None:

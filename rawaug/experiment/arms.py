@@ -19,7 +19,7 @@ from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
 from rawaug.registry import ESTIMATORS, SRGB_NOISE
 from rawaug.seeding import derived_seed, keyed_generator
-from rawaug.training.estimators import SelfSupervised, Supervised
+from rawaug.training.estimators import SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.srgb_noise import NoisyPictures
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
@@ -27,12 +27,6 @@ from rawaug.training.validation import Watched, watched
 
 WATCHED = 16
 """Samples made from pictures on which a training without validation pairs is watched."""
-
-
-def estimator_of(arm: ArmConfig) -> Supervised:
-    """The estimator that the arm names."""
-    estimator: Supervised = ESTIMATORS.make(arm.estimator)
-    return estimator
 
 
 def methods_of(recipe: Recipe) -> dict[str, str]:
@@ -76,7 +70,7 @@ def training_stream(
     seed: int,
 ) -> TrainingStream:
     """The training samples of one arm."""
-    crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), estimator_of(arm)
+    crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), ESTIMATORS.make(arm.estimator)
     real: Source | None = None
     made: Source | None = None
     augment: RawAugment | None = None

@@ -36,7 +36,6 @@ from rawaug.evaluation.scores import (
 from rawaug.evaluation.tables import Row, draw, first_runs, print_table
 from rawaug.experiment.arms import (
     chosen,
-    estimator_of,
     frames_of,
     in_pattern,
     methods_of,
@@ -52,7 +51,7 @@ from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.progress import timed
-from rawaug.registry import EXPERIMENTS
+from rawaug.registry import ESTIMATORS, EXPERIMENTS
 from rawaug.training.camera import fit
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
@@ -115,7 +114,7 @@ class TrainingRun:
                 named = recipe.network_of(arm).start or type(network).__name__
                 gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
                 raise ValueError(f"denoiser: {named} gives {gives}; take another network")
-        self.estimators = {label: estimator_of(arm) for label, arm in recipe.arms.items()}
+        self.estimators = {label: ESTIMATORS.make(arm.estimator) for label, arm in recipe.arms.items()}
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
         plan = planned(recipe, given)

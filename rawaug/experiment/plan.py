@@ -82,10 +82,9 @@ class Plan:
 
 
 def with_own_pairs(recipe: Recipe, content: Mapping[str, Any], given: Collection[str]) -> Recipe:
-    """A recipe whose pairs were replaced uses all of them, and validates on a part of them.
+    """A recipe whose pairs were replaced uses all of them, and holds out a part of them to validate on.
 
-    What its file says of ``data.count`` and ``data.validation`` is about the pairs that it names itself. A validation
-    of null, on RAW made from the pictures, stays.
+    What its file says of ``data.count`` and ``data.validation`` is about its own pairs; a validation of null stays.
     """
     usual = (content.get("data") or {}).get("pairs", DataConfig.pairs)
     if "data.pairs" not in given or recipe.data.pairs is None or _kind(recipe.data.pairs) == _kind(usual):

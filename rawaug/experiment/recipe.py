@@ -87,7 +87,6 @@ class DataConfig(PairSettings):
             raise ValueError(f"data.{given[0]}: applies to {_PAIRS}PATH, which neither pairs, validation nor test is")
 
     def settings_of(self, spec: str | Sequence[Pair]) -> dict[str, Any]:
-        """What the reader of ``spec`` is given."""
         return self._pair_settings() if isinstance(spec, str) and spec.startswith(_PAIRS) else {}
 
     def _pair_settings(self) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """The folder of a run: ``OUT/NAME``, which holds one run alone.
 
-``run.json`` holds the settings of the run. The same settings resume it; others are refused, but for those that change
-neither weights nor scores.
+``run.json`` holds its settings. The same ones resume it; others are refused, but for those that change no result.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ def require_free(settings: Any, overwrite: bool = False) -> Path:
 
 
 def claim(settings: Any, overwrite: bool = False) -> Path:
-    """:func:`require_free`, and the settings written there."""
     folder = require_free(settings, overwrite)
     write_json(asdict(settings), folder / STAMP)
     return folder

@@ -18,13 +18,10 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS
 
 COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue"}
-_ATOMS = 60
-"""As many colour atoms are drawn, at most."""
+_ATOMS = 60  # colour atoms drawn, at most
 _BINS = 24
-_MOST = 2**16
-"""Values of a colour."""
-_FEWEST = 50
-"""Values in a bin of the signal, for its variance to mean something."""
+_MOST = 2**16  # values of a colour
+_FEWEST = 50  # values in a bin of the signal, for its variance to mean something
 
 
 def histograms(drawn: Drawn) -> np.ndarray:
@@ -37,9 +34,8 @@ def histograms(drawn: Drawn) -> np.ndarray:
             share = torch.histc(values, len(edges) - 1, -0.05, 1.0) / values.numel()
             axis.stairs(share.numpy(), edges.numpy(), color=colour, **style)
         axis.plot([], [], color=colour, label=name)
-    axis.set(
-        yscale="log", ylim=(1e-6, 1), xlabel="RAW value, black 0, white 1", ylabel="share of values", xlim=(-0.05, 1.0)
-    )
+    axis.set(xlabel="RAW value, black 0, white 1", xlim=(-0.05, 1.0))
+    axis.set(ylabel="share of values", yscale="log", ylim=(1e-6, 1))
     _plain_numbers(axis, axis.yaxis)
     axis.legend(title="line: clean, area: noisy", fontsize=8, title_fontsize=8, ncols=3)
     return _pixels(figure)

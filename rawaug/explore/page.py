@@ -22,7 +22,7 @@ from rawaug.bayer import PATTERNS
 from rawaug.errors import MissingExtra, escape, extra
 from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
 from rawaug.explore.views import VIEWS, Panel, denoised, seen_in
-from rawaug.files import shipped_isps
+from rawaug.files import WEIGHTS
 from rawaug.isp.cameras import LAMPS, published_cameras
 from rawaug.plugin.sampling_config import SamplingConfig
 
@@ -150,7 +150,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    isps, usual, made = shipped_isps(), SamplingConfig(), dict[str, Any]()
+    isps, usual, made = sorted(file.stem for file in WEIGHTS.glob("*.safetensors")), SamplingConfig(), dict[str, Any]()
     cameras = sorted(set(published_cameras().names), key=str.casefold)
     whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():

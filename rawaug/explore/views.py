@@ -37,8 +37,7 @@ from rawaug.plugin.sampling_config import draw_key
 DRAWS = 8
 HEIGHT, WIDTH = 512, 768
 """Of the largest part of a picture that is shown pixel by pixel."""
-_WHOLE_CELLS = 12
-"""Parts begin at multiples of it, where the cells of all patterns do."""
+_WHOLE_CELLS = 12  # parts begin at multiples of it, where the cells of all patterns do
 _THUMBNAIL = 384
 _ZOOM = (24, 36)
 _SCALE = 8

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from rawaug.experiment.arms import estimator_of
 from rawaug.experiment.recipe import ArmConfig
 from rawaug.noise import EldNoise, SensorNoise, noise_model
 from rawaug.registry import BASELINES, DATASETS, ESTIMATORS, FILTERS, LOSSES, Registry, name_and_settings
@@ -55,6 +54,6 @@ def test_noise_has_settings_by_name() -> None:
 
 
 def test_an_arm_names_its_estimator() -> None:
-    estimator = estimator_of(ArmConfig(0.5, estimator={"name": "noisier", "settings": {"alpha": 0.7, "correct": True}}))
+    estimator = ESTIMATORS.make({"name": "noisier", "settings": {"alpha": 0.7, "correct": True}})
     assert isinstance(estimator, Noisier) and (estimator.alpha, estimator.correct) == (0.7, True)
     assert name_and_settings(ArmConfig().estimator) == ("supervised", {})
