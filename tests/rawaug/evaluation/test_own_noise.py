@@ -60,12 +60,9 @@ def test_shares_are_of_the_squared_error() -> None:
 
 
 def test_noise_as_weak_as_the_references_own_is_said() -> None:
+    raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
+    texture = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
+    assert own_variances([texture], [texture], noise_model((1e-3, 1e-5))) == {}, "no flat regions, no figure"
     assert added_noise_note({}) == added_noise_note({"a": OwnNoise(1e-5, 1e-3)}) == ""
     said = added_noise_note({"a": OwnNoise(2e-5, 2e-5)})
     assert "100% of the variance" in said and "would score 47.0 dB" in said
-
-
-def test_frames_without_flat_regions_have_no_figure() -> None:
-    raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
-    pair = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
-    assert own_variances([pair], [pair], noise_model((1e-3, 1e-5))) == {}
