@@ -298,7 +298,6 @@ def _targets(source: Path, out: Path) -> dict[Path, Path]:
 
 
 def print_denoised(result: DenoisedFolder) -> None:
-    """One line per file, and the failed ones by name."""
     for done in result.files:
         levels = f"shot_var {done.shot_var:.3g}, read_var {done.read_var:.3g} ({done.noise_source})"
         clipped = f"; {done.below_zero:.2%} below digital number 0, written as 0" if done.below_zero else ""

@@ -238,7 +238,6 @@ def _make(task: Task) -> Outcome:
 
 
 def print_synthesis(result: Synthesis) -> None:
-    """A short table, and the unreadable pictures by name."""
     head = ("pictures", "pairs made", "existing", "unreadable", "time (s)")
     numbers = (result.pictures, result.made, result.existing, len(result.broken))
     print_rows(str(result.out), head, [[*map(str, numbers), f"{result.seconds:.1f}"]])

@@ -288,7 +288,6 @@ def kind_of(content: Mapping[str, Any], file: str | Path = "recipe") -> str:
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """The recipes that travel with the package, by name."""
     shipped = Path(str(resources.files("rawaug"))) / "recipes"
     folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "recipes"
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}

@@ -187,7 +187,6 @@ FORMS: dict[str, dict[str, Any]] = {"sRGB": {"target": "srgb"}, "Burst": {"burst
 
 
 def seen_in(tab: str, look: Look) -> Look:
-    """The look as a tab shows it."""
     return replace(look, drawing=replace(look.drawing, **FORMS.get(tab, {})))
 
 

@@ -65,11 +65,10 @@ def test_json_holds_the_curve_and_the_same_table(isp: DictionaryISP, tmp_path: P
     torch.testing.assert_close(values[32], red, atol=1e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["gopro-hero", "universal-small"])
-def test_onnx_gives_pytorch_s_numbers_at_any_size(name: str, tmp_path: Path) -> None:
+def test_onnx_gives_pytorch_s_numbers_at_any_size(tmp_path: Path) -> None:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library, reason="pip install rawaug[export]")
-    isp = DictionaryISP.from_pretrained(name)
+    isp = DictionaryISP.from_pretrained("gopro-hero")
     (path,) = export_isp(isp, tmp_path / "camera.onnx")
     session, setting = session_of(path), isp.typical_setting((1.7, 1.0, 2.1))
     for height, width in ((64, 32), (30, 46)):
@@ -86,9 +85,8 @@ def test_the_traced_pass_is_the_reverse_pass(isp: DictionaryISP) -> None:
     srgb, setting = torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0)), isp.typical_setting()
     with torch.no_grad():
         expected = pack_rgb(isp.reverse_pixels(srgb, setting), isp.cfa)
-        torch.testing.assert_close(
-            ReversePass(isp)(srgb, setting.matrix, setting.gains), expected, atol=1e-6, rtol=1e-5
-        )
+        traced = ReversePass(isp)(srgb, setting.matrix, setting.gains)
+    torch.testing.assert_close(traced, expected, atol=1e-6, rtol=1e-5)
 
 
 def test_the_commands_write_and_print_and_refuse(

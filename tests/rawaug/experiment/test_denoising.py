@@ -26,7 +26,6 @@ def recipe(tmp_path: Path) -> Recipe:
     [
         ({"device": "cdua"}, r"device 'cdua' is unknown; .*nearest: cuda"),
         ({"device": "cuda"}, r"device 'cuda': 1 needed, this machine has none"),
-        ({"device": "cuda:1"}, "CUDA_VISIBLE_DEVICES"),
         ({"devices": 0}, "devices must be at least 1"),
         ({"train": TrainConfig(precision="bf16-mixde")}, r"train\.precision: .*'bf16-mixde' is invalid"),
         ({"classical": ["Wavelet"]}, r"classical: Wavelet: pywt is not installed; run: pip install"),

@@ -81,10 +81,9 @@ def test_every_view_has_titled_pictures_and_the_draws_differ(picture: str) -> No
     assert same.std(axis=0).max() < 5, "what is fixed does not vary"
 
 
-@pytest.mark.parametrize("cfa", ["XTRANS", "QUAD-BGGR"])
-def test_other_patterns_have_no_packed_planes_and_no_network(picture: str, cfa: str) -> None:
-    look = Look(picture, SamplingConfig(cfa=cfa))
-    assert [panel.title.partition(":")[0] for panel in views.raw(look)] == [cfa, "histograms"]
+def test_other_patterns_have_no_packed_planes_and_no_network(picture: str) -> None:
+    look = Look(picture, SamplingConfig(cfa="XTRANS"))
+    assert [panel.title.partition(":")[0] for panel in views.raw(look)] == ["XTRANS", "histograms"]
     assert views.pair(look)[0].image.shape == (96, 144, 3)
     with pytest.raises(ValueError, match="denoises Bayer RAW, not"):
         views.denoised(look)
