@@ -118,7 +118,7 @@ def test_a_law_over_iso_is_measured_stored_and_drawn_from(noisy_pair: Pair, tmp_
     for other, said in (
         (
             at_iso(noisy_pair, 100, 2e-4, "Other 2"),
-            r"2 cameras, Maker Model \(2\), Other 2 \(1\); measure each separately",
+            r"2 cameras, Maker Model \(2\), Other 2 \(1\); measure each",
         ),
         (at_iso(noisy_pair, None, 2e-4), "1 of 3 frames have no ISO"),
     ):
