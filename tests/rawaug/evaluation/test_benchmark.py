@@ -52,13 +52,13 @@ def test_the_function_of_the_docs_is_compared(
         "--crop",
         "64",
         "--noise",
-        "upi",
+        "[7e-3, 1.8e-4]",
     ]
     assert main([*command, "--json", "b.json", "--report", "b.html"]) == 0
     result = json.loads(Path("b.json").read_text())
     rows = result["rows"]
     assert {"noisy input", "NonLocalMeans", "rawaug-small", "mine_of_docs:blur"} <= set(rows)
-    told = {name: row["scores"]["levels told"]["upi"]["psnr"] for name, row in rows.items()}
+    told = {name: row["scores"]["levels told"]["[0.007, 0.00018]"]["psnr"] for name, row in rows.items()}
     assert told["noisy input"] < told["mine_of_docs:blur"] and told["noisy input"] < told["rawaug-small"]
     assert rows["rawaug-small"]["gmac"] > 1 and rows["noisy input"]["seconds"] is None
     assert result["hash"] in capsys.readouterr().out
