@@ -229,7 +229,7 @@ def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
         methods["PMRID, published weights"] = pmrid
     rows = {}
     for label, method in methods.items():
-        scores = [score for score, *_ in score_method(method, middles(args), noise, cfa, 0, label)]
+        scores = list(score_method(method, middles(args), noise, cfa, 0, label))
         rows[label] = {key: fmean(getattr(score, key) for score in scores) for key in ("psnr", "psnr_srgb")}
     return rows
 

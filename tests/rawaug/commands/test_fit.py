@@ -196,4 +196,4 @@ def test_frames_that_cannot_be_read_are_named_and_the_rest_is_fitted(
     (tmp_path / "shots" / "a.dng").write_bytes(b"damaged")
     for noise in ("off", "on"):
         with pytest.raises(ValueError, match=r"none of .*1 frames can be read; .*a\.dng"):
-            rawaug.fit(tmp_path / "shots" / "a.dng", progress=False, noise=noise, **SETTINGS)  # type: ignore[arg-type]
+            rawaug.fit(tmp_path / "shots" / "a.dng", progress=False, noise=noise, **SETTINGS)
