@@ -5,8 +5,9 @@ luminance Y and in chrominance UV (ITU-R BT.601), as in the ablation figure of C
 frame's as-shot gains and blind. And the other way round: fits that lack one stage.
 
 *Learned parts*: encoders, end-to-end training, the loss on the images between the stages and that on the weights'
-consistency are switched off one by one. Each seed draws its own photographs, lights and left-out frames, which all
-variants share. Each fit's figures go into a file of their own, so that a stopped run can resume.
+consistency are switched off one by one. Each seed draws its own frames, which all variants share: photographs as scenes
+before the demo camera's lens and sensor, in the colour and balance of a published camera and a light. Each fit's
+figures go into a file of their own, so that a stopped run can resume.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from statistics import fmean
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.data import PictureFolder, open_pairs, open_pictures
+from rawaug.data import DemoCamera, PictureFolder, open_pairs, open_pictures
 from rawaug.data.demo import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
@@ -32,14 +34,15 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free
 from rawaug.files import fingerprint, write_json
 from rawaug.isp import staged
+from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.config import POINTWISE_STAGES
+from rawaug.isp.dictionary import plausible
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import cycle_error
 from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
 from rawaug.metrics import psnr, worst_and_best_quarter
-from rawaug.paper.frames import synthetic_frames
 from rawaug.paper.methods import cycled_without_mosaic, resumed, reverse_parameters
 from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS, checked_settings
@@ -182,6 +185,7 @@ CAMERAS = (
     *("Canon EOS 5D Mark III", "Nikon D750", "Sony ILCE-7M3", "Fujifilm X-T3", "Panasonic DC-GH5"),
     *("Olympus E-M1 Mark II", "Pentax K-3", "Samsung Galaxy S7"),
 )
+LIGHTS_TRIED = 32
 PIXELS = 8192
 """Of a frame on which the forward pass is scored."""
 COLUMNS = {
@@ -262,6 +266,35 @@ def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> di
         cells.append([name, *figures, "" if row is first else mean_and_spread(apart, 2)])
     print_rows(title, ["fit", *COLUMNS.values(), "PSNR_r beside the first"], cells)
     return rows
+
+
+def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
+    """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own."""
+    matrices = published_cameras().named(cameras)
+    frames = []
+    for k, picture in enumerate(pictures):
+        which = k % len(cameras)
+        name = f"{part}_{k:03d}_{cameras[which].replace(' ', '-')}"
+        frames.append(_frame(picture, matrices[which], keyed_generator(seed, "varied frame", part, k), name))
+    return frames
+
+
+def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, name: str) -> Pair:
+    balances = white_balance(xyz_to_camera, torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))).numpy()
+    red, green, blue = balances[plausible(balances)][0].tolist()
+    least = min(red, green, blue)
+    to_srgb = torch.linalg.inv(colour_matrix(xyz_to_camera)).tolist()
+    camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))
+    shot = camera.sample(generator, iso=100)._replace(white_balance=(red / least, green / least, blue / least))
+    return camera.apply(_scene(picture, generator), shot, name)
+
+
+def _scene(picture: Tensor, generator: torch.Generator) -> Tensor:
+    """A crop of the picture at the largest whole reduction that still holds a frame."""
+    factor = min(side // size for side, size in zip(picture.shape[-2:], FRAME, strict=True))
+    small = F.avg_pool2d(picture[None].float(), factor)[0].round().to(torch.uint8)
+    scene: Tensor = bayer.RandomCrop(FRAME)(small, generator)
+    return scene
 
 
 def photographs(pictures: Sequence[Tensor] | PictureFolder, learned: ComponentAblation, seed: int) -> list[Tensor]:

@@ -9,7 +9,7 @@ method has seen. Each fit's figures go into a file of their own, so that a stopp
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -17,6 +17,7 @@ from statistics import fmean, median
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
@@ -27,12 +28,12 @@ from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
+from rawaug.io import decode_srgb, encode_srgb
 from rawaug.isp.fit import FitConfig
 from rawaug.metrics import worst_and_best_quarter
 from rawaug.noise import noise_model
 from rawaug.paper.baselines import Training
 from rawaug.paper.downstream import DownstreamConfig, psnr_d
-from rawaug.paper.frames import PERTURBED
 from rawaug.paper.methods import (
     FAMILIES,
     ROWS,
@@ -81,6 +82,33 @@ def row_name(family: str, row: str) -> str:
     return ", ".join([family, *([] if setting == "blind" else [ROWS[setting]]), *([kind] if kind else [])])
 
 
+STOPS, CONTRAST, SATURATION = 1.0, 0.5, 1.3
+LUMA = (0.2126, 0.7152, 0.0722)
+"""Of ITU-R BT.709."""
+
+
+def overexposed(pair: Pair) -> Pair:
+    """The shot with more light, RAW and picture clipped at white."""
+    factor = 2.0**STOPS
+    picture = encode_srgb((factor * decode_srgb(pair.srgb.float() / 255.0)).clamp(max=1.0))
+    return replace(pair, srgb=_as_8_bits(picture), raw=(factor * pair.raw).clamp(max=1.0))
+
+
+def retouched(pair: Pair) -> Pair:
+    """The RAW stays, the picture is given an S curve and more saturated colour."""
+    x = pair.srgb.float() / 255.0
+    x = x + CONTRAST * (3.0 * x**2 - 2.0 * x**3 - x)
+    luma = (torch.tensor(LUMA).reshape(3, 1, 1) * x).sum(0, keepdim=True)
+    return replace(pair, srgb=_as_8_bits((luma + SATURATION * (x - luma)).clamp(0.0, 1.0)))
+
+
+PERTURBED: dict[str, Callable[[Pair], Pair]] = {"overexposed": overexposed, "retouched": retouched}
+
+
+def _as_8_bits(picture: Tensor) -> Tensor:
+    return (255.0 * picture).round().to(torch.uint8)
+
+
 @dataclass
 class Comparison:
     """A table of methods.
@@ -105,7 +133,7 @@ class Comparison:
         balanced: a column with InvISP's figure as well, on whole frames: PSNR of demosaiced, white-balanced and
             gamma-compressed RAW.
         perturbed: more rows, of frames that are "overexposed" by a stop, or whose picture was "retouched", see
-            :mod:`rawaug.paper.frames`; methods are fitted to frames as they are.
+            below; methods are fitted to frames as they are.
         pictures: sRGB pictures for the cycle and for PSNR_d.
         fit: of the dictionary ISP.
         downstream: PSNR_d; null skips it.

@@ -1,10 +1,17 @@
-"""Encoders: weights on the simplex, from a constant alone or from the picture as well."""
+"""Encoders give weights on the simplex; what the user knows of a shot takes the place of their guess."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import pytest
 import torch
 
+from rawaug.data.pairs import Pair
+from rawaug.isp.config import ISPParams
+from rawaug.isp.model import DictionaryISP
 from rawaug.isp.staged import THUMBNAIL, Encoder, thumbnail
+from rawaug.metrics import psnr
 
 
 def images() -> torch.Tensor:
@@ -43,3 +50,109 @@ def test_a_thumbnail_keeps_the_mean_and_the_shape() -> None:
     assert small.shape == (1, 3, THUMBNAIL // 2, THUMBNAIL)
     torch.testing.assert_close(small.mean(), picture.mean())
     assert torch.equal(thumbnail(picture[..., :20, :30]), picture[..., :20, :30])  # small ones stay as they are
+
+
+LIGHT = (1.7, 0.9, 1.4)
+
+
+def picture() -> torch.Tensor:
+    return 0.05 + 0.75 * torch.rand(1, 3, 32, 48, generator=torch.Generator().manual_seed(0))
+
+
+def readings(raw: torch.Tensor, count: int, seed: int = 1) -> torch.Tensor:
+    """``(1, count, 3)`` random places with their values."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, columns = (torch.randint(side, (count,), generator=generator) for side in raw.shape[-2:])
+    return torch.stack([rows.float(), columns.float(), raw[0, 0, rows, columns]], dim=1)[None]
+
+
+def test_exact_readings_give_the_gains() -> None:
+    isp = DictionaryISP()
+    truth = isp.reverse(picture(), white_balance=LIGHT)
+    solved = isp.reverse(picture(), raw_samples=readings(truth.raw, 64)).params
+    torch.testing.assert_close(solved.gains, truth.params.gains, rtol=1e-4, atol=0)
+
+
+def test_noisy_readings_with_some_on_edges_give_the_gains() -> None:
+    isp = DictionaryISP()
+    truth = isp.reverse(picture(), white_balance=LIGHT)
+    off = []
+    for seed in range(8):
+        samples = readings(truth.raw, 64, seed)
+        generator = torch.Generator().manual_seed(seed)
+        value = samples[..., 2]
+        value += (1e-4 * value).sqrt() * torch.randn(value.shape, generator=generator)
+        value[:, :8] *= 3.0  # these lie on edges
+        solved = isp.reverse(picture(), raw_samples=samples).params
+        off.append((solved.gains / truth.params.gains - 1).abs())
+    assert torch.cat(off).median() < 0.01
+    assert torch.cat(off).max() < 0.05
+
+
+def test_clipped_readings_are_left_out() -> None:
+    isp = DictionaryISP()
+    truth = isp.reverse(picture(), white_balance=LIGHT)
+    samples = readings(truth.raw, 64)
+    samples[:, ::2, 2] = 1.0
+    solved = isp.reverse(picture(), raw_samples=samples).params
+    torch.testing.assert_close(solved.gains, truth.params.gains, rtol=1e-4, atol=0)
+
+
+def test_a_channel_without_a_reading_keeps_its_gain() -> None:
+    isp = DictionaryISP()
+    chosen = isp.choose(picture()).gains
+    truth = isp.reverse(picture(), white_balance=LIGHT)
+    samples = readings(truth.raw, 64)
+    green = (samples[..., 0] + samples[..., 1]) % 2 == 1  # RGGB
+    solved = isp.reverse(picture(), raw_samples=samples[green][None]).params.gains
+    torch.testing.assert_close(solved[0, 1], truth.params.gains[0, 1], rtol=1e-4, atol=0)
+    assert torch.equal(solved[:, 0::2], chosen[:, 0::2])
+
+
+def test_readings_reproduce_an_unseen_shot(fitted: DictionaryISP, exact_pair: Callable[..., Pair]) -> None:
+    unseen = exact_pair("unseen", (1.4, 1.0, 2.0), seed=9)
+    raw = fitted.reverse(unseen.srgb[None], raw_samples=readings(unseen.raw[None], 64)).raw
+    assert psnr(raw, unseen.raw[None]).item() > 50.0
+
+
+def test_readings_choose_the_colour_atoms_of_their_light() -> None:
+    isp = DictionaryISP()
+    isp.colour.light.copy_(torch.linspace(-0.5, 1.0, 16)[:, None].expand(16, 2))
+    isp.colour.spread.fill_(0.05)
+    truth = isp.reverse(picture(), white_balance=(1.65, 1.0, 1.65))  # log 0.5: atom 10 of 16
+    assert truth.params.colour_weights.argmax() == 10
+    solved = isp.reverse(picture(), raw_samples=readings(truth.raw, 64)).params
+    torch.testing.assert_close(solved.colour_weights, truth.params.colour_weights, atol=1e-3, rtol=0)
+
+
+def test_a_digital_gain_is_that_of_grey(fitted: DictionaryISP, exact_pairs: list[Pair]) -> None:
+    srgb = exact_pairs[0].srgb[None]
+
+    def grey(params: ISPParams) -> torch.Tensor:
+        return params.matrix[0].sum(1) / params.gains[0]
+
+    params = fitted.reverse(srgb, white_balance=(2.0, 1.0, 1.6), digital_gain=0.5).params
+    torch.testing.assert_close(grey(params), 1 / (0.5 * torch.tensor([2.0, 1.0, 1.6])), atol=0.01, rtol=0)
+    own = fitted.reverse(srgb).params
+    scaled = fitted.reverse(srgb, digital_gain=0.5).params
+    torch.testing.assert_close(grey(scaled)[1], torch.tensor(2.0))
+    torch.testing.assert_close(scaled.gains / scaled.gains[:, 1:2], own.gains / own.gains[:, 1:2])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"white_balance": (2.0, 1.0)}, r"white_balance must be \(3,\)"),
+        ({"white_balance": torch.ones(2, 3)}, "white_balance"),
+        ({"white_balance": (0.0, 1.0, 1.6)}, "white_balance must be positive"),
+        ({"digital_gain": 0.0}, "digital_gain must be positive"),
+        ({"raw_samples": torch.full((1, 1, 3), float("nan"))}, "NaN"),
+        ({"digital_gain": torch.ones(2)}, "digital_gain"),
+        ({"raw_samples": torch.zeros(1, 4)}, "row, column, value"),
+        ({"raw_samples": torch.tensor([[[32.0, 0.0, 0.1]]])}, "outside the picture, 32 x 48"),
+        ({"raw_samples": torch.tensor([[[0.0, -1.0, 0.1]]])}, "outside the picture"),
+    ],
+)
+def test_other_shapes_and_places_are_refused(given: dict[str, torch.Tensor], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DictionaryISP().reverse(picture(), **given)  # type: ignore[arg-type]
