@@ -85,12 +85,6 @@ def test_the_loci_pass_through_the_cie_illuminants() -> None:
     np.testing.assert_allclose(daylight(kelvin(7504.0)), kelvin(0.29902, 0.31485)[None], atol=2e-4, rtol=0)
 
 
-def test_colour_temperature_agrees_with_mccamy() -> None:
-    t = kelvin(3000, 4000, 5000, 6500, 8000)
-    np.testing.assert_allclose(mccamy(planckian(t)), t, rtol=0.01, atol=0)
-    np.testing.assert_allclose(mccamy(daylight(t[1:])), t[1:], rtol=0.01, atol=0)
-
-
 def test_a_step_off_the_locus_has_its_length_and_is_greener_when_positive() -> None:
     t, duv = kelvin(2500, 4000, 8000), kelvin(0.005, 0.005, 0.005)
     on = planckian(t)

@@ -47,11 +47,6 @@ def test_the_law_keeps_its_shape_and_the_calibration_is_the_same_each_time() -> 
     assert torch.allclose(ratio, ratio[0].expand(5)) and torch.allclose(one["read_var"] / read_var, ratio)
 
 
-def test_a_recipe_names_it() -> None:
-    model = noise_model({"name": "CalibratedNoise", "settings": {"pair_psnr": 41.18, "signal": [0.05, 0.2]}})
-    assert isinstance(model, CalibratedNoise)
-
-
 def test_what_cannot_be_calibrated_is_refused() -> None:
     with pytest.raises(ValueError, match="pair_psnr must be finite, got inf"):
         CalibratedNoise(math.inf)
