@@ -101,8 +101,8 @@ def run(
         return result
 
     if kind == "isp":
-        isp, frames = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
-        result = written(summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in frames))
+        isp, images = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
+        result = written(summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in images))
     else:
         test = _Test(file, pairs, noise, seed, where, classical or ())
         result = written(test.result(frames, bin, views or (8 if self_ensemble else 1), written))
