@@ -55,13 +55,6 @@ def test_files_that_no_dataset_means_are_not_counted(tmp_path: Path, bayer_dng: 
     assert len(list(files_below(tmp_path))) == 4
 
 
-def test_control_characters_in_a_camera_name_are_escaped(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
-    named = [(271, 2, 0, "Maker", True), (272, 2, 0, "\x1b[2JModel", True)]
-    bayer_dng(tmp_path / "a.dng", np.full((32, 48), 1000, np.uint16), extra=named)
-    report = str(check(tmp_path))
-    assert r"\x1b[2JModel" in report and "\x1b" not in report
-
-
 def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng: Callable[..., Path]) -> None:
     numbers = np.full((32, 48), 1000, np.uint16)
     bayer_dng(tmp_path / "a.dng", numbers, cfa="GRBG", black=(64,), white=1023)
@@ -96,13 +89,6 @@ def test_every_dataset_is_recognised(tmp_path: Path, mat73: Writer) -> None:
     write_picture(tmp_path / "a.png", torch.zeros(3, 8, 12, dtype=torch.uint8))
     (rawir,) = (part for part in check(tmp_path, first=1).parts if part.what.startswith("RAWIR"))
     assert rawir.items == 1 and dict(rawir.counts["sizes"]) == {"8 x 12": 1} and not rawir.broken
-
-
-def test_one_damaged_file_of_many_blocks_is_one_line(tmp_path: Path) -> None:
-    blocks = np.full((len(HELD_BACK), 32, 8, 8), 2.0, np.float32)
-    savemat(tmp_path / "BenchmarkNoisyBlocksRaw.mat", {"BenchmarkNoisyBlocksRaw": blocks})
-    report = check(tmp_path, first=5)
-    assert len(report.broken) == 1 and "has values from 2 to 2" in report.broken[0]
 
 
 def test_blocks_of_a_submission_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,14 +201,6 @@ def test_a_bare_folder_never_takes_a_noisy_frame_for_a_clean_one(tmp_path: Path,
     assert len(open_pairs(str(tmp_path), as_clean=False)) == 1  # frames that nothing takes for clean
 
 
-def test_larger_png_mosaics_are_refused(tmp_path: Path) -> None:
-    write_pair(tmp_path, "a", ".png")
-    spec, sites = f"pairs:{tmp_path}", NOISY.size
-    assert open_pairs(spec, max_pixels=sites, **GIVEN)[0].raw.numel() == sites
-    with pytest.raises(ValueError, match=rf"a_noisy\.png: declares .* above the limit of {sites - 1}"):
-        open_pairs(spec, max_pixels=sites - 1, **GIVEN)[0]
-
-
 def test_settings_are_for_pairs_alone(tmp_path: Path, bayer_dng: Dng) -> None:
     bayer_dng(tmp_path / "a.dng", CLEAN)
     for spec in (str(tmp_path), "demo:test"):

@@ -34,15 +34,6 @@ def test_a_shape_lies_around_its_centre_in_few_colours(kind: str) -> None:
     assert len(colours) <= {"stripes": 2, "lettering": 256}.get(kind, 1)
 
 
-def test_upright_boxes_have_edges_along_the_axes() -> None:
-    canvas = Image.new("L", (400, 400), 0).convert("RGB")
-    KINDS["upright box"](canvas, np.array([200.0, 200.0]), 60.0, np.random.default_rng(0))
-    grey = np.asarray(canvas, np.float32).sum(-1)
-    down, across = np.abs(np.diff(grey, axis=0)).sum(1), np.abs(np.diff(grey, axis=1)).sum(0)
-    for edges in (down, across):  # two lines hold nearly all of the change
-        assert np.sort(edges)[-12:].sum() > 0.95 * edges.sum()
-
-
 def test_the_power_spectrum_falls_as_that_of_photographs() -> None:
     pictures = torch.stack([Shapes(4, side=128)[k].float().mean(0) for k in range(4)])
     window = torch.hann_window(128)

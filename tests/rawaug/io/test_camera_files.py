@@ -73,15 +73,6 @@ def test_lens_corrections_are_kept(tmp_path: Path, bayer_dng: Dng) -> None:
         assert file.pages.first.tags["OpcodeList3"].value == opcode
 
 
-@pytest.mark.parametrize("layout", [{"rowsperstrip": 7}, {"tile": (16, 32)}, {"byteorder": ">"}])
-def test_strips_tiles_and_byte_orders(tmp_path: Path, bayer_dng: Dng, layout: dict[str, Any]) -> None:
-    numbers = numbers_of(CFA.GBRG, 48, 64)
-    path = bayer_dng(tmp_path / "a.dng", numbers, "GBRG", black=(BLACK,), white=WHITE, **layout)
-    frame = read_raw(path)
-    assert frame.cfa == CFA.GBRG
-    assert np.allclose(frame.mosaic[0].numpy(), (numbers - BLACK) / (WHITE - BLACK), atol=1e-6)
-
-
 def test_of_several_mosaics_the_largest_is_read_with_its_own_levels(tmp_path: Path, bayer_dng: Dng) -> None:
     """A phone's file: a preview first, a small mosaic, then the picture itself."""
     numbers = numbers_of(CFA.RGGB, 48, 64)

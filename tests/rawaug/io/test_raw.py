@@ -116,11 +116,6 @@ def test_the_upright_view_is_how_libraw_shows_it(tmp_path: Path, bayer_dng: Dng,
     assert np.array_equal(turn(srgb, frame.upright_view).permute(1, 2, 0).numpy(), shown)
 
 
-def test_scaling_by_the_frames_maximum_is_an_option(tmp_path: Path, bayer_dng: Dng) -> None:
-    path = bayer_dng(tmp_path / "a.dng", (NUMBERS * 0.85).astype(np.uint16))
-    assert develop(path, adjust_maximum_thr=0.75).float().mean() > develop(path).float().mean() + 2
-
-
 def not_bayer(name: str) -> dict[str, object]:
     if name == "X-Trans":
         cell = np.array([*b"\1\2\1\1\0\1\0\1\0\2\1\2\1\2\1\1\0\1\1\0\1\1\2\1\2\1\2\0\1\0\1\0\1\1\2\1"], np.uint8)

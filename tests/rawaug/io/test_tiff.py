@@ -118,10 +118,6 @@ def test_a_map_of_the_demosaiced_picture_reaches_the_sites_of_its_colours() -> N
     assert planes.flatten(1).mean(1).tolist() == [1, 2, 2, 5]
 
 
-def test_without_maps_there_is_no_correction() -> None:
-    assert torch.equal(gains_at_sites([], "RGGB", 4, 6), torch.ones(1, 4, 6))
-
-
 def test_opcode_lists_go_there_and_back() -> None:
     maps = a_map(), a_map(area=(1, 1, 8, 12), pitch=(2, 2), gains=torch.rand(2, 4, 3))
     opcodes = opcode_list(maps)

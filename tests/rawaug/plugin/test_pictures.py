@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from rawaug.plugin.pictures import (
@@ -108,12 +106,6 @@ def test_pictures_that_make_no_batch_are_refused() -> None:
         to_rgb_batch([])
     with pytest.raises(ValueError, match="a batch must be"):
         to_rgb_batch(torch.zeros(1, 2, 3, 4, 4))
-
-
-@given(st.integers(2, 9), st.integers(2, 9))
-def test_odd_sides_lose_a_line(height: int, width: int) -> None:
-    image = torch.zeros(3, height, width)
-    assert even_sided(image).shape == (3, height // 2 * 2, width // 2 * 2)
 
 
 @pytest.mark.parametrize("shape", [(3, 1, 8), (3, 8, 0), (0, 3, 8, 8)])

@@ -24,7 +24,7 @@ from rawaug.training.estimators import Supervised
 from rawaug.training.loop import Journal
 from rawaug.training.state import TrainingState, first_network, learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
-from rawaug.training.validation import Watched, validate
+from rawaug.training.validation import Watched
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
 CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
@@ -138,20 +138,6 @@ def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
     for row, part in zip(rows, (losses[:6], losses[6:8], losses[8:]), strict=True):
         assert float(row[1]) == pytest.approx(float(torch.stack(part).detach().mean()), rel=1e-4)
         assert float(row[3]) == pytest.approx(3e-3)
-
-
-def test_a_large_validation_frame_is_seen_in_tiles() -> None:
-    seen = []
-
-    class Note(torch.nn.Module):
-        def forward(self, noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
-            seen.append(max(noisy.shape[-2:]))
-            return noisy
-
-    frame = torch.rand(1, 4, 16, 2000, generator=torch.Generator().manual_seed(0))
-    sample = Watched(frame + 0.1, frame, torch.full_like(frame, 1e-3))
-    assert validate(Note(), [sample], torch.device("cpu"))["psnr"] == pytest.approx(20.0, abs=1e-3)
-    assert len(seen) > 1 and max(seen) <= 1536
 
 
 @pytest.mark.parametrize("choose", [True, False])

@@ -148,6 +148,8 @@ def test_sidd_cc_has_its_own_split_and_is_not_clipped_at_black(tmp_path: Path, m
     assert len(pairs) == 4 and len(SiddFrames(tmp_path)) == 2
     with pytest.raises(ValueError, match="no split test; use train"):
         open_pairs(f"sidd-cc:{tmp_path}:test")
+    with pytest.raises(ValueError, match=r"no split validation; use train \(full frames\)"):
+        open_pairs(f"sidd:{tmp_path}", split="validation")
 
 
 def test_incomplete_and_damaged_frames_are_reported(tmp_path: Path, mat73: Writer) -> None:
@@ -311,18 +313,6 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
         with pytest.raises(ValueError, match=r"bayer_patterns\.csv: is not a list of patterns") as error:
             SiddPlusBlocks(tmp_path)
         assert "\n" not in str(error.value)
-
-
-def test_open_pairs_knows_the_splits(blocks: Path, tmp_path: Path, mat73: Writer) -> None:
-    write_scene(tmp_path, mat73, "0001_001_IP_00100_00060_3200_L", ("010",))
-    assert len(open_pairs(f"sidd:{blocks}")) == 1280
-    assert len(open_pairs(f"sidd:{tmp_path}", split="train")) == 1 == len(open_pairs(f"sidd:{tmp_path}:train"))
-    with pytest.raises(ValueError, match=r"no split validation; use train \(full frames\)"):
-        open_pairs(f"sidd:{tmp_path}", split="validation")
-    with pytest.raises(FileNotFoundError, match=r"contains no ValidationGtBlocksRaw\.mat"):
-        open_pairs(f"sidd:{tmp_path}")
-    with pytest.raises(ValueError, match="sidd:: has no path; write sidd:PATH"):
-        open_pairs("sidd:")
 
 
 SMALL = [
