@@ -90,11 +90,7 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     Args:
         path: a folder, a RAW file, a SIDD submission, or ``pairs:PATH``.
         first: read at most this many items of each kind.
-        settings: of :class:`rawaug.data.PairFolder`, for noisy/clean pairs; None is left out.
-
-    Raises:
-        FileNotFoundError: if there is no such path.
-        ValueError: if it contains no known data, or settings are given and it is not ``pairs:PATH``.
+        settings: of :class:`rawaug.data.PairFolder`, for ``pairs:PATH``; None is left out.
     """
     settings = {key: value for key, value in settings.items() if value is not None}
     if str(path).startswith(_PAIRS):

@@ -65,11 +65,7 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True)
 class DemoCamera:
-    """A camera with a sensor of pattern ``cfa``.
-
-    Args:
-        cfa: the pattern.
-        color_matrix: rows of M, white-balanced camera colour to linear sRGB, each summing to 1.
+    """A camera with a sensor of pattern ``cfa``; ``color_matrix`` M has rows that sum to 1.
 
     Example:
         >>> picture = torch.randint(0, 256, (3, 64, 96), dtype=torch.uint8)
@@ -101,11 +97,7 @@ class DemoCamera:
         )
 
     def apply(self, picture: Tensor, shot: Shot, name: str = "demo") -> Pair:
-        """Take the shot of ``picture``, uint8 ``(3, H, W)``, as the scene.
-
-        Raises:
-            ValueError: if the picture is not uint8 ``(3, H, W)`` with even sides of at least 4.
-        """
+        """Take the shot of ``picture``, uint8 ``(3, H, W)`` with even sides of at least 4, as the scene."""
         if picture.ndim != 3 or picture.shape[0] != 3 or picture.dtype != torch.uint8 or min(picture.shape[1:]) < 4:
             raise ValueError(f"{name}: a scene must be uint8 (3, H, W), at least 4 x 4, got {tuple(picture.shape)}")
         exposed = self._expose(picture, shot)

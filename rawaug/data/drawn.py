@@ -44,12 +44,8 @@ def dead_leaves(height: int, width: int, sources: Sequence[Tensor], generator: t
     Args:
         height, width: in pixels, at least 16. Radii are 4 pixels to a third of the longer side, or what fits into a
             source.
-        sources: photographs for colours and textures, uint8 ``(3, h, w)``, sides at least 32; textures are drawn at
-            half the photograph's scale.
+        sources: photographs for colours and textures, uint8 ``(3, h, w)``, sides at least 32, used at half their scale.
         generator: the only source of randomness, on the CPU.
-
-    Raises:
-        ValueError: if there is no source, or one of another shape or dtype, or the picture is too small.
 
     Example:
         >>> source = torch.randint(0, 256, (3, 64, 64), dtype=torch.uint8)
@@ -150,13 +146,7 @@ Rng = np.random.Generator
 class Shapes(Dataset[Tensor]):
     """``count`` different pictures, uint8 ``(3, side, side)``, each drawn when it is asked for, in half a second.
 
-    Args:
-        count: how many.
-        side: in pixels.
-        seed: of all draws; picture i depends on (seed, i) alone.
-
-    Raises:
-        ValueError: if the count is below 1, or the side below 32.
+    Picture i depends on (seed, i) alone.
 
     Example:
         >>> Shapes(2, side=64)[1].shape

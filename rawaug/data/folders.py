@@ -90,13 +90,6 @@ class PictureFolder(Dataset[Tensor]):
     Raises:
         FileNotFoundError: if there is no such folder.
         ValueError: if it holds no file with such an extension, or, on access, if too many of them had to be skipped.
-
-    Example:
-        >>> pictures = PictureFolder("photographs", min_side=256)  # doctest: +SKIP
-        >>> pictures[0].shape  # doctest: +SKIP
-        torch.Size([3, 375, 500])
-        >>> print(pictures.report())  # doctest: +SKIP
-        photographs: none of 25000 pictures skipped so far
     """
 
     def __init__(
@@ -221,10 +214,7 @@ class Cached(Dataset[Tensor]):
 
 
 class Readable(Sequence[Pair]):
-    """Pairs without those that cannot be read, whose reasons are kept.
-
-    Iterating raises ValueError if no pair is readable.
-    """
+    """Pairs without those that cannot be read, whose reasons are kept; ValueError on iteration if none can."""
 
     def __init__(self, pairs: Sequence[Pair]) -> None:
         self.pairs = pairs
@@ -297,11 +287,6 @@ class RawFolder(LazyPairs):
     Raises:
         FileNotFoundError: if a file or the folder does not exist.
         ValueError: if the folder holds no RAW file.
-
-    Example:
-        >>> pair = RawFolder("shots")[0]  # doctest: +SKIP
-        >>> pair.raw.shape, pair.srgb.shape  # doctest: +SKIP
-        (torch.Size([1, 3000, 4000]), torch.Size([3, 3000, 4000]))
     """
 
     def __init__(

@@ -65,11 +65,10 @@ class PairFolder(LazyPairs):
     """The noisy/clean pairs of a folder and its subfolders, sorted by path; or those of one noisy (or two-in-one) file.
 
     The sRGB picture of a pair is the clean frame, developed without a tone curve. Where no file states white balance
-    and colour matrix, they are 1 and the identity, and ``color_known`` is false.
+    and colour matrix, they are 1 and the identity, and ``color_known`` is false. A folder has no splits.
 
     Args:
         path: where the pairs are.
-        split: is ignored: a folder has no splits.
         noisy: a pattern with a slash is one of paths; files of other names are left out. Without a pattern all readable
             files must belong to a pair by the naming of ``rawaug synth``.
         clean, cfa, black, white: as in :class:`PairSettings`.
@@ -77,11 +76,6 @@ class PairFolder(LazyPairs):
     Raises:
         FileNotFoundError: if there is no such path, or a frame has no partner.
         ValueError: if it contains no pair, a file belongs to none, or a pattern cannot be used.
-
-    Example:
-        >>> pair = PairFolder("shots", noisy="*_NOISY_*.png", cfa="GRBG", black=64, white=1023)[0]  # doctest: +SKIP
-        >>> pair.noisy.shape, pair.raw.shape  # doctest: +SKIP
-        (torch.Size([1, 3000, 4000]), torch.Size([1, 3000, 4000]))
     """
 
     def __init__(

@@ -40,17 +40,9 @@ COUNT = len(HELD_BACK) * BLOCKS
 
 
 class SiddBenchmark(Lazy[RawFrame]):
-    """The benchmark's noisy blocks, whose clean ones are not public; results go to :func:`write_submission`.
+    """The noisy blocks of ``BenchmarkNoisyBlocksRaw.mat`` below a folder, with their levels where these are published.
 
-    Args:
-        path: contains ``BenchmarkNoisyBlocksRaw.mat``, at any depth, and ``noise_level_functions.csv`` if there is one.
-
-    Raises:
-        FileNotFoundError: if the blocks are not there.
-
-    Example:
-        >>> blocks = SiddBenchmark("SIDD_Benchmark")  # doctest: +SKIP
-        >>> write_submission("SubmitRaw.csv", (denoise(b.mosaic, b.cfa) for b in blocks))  # doctest: +SKIP
+    Results go to :func:`write_submission`, in the same order.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -69,12 +61,8 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SID
 
     Args:
         path: ``SubmitRaw.csv`` or ``SubmitRaw.mat``.
-        blocks: 1,280 tensors ``(1, H, W)``, in the pattern that they came in. Values are written as they are.
+        blocks: 1,280 tensors ``(1, side, side)``, finite, in the pattern that they came in; written as they are.
         side: of the blocks.
-
-    Raises:
-        ValueError: if the extension is another, a block has the wrong shape or a value that is not finite, or there are
-            not 1,280.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".mat"):
@@ -96,9 +84,7 @@ def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SID
 def check_submission(path: str | Path, side: int = SIDE) -> Tensor:
     """Read a submission back as ``(1280, 1, side, side)``.
 
-    Raises:
-        FileNotFoundError, OSError: if there is no such file, or it is damaged.
-        ValueError: in one line, if the benchmark would refuse it, or values leave [0, 1] (which it would not notice).
+    ValueError, in one line, if the benchmark would refuse it, or if values leave [0, 1], which it would not notice.
     """
     path = Path(path)
     blocks = _from_mat(path, side) if path.suffix == ".mat" else _from_csv(path, side)
@@ -145,18 +131,7 @@ FRAMES, BOXES = 50, 20
 
 
 class Dnd(Lazy[RawFrame]):
-    """The boxes, frame by frame: 1,000 of 512 x 512; one frame at a time is in memory.
-
-    Args:
-        path: the folder with ``info.mat`` and ``images_raw``.
-
-    Raises:
-        FileNotFoundError, OSError, ValueError: if a file is missing, damaged, or is not as published.
-
-    Example:
-        >>> dnd = Dnd("dnd_2017")  # doctest: +SKIP
-        >>> write_dnd_submission("submission", (denoise(crop) for crop in dnd))  # doctest: +SKIP
-    """
+    """The boxes, frame by frame: 1,000 of 512 x 512; one frame at a time is in memory."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -225,10 +200,7 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
 
     Args:
         folder: made where it does not exist.
-        denoised: 1,000 mosaics ``(1, H, W)``, in the pattern that they came in. Values are written as they are.
-
-    Raises:
-        ValueError: if one has the wrong shape or a value that is not finite, or there are not 1,000.
+        denoised: 1,000 finite mosaics ``(1, H, W)``, in the pattern that they came in; written as they are.
     """
     from scipy.io import savemat
 
@@ -245,12 +217,7 @@ def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None
 
 
 def check_dnd_submission(folder: str | Path, dnd: Dnd) -> None:
-    """Check a submission's files against the boxes that they answer.
-
-    Raises:
-        FileNotFoundError, OSError: if a file is missing or damaged.
-        ValueError: in one line, if a box has another size, type or range than it should.
-    """
+    """Raise ValueError, in one line, if a box of a submission has another size, type or range than it should."""
     for k, frame in enumerate(dnd.frames):
         file = Path(folder) / f"{k + 1:04d}.mat"
         boxes = list(np.atleast_1d(np.asarray(read_value(file, "Idenoised"))))

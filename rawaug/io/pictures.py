@@ -68,10 +68,6 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
         OSError: if the file is not a picture, or is truncated.
         ValueError: if its header declares more than ``max_pixels``, it is animated, its colours are not sRGB (CMYK,
             CIELAB, more than four channels, a damaged profile), or leave [0, 1].
-
-    Example:
-        >>> read_picture("photograph.jpg").shape  # doctest: +SKIP
-        torch.Size([3, 480, 640])
     """
     pixels, orientation = _read(Path(path), max_pixels)
     return turn(torch.from_numpy(pixels).permute(2, 0, 1), view_of_orientation(orientation)).contiguous()

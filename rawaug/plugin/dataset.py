@@ -109,11 +109,7 @@ class RawPairs(Dataset[Any]):
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``, while no loader is in the middle of a pass.
-
-        Raises:
-            ValueError: if it is no state, or that of a dataset of another length.
-        """
+        """Go on from ``state``, while no loader is in the middle of a pass."""
         self._epochs.load_state_dict(state)
         if self._epochs.pinned is not None:
             self.set_epoch(self._epochs.pinned)

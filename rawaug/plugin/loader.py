@@ -71,9 +71,6 @@ class WrappedLoader:
         Without it every pass counts as the next epoch. Call it with a fixed number before each pass over validation
         data, to repeat the same noise, and with ``start`` where the wrapped loader itself resumes in the middle of
         an epoch.
-
-        Raises:
-            ValueError: if either is not an integer from 0 to 2^63 - 1.
         """
         self._next = self._at = Position(checked_epoch(epoch), checked_epoch(start))
         if hasattr(self.loader, "set_epoch"):

@@ -108,12 +108,7 @@ def save_params(params: AugmentParams, path: str | Path) -> None:
 
 
 def load_params(path: str | Path) -> AugmentParams:
-    """Parameters from a file of :func:`save_params`, on the CPU.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it holds something else.
-    """
+    """Parameters from a file of :func:`save_params`, on the CPU; ValueError if it holds something else."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file of parameters")
     header, tensors = read_tensors(path, "save the parameters again")

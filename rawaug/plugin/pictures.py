@@ -131,10 +131,7 @@ def picked(sample: Any, where: Where) -> Any:
 def replaced(sample: Any, where: Where, value: Any) -> Any:
     """The sample with ``value`` there, all else as it was; mappings become dicts.
 
-    A dict in place of the picture of a mapping is merged with it.
-
-    Raises:
-        ValueError: if that would overwrite another field.
+    A dict in place of the picture of a mapping is merged with it; ValueError if that would overwrite another field.
     """
     if where is None:
         return value

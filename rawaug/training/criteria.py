@@ -39,11 +39,7 @@ LOSSES.register("l2")(nn.MSELoss)
 
 @LOSSES.register("charbonnier")
 class Charbonnier(nn.Module):
-    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink.
-
-    Args:
-        epsilon: below which it is quadratic.
-    """
+    """The mean of ``sqrt((a - b)^2 + epsilon^2)``: l1 without the kink."""
 
     def __init__(self, epsilon: float = 1e-3) -> None:
         super().__init__()

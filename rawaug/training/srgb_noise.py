@@ -43,11 +43,7 @@ class SrgbNoise(Protocol):
 
 @SRGB_NOISE.register("Gaussian")
 class WhiteNoise:
-    """White Gaussian noise of a standard deviation drawn uniformly, in units of 1/255.
-
-    Args:
-        sigma: its limits.
-    """
+    """White Gaussian noise of a standard deviation drawn uniformly between the limits ``sigma``, in units of 1/255."""
 
     def __init__(self, sigma: tuple[float, float] = (0.0, 50.0)) -> None:
         _require_limits("sigma", sigma, 0, 255)
