@@ -44,8 +44,8 @@ def watched(sample: Sample, pair: Pair, cfa: CFA) -> Watched:
 def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) -> dict[str, float]:
     """Mean PSNR in dB, large frames in tiles.
 
-    ``psnr`` is over all frames; of three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` are over the thirds; and
-    the same as ``psnr_srgb``, ... where every frame can be developed.
+    Returns ``psnr`` over all frames; of three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
+    and the same as ``psnr_srgb``, ... where every frame can be developed.
     """
     net.eval()
     raw, srgb = [], []
