@@ -1,7 +1,7 @@
 """What each part of the universal ISP is worth: PSNR_d of denoisers trained on RAW made without it.
 
     python -m benchmarks.psnr_d --pictures PHOTOS [MORE ...] --test NAME=RAW_DIR [NAME=...] [--real NAME=RAW_DIR ...]
-        [--older universal.safetensors] [--seeds 0 1 2] [--recipe RECIPE.yaml] [--steps 1200] [--out runs/psnr_d]
+        [--seeds 0 1 2] [--recipe RECIPE.yaml] [--steps 1200] [--out runs/psnr_d]
 
 Network, steps, noise and pictures are those of recipes/reconstruction.yaml, or of the training recipe that is given,
 but for its zoom, and the same in every row; a row differs in the way from sRGB to RAW. The test frames have
@@ -71,7 +71,7 @@ def without_tone(isp: DictionaryISP) -> DictionaryISP:
 
 
 def sources(
-    pictures: Sequence[Tensor], older: Path | None, real: dict[str, list[str]], noise: NoiseModel, crop: int
+    pictures: Sequence[Tensor], real: dict[str, list[str]], noise: NoiseModel, crop: int
 ) -> Iterator[tuple[str, Source]]:
     """Rows: name and training samples."""
 
@@ -84,8 +84,6 @@ def sources(
     yield "universal", made(universal())
     upi = UPI()
     yield "UPI", MadeCrops(pictures, upi.draw, upi.cfa, noise, crop)
-    if older is not None:
-        yield "universal, older", made(DictionaryISP.from_pretrained(older), exposure=CONFIG.exposure)
     yield "without tone", made(without_tone(universal()))
     yield "without consistent gains", made(universal(), sampling="independent")
     calibrated = RawAugment(universal(), noise_model({"pair_psnr": PAIR_PSNR}))
@@ -119,7 +117,6 @@ def main() -> None:
     cli.add_argument("--test", nargs="+", required=True, metavar="NAME=RAW")
     cli.add_argument("--bin", type=int, default=1, help="bins the tests K x K by colour site: clean references")
     cli.add_argument("--real", nargs="*", default=[], metavar="NAME=RAW")
-    cli.add_argument("--older", type=Path, help="the file of another ISP, drawn at exposures of -1.5 to 0 stops")
     cli.add_argument("--rows", nargs="*", default=[], help="names of rows to run; all by default")
     cli.add_argument("--recipe", help="a training recipe; its network, loop, noise and crops")
     cli.add_argument("--steps", type=int, help="in place of the recipe's")
@@ -135,7 +132,7 @@ def main() -> None:
     tests, known = named(options.test), options.out / "scores.json"
     rows: Rows = json.loads(known.read_text(encoding="utf-8")) if known.is_file() else {}
     for seed in options.seeds:
-        for row, crops in sources(pictures, options.older, named(options.real), noise, crop):
+        for row, crops in sources(pictures, named(options.real), noise, crop):
             if options.rows and row not in options.rows:
                 continue
             scores = rows.setdefault(row, {}).setdefault(str(seed), {})

@@ -132,12 +132,27 @@ class Descent:
         watch: Callable[[], float] | None = None,
     ) -> None:
         """Minimise ``loss`` over ``tensors`` in place; a watched stage ends with its best ones."""
+
+        def scores(step: int) -> str:
+            reported = report() if report is not None and step else ""
+            return reported + ("" if watch is None else self._note(stage, step, watch(), tensors))
+
         if not all(f"{stage}/{name}" in self._ends for name in tensors):
-            if watch is not None:
-                self._note(stage, 0, watch(), tensors)
+            scores(0)
             for tensor in tensors.values():
                 tensor.requires_grad_()
-            self._descend(stage, loss, tensors, steps, learning_rate, report, watch)
+            descent = adam(
+                list(tensors.values()),
+                learning_rate,
+                lambda step: loss(keyed_generator(self.seed, stage, step)),
+                lambda step: step / steps if step < steps else 1.0,
+            )
+            bar, losses = progress(descent, label=stage, unit="step", total=steps, shown=self.progress), list[Tensor]()
+            for done, value in enumerate(bar, 1):
+                losses.append(value)
+                if done % self.report_steps == 0 or done == steps:
+                    bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores(done)}", refresh=False)
+                    losses.clear()
             if watch is None:
                 self._keep(stage, tensors)
             if self.path is not None:
@@ -145,31 +160,6 @@ class Descent:
         for name, tensor in tensors.items():
             tensor.data.copy_(self._ends[f"{stage}/{name}"])
             tensor.requires_grad_(isinstance(tensor, torch.nn.Parameter))
-
-    def _descend(
-        self,
-        stage: str,
-        loss: Callable[[torch.Generator], Tensor],
-        tensors: Mapping[str, Tensor],
-        steps: int,
-        learning_rate: float,
-        report: Callable[[], str] | None,
-        watch: Callable[[], float] | None,
-    ) -> None:
-        descent = adam(
-            list(tensors.values()),
-            learning_rate,
-            lambda step: loss(keyed_generator(self.seed, stage, step)),
-            lambda step: step / steps if step < steps else 1.0,
-        )
-        bar, losses = progress(descent, label=stage, unit="step", total=steps, shown=self.progress), list[Tensor]()
-        for done, value in enumerate(bar, 1):
-            losses.append(value)
-            if done % self.report_steps == 0 or done == steps:
-                scores = "" if report is None else report()
-                scores += "" if watch is None else self._note(stage, done, watch(), tensors)
-                bar.set_postfix_str(f"loss {torch.stack(losses).mean():.2e} {scores}", refresh=False)
-                losses.clear()
 
     def finish(self) -> None:
         """Remove the state: the fit is done."""

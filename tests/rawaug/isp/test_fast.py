@@ -13,21 +13,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, ToneMap
 from rawaug.kernels import runtime
 from rawaug.metrics import psnr
-
-
-def curved_isp(**settings: object) -> DictionaryISP:
-    """An ISP with atoms apart from each other, and with tone, attention and shading that do something."""
-    generator = torch.Generator().manual_seed(0)
-    isp = DictionaryISP(ISPConfig(cfa="GBRG", colour_atoms=3, gain_atoms=3, **settings))  # type: ignore[arg-type]
-    with torch.no_grad():
-        isp.colour.matrices.add_(0.3 * torch.rand(3, 3, 3, generator=generator))
-        if tone := isp.find(ToneMap):
-            list(tone.reverse_network.parameters())[-2].normal_(std=0.05, generator=generator)
-        if lens := isp.find(LensShading):
-            lens.mask.set(torch.tensor([0.1, 0.0]), 0.5 * torch.eye(2))
-            if lens.reverse_attention:
-                list(lens.reverse_attention.parameters())[-2].normal_(std=0.05, generator=generator)
-    return isp
+from tests.rawaug.kernels.full_isp import full_isp
 
 
 @pytest.fixture(params=["compiled", "pytorch"])
@@ -39,7 +25,7 @@ def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("attention", [False, True])
 def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
-    isp = curved_isp(attention=attention)
+    isp = full_isp(attention=attention)
     generator = torch.Generator().manual_seed(1)
     srgb = torch.randint(256, (4, 3, 48, 64), generator=generator, dtype=torch.uint8)
     params = isp.choose(srgb) if attention else isp.reverse(srgb, digital_gain=0.6).params  # some gains below 1
@@ -48,7 +34,7 @@ def test_baked_is_the_isp_above_75_db(attention: bool) -> None:
 
 
 def test_the_table_has_the_same_bits_with_any_number_of_threads() -> None:
-    isp, before = curved_isp(), torch.get_num_threads()
+    isp, before = full_isp(), torch.get_num_threads()
     tables = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
@@ -63,7 +49,7 @@ def test_the_table_has_the_same_bits_with_any_number_of_threads() -> None:
 @pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("left_out", POINTWISE_STAGES)
 def test_any_stage_may_be_left_out(left_out: str) -> None:
-    isp = curved_isp(stages=tuple(stage for stage in POINTWISE_STAGES if stage != left_out))
+    isp = full_isp(stages=tuple(stage for stage in POINTWISE_STAGES if stage != left_out))
     srgb = torch.rand(1, 3, 16, 16, generator=torch.Generator().manual_seed(1))
     params = isp.choose(srgb)
     unbaked = bayer.pack(isp.reverse(srgb, params).raw, isp.cfa)
@@ -73,7 +59,7 @@ def test_any_stage_may_be_left_out(left_out: str) -> None:
 @pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("view", range(bayer.N_VIEWS))
 def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: int) -> None:
-    isp = curved_isp()
+    isp = full_isp()
     frame = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
     params = isp.choose(frame)
     x5 = isp.reverse_pixels(frame, params)
@@ -86,7 +72,7 @@ def test_the_mask_keeps_to_the_place_that_a_turned_crop_has_in_its_frame(view: i
 @pytest.mark.parametrize("looks", [False, True])
 def test_choice_is_that_of_the_isp(looks: bool) -> None:
     generator = torch.Generator().manual_seed(2)
-    isp = curved_isp(encoders=looks)
+    isp = full_isp(encoders=looks)
     with torch.no_grad():
         for encoder in (isp.reverse_encoders.colour, isp.reverse_encoders.gain) if looks else ():
             list(encoder.parameters())[-2].normal_(std=5.0, generator=generator)
@@ -98,7 +84,7 @@ def test_choice_is_that_of_the_isp(looks: bool) -> None:
 
 
 def test_later_changes_of_the_isp_do_not_reach_it() -> None:
-    isp, srgb = curved_isp(), torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+    isp, srgb = full_isp(), torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
     params, baked = isp.choose(srgb), BakedISP(isp)
     before = baked(srgb, params)
     with torch.no_grad():
@@ -108,7 +94,7 @@ def test_later_changes_of_the_isp_do_not_reach_it() -> None:
 
 
 def test_pictures_and_parameters_that_do_not_fit_are_refused() -> None:
-    isp = curved_isp()
+    isp = full_isp()
     baked, params = BakedISP(isp), isp.choose(torch.zeros(2, 3, 8, 8))
     with pytest.raises(ValueError, match=r"even sides, got \(2, 3, 8, 7\)"):
         baked(torch.zeros(2, 3, 8, 7), params)
@@ -126,8 +112,8 @@ def test_stages_in_another_order_are_refused() -> None:
 
 
 def forward_curved(**settings: object) -> DictionaryISP:
-    """:func:`curved_isp`, whose forward networks do something as well."""
-    isp, generator = curved_isp(**settings), torch.Generator().manual_seed(5)
+    """:func:`full_isp`, whose forward networks do something as well."""
+    isp, generator = full_isp(**settings), torch.Generator().manual_seed(5)
     with torch.no_grad():
         if tone := isp.find(ToneMap):
             list(tone.forward_network.parameters())[-2].normal_(std=0.05, generator=generator)
