@@ -49,7 +49,7 @@ class JointDRUNet(DRUNet):
     D, and one that starts from a DRUNet's weights is that network followed by D.
 
     Args:
-        width, scales, blocks, limits, mend, domain, seed, context: see :class:`denoisers.DRUNet`.
+        width, scales, blocks, limits, mend, domain, seed: see :class:`denoisers.DRUNet`.
         refine: residual blocks before the twelve planes, at most 1000.
 
     Example:
@@ -71,16 +71,16 @@ class JointDRUNet(DRUNet):
         refine: int = 1,
         domain: str = "anscombe",
         seed: int = 0,
-        context: int = 0,
     ) -> None:
         require_bounded(seed, refine=refine)
-        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed, context=context)
+        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed)
         own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        self.config = {**own, "refine": refine, "domain": domain} | ({"context": context} if context else {})
+        self.config = {**own, "refine": refine, "domain": domain}
         self.refine = nn.Sequential(*(ResidualBlock(width) for _ in range(refine)))
         self.detail = conv(width, RGB * PACKED, bias=False)
         self.register_buffer("stencils", _stencils(), persistent=False)
-        self.initialise(seed, self.tail, self.detail, *self.ends(), gain=1.0)
+        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+        self.initialise(seed, self.tail, self.detail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
         x = self.body(features)

@@ -52,11 +52,9 @@ def conv(
     stride: int = 1,
     groups: int = 1,
     padding: int | None = None,
-    dilation: int = 1,
 ) -> nn.Conv2d:
     """A convolution that keeps the size, or divides it by ``stride``; :meth:`Denoiser.initialise` draws its weights."""
-    around = dilation * (size // 2) if padding is None else padding
-    settings = {"stride": stride, "groups": groups, "padding": around, "dilation": dilation}
+    settings = {"stride": stride, "groups": groups, "padding": size // 2 if padding is None else padding}
     return nn.utils.skip_init(
         nn.Conv2d, inputs, outputs, size, bias=bias, device=torch.get_default_device(), **settings
     )

@@ -339,19 +339,6 @@ class ResidualBlock(nn.Module):
         return x + self.conv2(self.conv1(x).relu_())
 
 
-class ContextBlock(nn.Module):
-    """A residual on a quarter of the features, whose 3 x 3 taps are ``dilation`` apart."""
-
-    def __init__(self, width: int, dilation: int) -> None:
-        super().__init__()
-        narrow = -(-width // 4)
-        self.conv1, self.conv3 = conv(width, narrow, 1, bias=False), conv(narrow, width, 1, bias=False)
-        self.conv2 = conv(narrow, narrow, bias=False, dilation=dilation)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv3(self.conv2(self.conv1(x).relu_()).relu_())
-
-
 @DENOISERS.register("DRUNet")
 class DRUNet(Denoiser):
     """A U-Net of residual blocks without biases (Zhang et al., "Plug-and-Play Image Restoration", TPAMI 2021).
@@ -369,8 +356,6 @@ class DRUNet(Denoiser):
         blocks: of each scale, going down and going up, at most 1000; 4 is published.
         patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
             takes a quarter of the time, for pictures that were demosaiced.
-        context: blocks that the last scale has besides, their taps 1, 2, 4, ... cells apart, at most 8: flat areas are
-            wider than a cell, and strong noise needs all of them.
         limits, mend, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
@@ -394,15 +379,13 @@ class DRUNet(Denoiser):
         domain: str = "linear",
         seed: int = 0,
         patch: int = 1,
-        context: int = 0,
     ) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
         require_between("patch", patch, 1, 8)
-        require_between("context", context, 0, 8)
         require_bounded(seed, blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        config |= ({} if patch == 1 else {"patch": patch}) | ({"context": context} if context else {})
+        config |= {} if patch == 1 else {"patch": patch}
         cell = 2 ** (scales - 1)
         super().__init__(channels, variance_map, deviation, patch * CONTEXT * cell, config, domain, limits, mend)
         self.cell, self.patch = cell, patch
@@ -414,15 +397,11 @@ class DRUNet(Denoiser):
         self.downs = nn.ModuleList(conv(c, 2 * c, 2, bias=False, stride=2, padding=0) for c in sizes[:-1])
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
         self.decoder = nn.ModuleList(_residuals(size, blocks) for size in reversed(sizes[:-1]))
-        self.context = nn.Sequential(*(ContextBlock(sizes[-1], 2**k) for k in range(context)))
         self.coarse = conv(planes, sizes[-1], bias=False)
         self.tail = conv(width, planes, bias=False)
-        self.initialise(seed, self.tail, *self.ends(), gain=1.0)
-
-    def ends(self) -> list[nn.Conv2d]:
-        """Last layers of the residual blocks: as in DHDN, one after another stay tame when each starts as identity."""
-        inner = [block.conv2 for block in self.modules() if isinstance(block, ResidualBlock)]
-        return [*inner, *(block.conv3 for block in self.modules() if isinstance(block, ContextBlock))]
+        # As in DHDN: residual blocks one after another stay tame when each starts as the identity.
+        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+        self.initialise(seed, self.tail, *ends, gain=1.0)
 
     def residual(self, features: Tensor) -> Tensor:
         return F.pixel_shuffle(self.tail(self.body(F.pixel_unshuffle(features, self.patch))), self.patch)
@@ -440,7 +419,7 @@ class DRUNet(Denoiser):
         coarse = self.coarse(self.cell * (mean - wide))
         for k, blocks in enumerate(self.encoder):
             x = self.downs[k - 1](x) if k else x
-            x = self.context(blocks(x + coarse)) if k == len(self.encoder) - 1 else blocks(x)
+            x = blocks(x + coarse if k == len(self.encoder) - 1 else x)
             skips.append(x)
         for up, blocks, skip in zip(self.ups, self.decoder, reversed(skips[:-1]), strict=True):
             x = blocks(F.pixel_shuffle(up(x), 2) + skip)

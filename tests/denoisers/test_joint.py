@@ -65,15 +65,9 @@ def test_it_starts_from_a_denoiser_as_that_followed_by_the_interpolation(tmp_pat
     expected = malvar(noisy, variance, denoised=first(noisy, variance))
     torch.testing.assert_close(joint(noisy, variance), expected, rtol=0, atol=1e-4)
     assert (malvar(noisy, variance) - expected).abs().max() > 0.05
-    wider = DRUNet(**SMALL, blocks=1, limits=True, variance_map=False, domain="anscombe", context=1)
-    denoisers.save(wider, tmp_path / "wider.safetensors", {})
-    for other, file in (
-        ({**SMALL, "width": 8}, start),
-        ({**SMALL, "limits": False}, start),
-        (SMALL, str(tmp_path / "wider.safetensors")),
-    ):
+    for other in ({**SMALL, "width": 8}, {**SMALL, "limits": False}):
         with pytest.raises(ValueError, match=r"denoiser\.start: .* is a DRUNet with .*, not a JointDRUNet"):
-            first_network(DenoiserConfig("JointDRUNet", other, file), seed=0)
+            first_network(DenoiserConfig("JointDRUNet", other, start), seed=0)
 
 
 def test_tiles_of_full_colour_join() -> None:

@@ -402,14 +402,3 @@ def test_onnx_gives_the_same_numbers(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(denoised, expected, rtol=1e-4, atol=1e-5)
         assert np.abs(expected).max() > 0.1
     assert not np.allclose(model(noisy, variance).detach(), noisy, atol=1e-3)
-
-
-@torch.no_grad()
-def test_context_reaches_far_and_starts_as_nothing() -> None:
-    settings: dict[str, Any] = {"width": 4, "scales": 2, "blocks": 0, "variance_map": False}
-    near, far = (DRUNet(**settings, context=number) for number in (0, 3))
-    noisy = torch.zeros(1, 4, 64, 64)
-    noisy[..., 30:34, 30:34] = 1.0
-    assert torch.equal(awake(near)(noisy), far.load_state_dict(near.state_dict(), strict=False) and far(noisy))
-    reach = [(awake(net)(noisy)[0, 0, 32] - net(torch.zeros_like(noisy))[0, 0, 32]).abs() > 1e-7 for net in (near, far)]
-    assert reach[1].sum() > reach[0].sum() + 8
