@@ -1,4 +1,4 @@
-"""A camera whose parameters are known, and pairs made by it."""
+"""A camera whose parameters are known, pairs made by it, and the universal ISP."""
 
 from __future__ import annotations
 
@@ -77,3 +77,9 @@ def exact_pairs() -> list[Pair]:
 def fitted(exact_pairs: list[Pair]) -> DictionaryISP:
     """Fitted to the three shots."""
     return fit_isp(exact_pairs, FitConfig(steps=60, pixels=4096, batch=1024, prior_steps=100), progress=False)
+
+
+@pytest.fixture(scope="session")
+def universal() -> DictionaryISP:
+    """As shipped."""
+    return DictionaryISP.from_pretrained("universal")

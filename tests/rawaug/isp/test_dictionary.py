@@ -132,11 +132,6 @@ def test_greedy_atoms_of_some_cameras_reach_the_others() -> None:
     assert (greedy >= 45).double().mean() > 0.65
 
 
-@pytest.fixture(scope="module")
-def universal() -> DictionaryISP:
-    return DictionaryISP.from_pretrained("universal")
-
-
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 

@@ -13,11 +13,6 @@ from rawaug.isp.universal import TONE_AND_CAMERAS, camera_points, held, inverse_
 from rawaug.metrics import psnr as image_psnr
 
 
-@pytest.fixture(scope="module")
-def universal() -> DictionaryISP:
-    return DictionaryISP.from_pretrained("universal")
-
-
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
