@@ -201,7 +201,7 @@ def test_names_may_hold_any_bytes(tmp_path: Path) -> None:
 
 def test_the_file_that_killed_a_worker_is_named(folder: Path) -> None:
     pictures = Deadly(folder)
-    with pytest.raises(RuntimeError, match=r"worker \(pid.* exited unexpectedly"):
+    with pytest.raises((RuntimeError, ConnectionError)):  # that of PyTorch's watch, or of a tensor on its way
         list(DataLoader(pictures, batch_size=None, num_workers=1, multiprocessing_context="forkserver"))
     assert pictures.being_read() == [folder / "b.png"] and folder / "b.png" in being_read()
 
