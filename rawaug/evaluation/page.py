@@ -251,7 +251,7 @@ def draw_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
             else:
                 axis.plot(gmac, psnr[k], "o", **style)
         axis.set(xlabel="GMAC a megapixel", xscale="log", title=f"PSNR, {title} (dB)")
-    axis.legend(fontsize=8)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     return _png(figure)
 
 

@@ -101,7 +101,7 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
     if not (output.close() and written):
-        raise OSError(f"{path}: cannot be written (OpenImageIO: {_first_line(output.geterror())})")
+        raise OSError(f"{path}: cannot be written (OpenImageIO: {_reason(output) or 'no reason given'})")
 
 
 def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
@@ -132,14 +132,14 @@ def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[n
         pixels = source.read_image(kind(spec))
     except UnicodeDecodeError as error:  # OpenImageIO's binding, of texts in the header
         raise OSError(f"{path}: cannot be read as a picture (its header is damaged: {error}); copy it again") from error
-    fault = source.geterror()  # also set where a decoder padded a truncated file
+    fault = _reason(source)  # also set where a decoder padded a truncated file
     # a GIF is marked as animated only if its frames have a duration
     moves = spec.get_int_attribute("oiio:Movie") or (source.format_name() == "gif" and source.seek_subimage(1, 0))
     source.close()
     if moves:
         raise ValueError(f"{path}: is an animation; save a single frame")
     if pixels is None or fault:
-        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(fault)})")
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {fault or 'no reason given'})")
     return pixels, spec
 
 
@@ -150,7 +150,7 @@ def _opened(path: Path) -> Any:
     require_utf8(path)
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_first_line(oiio.geterror())})")
+        raise OSError(f"{path}: cannot be read as a picture (OpenImageIO: {_reason(oiio) or 'no reason given'})")
     return source
 
 
@@ -198,8 +198,12 @@ def _round_to_8_bits(pixels: np.ndarray, path: Path, linear: bool = False) -> np
     return np.rint(values * 255).astype(np.uint8)
 
 
-def _first_line(message: str) -> str:
-    return message.strip().splitlines()[0] if message.strip() else "no reason given"
+def _reason(source: Any) -> str:
+    """The first line of OpenImageIO's message, if there is one."""
+    try:
+        return "".join(source.geterror().strip().splitlines()[:1])
+    except UnicodeDecodeError:  # it quotes the damaged file
+        return "its header is damaged"
 
 
 _ISO = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")

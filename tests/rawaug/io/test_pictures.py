@@ -231,3 +231,11 @@ def test_it_is_what_a_file_of_that_quality_holds_with_colour_at_half_the_width()
     stripes = torch.tensor([[255, 0], [0, 0], [0, 255]], dtype=torch.uint8)[:, None].repeat(1, 32, 16)
     fine, turned = (through_jpeg(x, 90).float() - x for x in (stripes, stripes.mT))
     assert fine.square().mean() > 2 * turned.square().mean(), "columns of colour are lost, rows are not"
+
+
+def test_a_decoder_s_message_that_is_no_text_is_refused_like_any_other(tmp_path: Path) -> None:
+    write_with_oiio(tmp_path / "a.exr", np.zeros((8, 8, 3), np.float32), "float")
+    damaged = (tmp_path / "a.exr").read_bytes().replace(b"chlist", b"\xa8" * 6, 1)
+    (tmp_path / "b.exr").write_bytes(damaged)
+    with pytest.raises(OSError, match=r"b\.exr: cannot be read as a picture \(OpenImageIO: .*\)"):
+        read_picture(tmp_path / "b.exr")
