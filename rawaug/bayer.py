@@ -241,9 +241,9 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
 
 
-def binned_variance(factor: int) -> float:
+def binned_variance(factor: int, together: bool = False) -> float:
     """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
-    part = (factor - 1) / 4 % 1
+    part = 0.0 if together else (factor - 1) / 4 % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
 
 

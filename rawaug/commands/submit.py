@@ -15,14 +15,7 @@ from torch import Tensor
 
 from rawaug.commands import YAML
 from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
-from rawaug.data import (
-    Dnd,
-    SiddBenchmark,
-    check_dnd_submission,
-    check_submission,
-    write_dnd_submission,
-    write_submission,
-)
+from rawaug.data import submissions
 from rawaug.data.sidd import BLOCKS
 from rawaug.files import require_writable
 from rawaug.io import RawFrame
@@ -63,13 +56,13 @@ def run(
 
 def submit_sidd(path: str, out: str, method: FrameDenoiser) -> int:
     """Write and check SIDD's submission; the number of blocks."""
-    blocks = SiddBenchmark(path)
+    blocks = submissions.SiddBenchmark(path)
     side = blocks[0].mosaic.shape[-1]
-    write_submission(out, _sidd_denoised(blocks, method), side)
-    return len(check_submission(out, side))
+    submissions.write_submission(out, _sidd_denoised(blocks, method), side)
+    return len(submissions.check_submission(out, side))
 
 
-def _sidd_denoised(benchmark: SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
+def _sidd_denoised(benchmark: submissions.SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
     for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
         blocks = benchmark[first : first + BLOCKS]
         levels = blocks[0].noise_profile or (_estimated(blocks) if method.reads_levels else _UNUSED)
@@ -90,13 +83,13 @@ def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
 
 def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
     """Write and check DND's submission; the number of boxes."""
-    boxes = Dnd(path)
+    boxes = submissions.Dnd(path)
     denoised = (
         method(box, box.noise_profile or _UNUSED).clamp(0.0, 1.0)
         for box in progress(boxes, label="benchmark", unit="box")
     )
-    write_dnd_submission(out, denoised)
-    check_dnd_submission(out, boxes)
+    submissions.write_dnd_submission(out, denoised)
+    submissions.check_dnd_submission(out, boxes)
     return len(boxes)
 
 

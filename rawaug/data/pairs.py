@@ -149,7 +149,7 @@ class Pair:
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
         changed: dict[str, Any] = {}
-        left = factor**-2 if together else binned_variance(factor)
+        left = binned_variance(factor, together)
         for key in ("raw", "noisy", "srgb", "noisy_srgb"):
             image = getattr(self, key)
             if image is None:

@@ -264,12 +264,13 @@ def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
     pair = pairs[index]
     if pair.own_noise is not None:
         return pair.own_noise
-    whole, factor = (pairs.pairs[index], pairs.factor) if isinstance(pairs, Binned) else (pair, 1)
+    whole, left = pair, 1.0
+    if isinstance(pairs, Binned):
+        whole, left = pairs.pairs[index], binned_variance(pairs.factor, pairs.together)
     try:
         estimate = estimate_noise(whole.raw, whole.cfa)
     except ValueError:
         return None
-    left = binned_variance(factor)
     return None if estimate.r2 < WORST_FIT else (estimate.shot_var * left, estimate.read_var * left)
 
 

@@ -26,11 +26,11 @@ def reference(truth: Tensor) -> Pair:
     return Pair("frame", torch.zeros(3, *truth.shape[1:], dtype=torch.uint8), raw, CFA.GRBG)
 
 
-@pytest.mark.parametrize("factor", [1, 4])
-def test_the_share_of_a_known_own_noise_is_found(factor: int) -> None:
+@pytest.mark.parametrize(("factor", "together"), [(1, False), (4, False), (4, True)])
+def test_the_share_of_a_known_own_noise_is_found(factor: int, together: bool) -> None:
     truth = scene()
-    pairs = Binned([reference(truth)], factor)
-    clean = Pair("truth", pairs.pairs[0].srgb, truth, CFA.GRBG).binned(factor).raw
+    pairs = Binned([reference(truth)], factor, together)
+    clean = Pair("truth", pairs.pairs[0].srgb, truth, CFA.GRBG).binned(factor, together).raw
     denoised = clean + 3e-3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     error = (denoised - pairs[0].raw).square().mean().item()
     levels = own_noise(pairs, 0)
@@ -43,6 +43,5 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     small = reference(scene(64, 64))
     assert own_noise([small], 0) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
-    assert own_noise(Binned([stated], 4), 0) == pytest.approx(
-        (3.2e-5 * binned_variance(4), 1.6e-7 * binned_variance(4))
-    )
+    for together, left in ((False, binned_variance(4)), (True, 1 / 16)):
+        assert own_noise(Binned([stated], 4, together), 0) == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
