@@ -84,7 +84,7 @@ def curves(path: Path) -> dict[str, list[tuple[Tensor, Tensor]]]:
     noisy_raw = bayer.unpack(model.apply(packed, model.sample(1, torch.Generator().manual_seed(0))), frame.cfa)[0]
     noisy, clean = by_libraw(frame, noisy_raw)
     found = {"RAW": [(frame.mosaic[0], (noisy_raw - frame.mosaic)[0])], "LibRaw": [(clean[1], (noisy - clean)[1])]}
-    for method in bayer.STENCILS:
+    for method in bayer.METHODS:
         augment = RawAugment.from_pretrained(
             "universal", noise=LEVELS, target="srgb", demosaicing=method, exposure=(0.0, 0.0)
         )
@@ -137,7 +137,7 @@ def main() -> None:
         print(f"{name:20}", *(f"{value:6.2f}" for value in by_lag.tolist()))
     sharp = list(demo_photographs("test").values())
     large = [enlarged(p, (2 * p.shape[-2], 2 * p.shape[-1])) for p in sharp]
-    for method in bayer.STENCILS:
+    for method in bayer.METHODS:
         for name, pictures in (("as they are", sharp), ("enlarged", large)):
             demosaicing, noise = differences(pictures, method)
             print(f"{method}, {name}: demosaicing {demosaicing:.1f} dB, noise of cycleisp_sidd {noise:.1f} dB")

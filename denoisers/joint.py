@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from denoisers.network import PACKED, conv, require_bounded
 from denoisers.networks import DRUNet, ResidualBlock
-from rawaug.bayer import CFA, demosaicing
+from rawaug.bayer import CFA, stencils_of
 from rawaug.registry import DENOISERS
 
 RGB = 3
@@ -27,7 +27,7 @@ REACH = 2
 
 def _stencils() -> Tensor:
     """``(12, 1, 6, 6)``: of each colour and site of a cell, what D takes of the cell and its neighbours."""
-    found, kinds = demosaicing(CFA.RGGB, "malvar")
+    found, kinds = stencils_of(CFA.RGGB, "malvar")
     side = 2 * REACH + 1
     own = torch.zeros(1, side, side, device="cpu")
     own[0, REACH, REACH] = 1.0

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from denoisers.domains import DOMAINS, levels_of
+from rawaug import bayer
 from rawaug.registry import require_between
 
 PACKED = 4
@@ -104,6 +105,23 @@ def mended(signal: Tensor) -> Tensor:
     return torch.where(beyond & alone, mean, signal)
 
 
+def halved(picture: Tensor) -> Tensor:
+    """A picture at half its sides; packed RAW, whose sites are those of RGGB, is binned around the new sites."""
+    if picture.shape[1] != PACKED:
+        return F.avg_pool2d(picture, 2)
+    return bayer.pack(bayer.bin_mosaic(bayer.unpack(picture, bayer.CFA.RGGB), bayer.CFA.RGGB, 2), bayer.CFA.RGGB)
+
+
+def doubled(picture: Tensor) -> Tensor:
+    """A picture at twice its sides, linear between its places, which for packed RAW are those of :func:`halved`."""
+    if picture.shape[1] != PACKED:
+        return F.interpolate(picture, scale_factor=2, mode="bilinear")
+    taps = torch.tensor([[3.0, 7, 5, 1], [1, 5, 7, 3]], device=picture.device) / 8  # of the first and second site
+    kernels = torch.stack([torch.outer(taps[i], taps[j]) for i, j in bayer.CFA.RGGB.sites])[:, None]
+    padded = F.pad(picture, (1, 1, 1, 1), mode="replicate")
+    return F.conv_transpose2d(padded, kernels.to(picture.dtype), stride=2, padding=3, groups=PACKED)
+
+
 class Denoiser(nn.Module, ABC):
     """Base of the networks: ``model(noisy, variance=None) -> denoised``, all ``(B, channels, h, w)``, white = 1.
 
@@ -120,6 +138,8 @@ class Denoiser(nn.Module, ABC):
         limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
             at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
         mend: put :func:`mended` before the network, of packed RAW. Not in the domain ``linear``.
+        pyramid: also denoise at half the resolution, where wide noise is narrow, and take what is wide from there; a
+            quarter more work. Not where the result is demosaiced.
 
     Raises:
         ValueError: if there is no such domain, or it does not go with the rest.
@@ -140,6 +160,7 @@ class Denoiser(nn.Module, ABC):
         domain: str = "linear",
         limits: bool = False,
         mend: bool = False,
+        pyramid: bool = False,
     ) -> None:
         super().__init__()
         if (limits or mend) and domain == "linear":
@@ -149,11 +170,12 @@ class Denoiser(nn.Module, ABC):
         if domain != "linear" and domain not in DOMAINS:
             raise ValueError(f"domain {domain!r} is unknown; use one of linear, {', '.join(DOMAINS)}")
         require_between("channels", channels, 1, MOST_FEATURES)
-        self.domain, self.limits, self.mend = domain, limits, mend
+        self.domain, self.limits, self.mend, self.pyramid = domain, limits, mend, pyramid
         self.channels = channels
         self.variance_map = variance_map
         self.deviation = deviation
-        self.stride = stride
+        self.multiple = stride
+        self.stride = 2 * stride if pyramid else stride
         shared = {"channels": channels, "variance_map": variance_map, "deviation": deviation}
         self.config: dict[str, Any] = {**config, **shared} | ({} if domain == "linear" else {"domain": domain})
 
@@ -185,14 +207,27 @@ class Denoiser(nn.Module, ABC):
         if noisy.ndim != 4 or noisy.shape[1] != self.channels or min(noisy.shape[-2:]) < 2:
             raise ValueError(f"{name} takes (B, {self.channels}, h >= 2, w >= 2), got {tuple(noisy.shape)}")
         self._require_type(noisy, "noisy")
-        if not self.reads_variance:
-            return self.uncorrected(noisy) + self._correction(noisy)
+        if self.reads_variance:
+            variance = self._required(noisy, variance)
+        denoised = self._at_one_scale(noisy, variance)
+        denoised = denoised + self._wide(noisy, variance, denoised) if self.pyramid else denoised
+        if variance is None or self.domain == "linear" or self.upscale > 1:
+            return denoised
+        return torch.where(variance > 0, denoised, noisy)
+
+    def _required(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
+        name = type(self).__name__
         if variance is None:
             needed = "variance_map=True" if self.variance_map else f"domain={self.domain!r}"
             raise ValueError(f"{name} was built with {needed}: pass the noise variance of each value")
         if variance.shape != noisy.shape:
             raise ValueError(f"variance {tuple(variance.shape)} must have the shape {tuple(noisy.shape)} of noisy")
         self._require_type(variance, "variance")
+        return variance
+
+    def _at_one_scale(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
+        if variance is None or not self.reads_variance:
+            return self.uncorrected(noisy) + self._correction(noisy)
         if self.domain == "linear":
             correction = self._correction(noisy, variance.sqrt() if self.deviation else variance)
             return self.uncorrected(noisy) + correction
@@ -205,13 +240,24 @@ class Denoiser(nn.Module, ABC):
             maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
         correction = self._correction(signal, *maps)
         correction = maps[0] * correction if self.variance_map else correction
-        denoised = domain.inverse(self.uncorrected(signal) + correction, *levels)
-        denoised = denoised if self.upscale > 1 else torch.where(variance > 0, denoised, noisy)
-        return denoised.to(noisy.dtype)
+        return domain.inverse(self.uncorrected(signal) + correction, *levels).to(noisy.dtype)
+
+    def _wide(self, noisy: Tensor, variance: Tensor | None, denoised: Tensor) -> Tensor:
+        """What is wide in the error of one scale, ``U(f(B y) - B f(y))`` with B halving and U doubling the sides."""
+        height, width = noisy.shape[-2:]
+        if self.mend and variance is not None:  # a mean over a defect hides it
+            domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
+            noisy = domain.inverse(mended(domain.forward(noisy.float(), *levels)), *levels).to(noisy.dtype)
+        part = bayer.binned_variance(2, together=self.channels != PACKED)
+        told = None if variance is None else part * halved(pad_to_multiple(variance, 4))
+        error = self._at_one_scale(halved(pad_to_multiple(noisy, 4)), told) - halved(pad_to_multiple(denoised, 4))
+        # Near its own limit of resolution the half picture knows less than the whole one.
+        error = F.avg_pool2d(error, 3, 1, 1, count_include_pad=False)
+        return doubled(error)[..., :height, :width]
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
         features = torch.cat([signal, *maps], dim=1) if maps else signal
-        correction = self.residual(pad_to_multiple(features.to(self._dtype), self.stride))
+        correction = self.residual(pad_to_multiple(features.to(self._dtype), self.multiple))
         height, width = (self.upscale * side for side in signal.shape[-2:])
         return correction[..., :height, :width]
 

@@ -356,7 +356,7 @@ class DRUNet(Denoiser):
         blocks: of each scale, going down and going up, at most 1000; 4 is published.
         patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
             takes a quarter of the time, for pictures that were demosaiced.
-        limits, mend, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
+        limits, mend, pyramid, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
         >>> noisy = torch.rand(2, 4, 33, 50)
@@ -379,15 +379,17 @@ class DRUNet(Denoiser):
         domain: str = "linear",
         seed: int = 0,
         patch: int = 1,
+        pyramid: bool = False,
     ) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
         require_between("patch", patch, 1, 8)
         require_bounded(seed, blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        config |= {} if patch == 1 else {"patch": patch}
+        config |= ({} if patch == 1 else {"patch": patch}) | ({"pyramid": True} if pyramid else {})
         cell = 2 ** (scales - 1)
-        super().__init__(channels, variance_map, deviation, patch * CONTEXT * cell, config, domain, limits, mend)
+        stride = patch * CONTEXT * cell
+        super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend, pyramid)
         self.cell, self.patch = cell, patch
         planes = channels * patch**2
         sizes = [width * 2**k for k in range(scales)]

@@ -137,13 +137,31 @@ class FastForward(nn.Module):
         self, raws: Sequence[Tensor], methods: Sequence[str], params: ISPParams, place: Tensor | None = None
     ) -> list[Tensor]:
         """Mosaics ``(B, 1, H, W)`` of the same pictures to sRGB, each picture demosaiced by its own method."""
+        directional = any(method in bayer.DIRECTIONAL for method in methods)
+        if directional and len(methods) > 1:  # a picture is the same whatever is beside it
+            alone = []
+            for i, method in enumerate(methods):
+                own, at = ISPParams(*(value[i, None] for value in params)), None if place is None else place[i, None]
+                alone.append(self.develop([raw[i, None] for raw in raws], [method], own, at))
+            return [torch.cat(pictures) for pictures in zip(*alone, strict=True)]
         display = self._display(raws[0], params, place)
 
-        def in_pytorch(raw: Tensor) -> Tensor:
-            pictures = zip(raw.split(1), methods, strict=True)
-            return render(torch.cat([bayer.demosaic(one, self.cfa, method) for one, method in pictures]), display)
+        def in_steps(raw: Tensor) -> Tensor:
+            found = [self._demosaiced(*one) for one in zip(raw.split(1), methods, display.gains, strict=True)]
+            linear = torch.cat(found)
+            return fastest("render", linear, display, otherwise=lambda: render(linear, display))
 
-        return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_pytorch, raw)) for raw in raws]
+        if directional:
+            return [in_steps(raw) for raw in raws]
+        return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw)) for raw in raws]
+
+    def _demosaiced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
+        """Balanced, and clipped at black, before a choice of direction, as RAW developers do it."""
+        if method not in bayer.DIRECTIONAL:
+            return bayer.demosaic(raw, self.cfa, method)
+        balance = gains[:3, None, None]
+        sites = bayer.mosaic(balance.expand(3, 2, 2), self.cfa).repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
+        return bayer.demosaic((raw * sites).clamp_min(0.0), self.cfa, method) / balance
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)

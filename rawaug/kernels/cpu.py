@@ -21,7 +21,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from rawaug.bayer import CFA, demosaicing
+from rawaug.bayer import CFA, stencils_of
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compiled, over_rows, part
 
@@ -101,7 +101,7 @@ def _rendered(
 @lru_cache
 def _site_weights(cfa: CFA, method: str) -> np.ndarray:
     """``(2, 3, 6, _TILE)``: by row and colour, the weights of the six sums of :func:`_demosaic` at each site."""
-    stencils, kinds = demosaicing(cfa, method)
+    stencils, kinds = stencils_of(cfa, method)
     edge = 2 - stencils.shape[-1] // 2
     around = F.pad(stencils, (edge, edge, edge, edge))
     own = torch.eye(6)[:1]

@@ -67,7 +67,7 @@ class RawAugment(nn.Module):
         target: what the pair holds. ``"raw"``: noisy and clean RAW. ``"rgb"``: noisy RAW, and clean linear camera RGB
             ``(B, 3, H, W)`` of the full size, for demosaicing. ``"srgb"``: both as sRGB ``(B, 3, H, W)`` in [0, 1],
             developed by the setting that made the RAW, and no variance map; see :mod:`rawaug.plugin.targets`.
-        demosaicing: of ``"srgb"``: a name of :data:`rawaug.bayer.STENCILS`, or several to draw from (all).
+        demosaicing: of ``"srgb"``: a name of :data:`rawaug.bayer.METHODS`, or several to draw from (all).
         jpeg: of ``"srgb"``: lowest and highest quality of the JPEG that the noisy picture goes through (no JPEG).
         burst: number N of noisy frames of the scene that a pair holds, ``(B, N, ...)``; clean is that of the first. By
             default a single one, without the N.

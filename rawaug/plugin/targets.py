@@ -48,10 +48,10 @@ class Targets:
             raise ValueError(f"target 'srgb' demosaics Bayer patterns, not {pattern}; use target 'rgb' or 'raw'")
         if jpeg is not None and not (len(jpeg) == 2 and 1 <= jpeg[0] <= jpeg[1] <= 100):
             raise ValueError(f"jpeg must be (lowest, highest) quality within 1 to 100, got {jpeg}")
-        names = list(bayer.STENCILS) if demosaicing is None else demosaicing
+        names = list(bayer.METHODS) if demosaicing is None else demosaicing
         self.names = (names,) if isinstance(names, str) else tuple(names)
         for name in self.names:
-            bayer.demosaicing("RGGB", name)  # an unknown one is refused
+            bayer.require_method(name)
         self.target, self.jpeg = target, jpeg
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:

@@ -402,3 +402,41 @@ def test_onnx_gives_the_same_numbers(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(denoised, expected, rtol=1e-4, atol=1e-5)
         assert np.abs(expected).max() > 0.1
     assert not np.allclose(model(noisy, variance).detach(), noisy, atol=1e-3)
+
+
+class Mean(Denoiser):
+    """The mean over 3 x 3 pixels: what is wider than these it leaves."""
+
+    def __init__(self, channels: int, pyramid: bool) -> None:
+        super().__init__(channels, False, False, 1, {}, pyramid=pyramid)
+
+    def residual(self, features: Tensor) -> Tensor:
+        padded = F.pad(features, (1, 1, 1, 1), mode="reflect")
+        return F.avg_pool2d(padded, 3, 1) - features
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_pyramid_takes_out_wide_noise_and_leaves_the_scene(channels: int) -> None:
+    rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(80.0), indexing="ij")
+    scene = torch.stack([0.004 * (rows + i / 2) + 0.003 * (columns + j / 2) for i in (0, 1) for j in (0, 1)])[None]
+    scene = scene[:, :channels] if channels == 4 else scene[:, :1].expand(1, 3, 64, 80)
+    plain, pyramid = Mean(channels, False), Mean(channels, True)
+    torch.testing.assert_close(pyramid(scene)[..., 8:-8, 8:-8], scene[..., 8:-8, 8:-8])
+    noise = 0.01 * torch.randn(scene.shape, generator=torch.Generator().manual_seed(0))
+    errors = [(model(scene + noise) - scene)[..., 8:-8, 8:-8] for model in (plain, pyramid)]
+    wide = [F.avg_pool2d(error, 4).square().mean() for error in errors]
+    assert wide[1] < 0.85 * wide[0] and errors[1].square().mean() < 0.95 * errors[0].square().mean()
+    assert pyramid(noise[..., :2, :3]).shape == (1, channels, 2, 3)
+
+
+@torch.no_grad()
+def test_a_pyramid_is_built_again_and_a_defect_stays_small() -> None:
+    settings: dict[str, Any] = {"width": 4, "scales": 2, "blocks": 1, "variance_map": False, "domain": "anscombe"}
+    net = awake(DRUNet(**settings, mend=True, pyramid=True))
+    assert net.stride == 2 * awake(DRUNet(**settings)).stride
+    assert denoisers.build("DRUNet", **net.config).pyramid
+    noisy = pair(1, 4, 32, 32)[0].clamp_min(0.0) * 0.1
+    hot = noisy.clone()
+    hot[0, 2, 10, 11] = 0.9
+    changed = net(hot, 1e-3 * hot + 1e-5) - net(noisy, 1e-3 * noisy + 1e-5)
+    assert changed.abs().max() < 0.1

@@ -23,7 +23,7 @@ from rawaug import (
     save_params,
     wrap,
 )
-from rawaug.bayer import STENCILS, pack_rgb
+from rawaug.bayer import METHODS, pack_rgb
 from rawaug.isp.config import ISPConfig
 from rawaug.metrics import psnr
 
@@ -49,7 +49,7 @@ def test_linear_rgb_is_what_the_mosaic_was_taken_from(universal: DictionaryISP) 
     assert xtrans.noisy.shape == (2, 1, 48, 64) and torch.equal(xtrans.clean, pair.clean)
 
 
-@pytest.mark.parametrize("demosaicing", STENCILS)
+@pytest.mark.parametrize("demosaicing", METHODS)
 @pytest.mark.parametrize("isp", ["universal", "canon-powershot"])
 def test_without_noise_the_setting_develops_to_the_picture(isp: str, demosaicing: str) -> None:
     srgb = smooth(2, 192, 256)
@@ -107,7 +107,7 @@ def test_a_replay_is_exact_and_goes_through_a_file(universal: DictionaryISP, tmp
 def test_every_demosaicing_and_quality_is_drawn_and_a_low_quality_costs_more(universal: DictionaryISP) -> None:
     srgb = smooth(64)
     drawn = RawAugment(universal, target="srgb", jpeg=(10, 12)).sample(srgb, seeded()).extras
-    assert set(drawn["demosaicing"].tolist()) == {0, 1} and set(drawn["quality"].tolist()) == {10, 11, 12}
+    assert set(drawn["demosaicing"].tolist()) == {0, 1, 2, 3} and set(drawn["quality"].tolist()) == {10, 11, 12}
     without, high, low = (
         RawAugment(universal, noise=(1e-4, 0.0), target="srgb", demosaicing="malvar", jpeg=jpeg)(srgb[:2], seeded())
         for jpeg in (None, (95, 95), (10, 10))
@@ -155,7 +155,10 @@ def test_settings_without_meaning_are_refused(universal: DictionaryISP) -> None:
         ({"jpeg": (40, 95)}, "for target 'srgb', not 'raw'"),
         ({"target": "srgb", "jpeg": (0, 95)}, "within 1 to 100"),
         ({"target": "srgb", "jpeg": (95, 40)}, "within 1 to 100"),
-        ({"target": "srgb", "demosaicing": "ahd"}, "demosaicing 'ahd' is unknown; use one of bilinear, malvar"),
+        (
+            {"target": "srgb", "demosaicing": "lmmse"},
+            "demosaicing 'lmmse' is unknown; use one of bilinear, malvar, adams",
+        ),
         ({"target": "srgb", "cfa": "XTRANS"}, "demosaics Bayer patterns, not XTRANS"),
     ):
         given: Any = settings

@@ -1,0 +1,199 @@
+r"""Mosaics: the colour filter array, packing, and geometry that keeps the pattern.
+
+A mosaic keeps one colour a site, ``y[i, j] = x[c(i, j), i, j]``, where ``c`` repeats every two rows and columns in
+Bayer's patterns (US patent 3,971,065, 1976). *Packed* RAW holds the four sites of each 2 x 2 cell as four planes,
+always in the order R, Gr, Gb, B (Gr is the green of the red row), so that a network need not know the sensor's pattern.
+
+A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` only moves pixels,
+:meth:`CFA.turned` says what the pattern becomes, and :func:`turn_keeping_cfa` crops a line where that brings it back.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+N_VIEWS = 8  # flips and quarter turns of a picture: the dihedral group of the square
+
+
+class CFA(StrEnum):
+    """The 2 x 2 colour filter array, read row by row from the top left: ``CFA("RGGB")`` is R G / G B."""
+
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+    @classmethod
+    def _missing_(cls, value: object) -> CFA:
+        names = ", ".join(member.value for member in cls)
+        raise ValueError(f"CFA {value!r} is not a Bayer pattern; use one of {names}")
+
+    @property
+    def sites(self) -> tuple[tuple[int, int], ...]:
+        """(row, column) within the cell of R, Gr, Gb and B, in this order."""
+        red = self.value.index("R")
+        row, column = divmod(red, 2)
+        return (row, column), (row, 1 - column), (1 - row, column), (1 - row, 1 - column)
+
+    @property
+    def channels(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """The cell as indices into RGB: ``((0, 1), (1, 2))`` for RGGB."""
+        a, b, c, d = ("RGB".index(colour) for colour in self.value)
+        return (a, b), (c, d)
+
+    def shifted(self, rows: int, columns: int) -> CFA:
+        """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
+        cell = [self.value[:2], self.value[2:]]
+        return CFA("".join(cell[(i + rows) % 2][(j + columns) % 2] for i in (0, 1) for j in (0, 1)))
+
+    def turned(self, view: int) -> CFA:
+        """The pattern after :func:`turn` of a mosaic with even sides."""
+        cell = torch.arange(4).reshape(1, 1, 2, 2)
+        return CFA("".join(self.value[k] for k in turn(cell, view).flatten().tolist()))
+
+    def shift_to(self, other: CFA) -> tuple[int, int]:
+        """(rows, columns) in {0, 1} with ``self.shifted(rows, columns) == other``."""
+        return next((i, j) for i in (0, 1) for j in (0, 1) if self.shifted(i, j) == other)
+
+
+def noise_variance(raw: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
+    """The variance of shot and read noise, ``shot_var max(raw, 0) + read_var``, white = 1; the levels broadcast."""
+    return raw.clamp_min(0.0) * shot_var + read_var
+
+
+def require_even(height: int, width: int) -> None:
+    if height % 2 or width % 2:
+        raise ValueError(f"a Bayer mosaic must have even sides, got {height} x {width}; crop the last row or column")
+    if min(height, width) < 2:
+        raise ValueError(f"a Bayer mosaic must be at least 2 x 2, got {height} x {width}")
+
+
+def require_channels(image: Tensor, channels: int, what: str) -> None:
+    if image.ndim < 3 or image.shape[-3] != channels:
+        raise ValueError(f"{what} must have shape (..., {channels}, H, W), got {tuple(image.shape)}")
+
+
+def pack(mosaic: Tensor, cfa: CFA | str) -> Tensor:
+    """Mosaic ``(..., 1, H, W)`` to packed planes R, Gr, Gb, B ``(..., 4, H/2, W/2)``; ValueError if a side is odd."""
+    require_channels(mosaic, 1, "a mosaic")
+    require_even(*mosaic.shape[-2:])
+    plane = mosaic[..., 0, :, :]
+    return torch.stack([plane[..., i::2, j::2] for i, j in CFA(cfa).sites], dim=-3)
+
+
+def unpack(packed: Tensor, cfa: CFA | str) -> Tensor:
+    """Packed planes ``(..., 4, H/2, W/2)`` to the mosaic ``(..., 1, H, W)``; the inverse of :func:`pack`."""
+    require_channels(packed, 4, "packed RAW")
+    *lead, _, height, width = packed.shape
+    require_even(2 * height, 2 * width)
+    mosaic = packed.new_empty(*lead, 1, 2 * height, 2 * width)
+    for k, (i, j) in enumerate(CFA(cfa).sites):
+        mosaic[..., 0, i::2, j::2] = packed[..., k, :, :]
+    return mosaic
+
+
+def pack_rgb(rgb: Tensor, cfa: CFA | str) -> Tensor:
+    """Full-colour linear ``(..., 3, H, W)`` to packed ``(..., 4, H/2, W/2)``: each site keeps its own colour alone."""
+    require_channels(rgb, 3, "an RGB image")
+    require_even(*rgb.shape[-2:])
+    sites = zip((0, 1, 1, 2), CFA(cfa).sites, strict=True)
+    return torch.stack([rgb[..., c, i::2, j::2] for c, (i, j) in sites], dim=-3)
+
+
+def mosaic(rgb: Tensor, cfa: CFA | str) -> Tensor:
+    """Full-colour linear ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``: stage f6, reversed."""
+    return unpack(pack_rgb(rgb, cfa), cfa)
+
+
+def turn(image: Tensor, view: int) -> Tensor:
+    """One of the eight flips and quarter turns of ``(..., H, W)``; a mosaic's pattern moves along.
+
+    ``view`` is in [0, 8): bit 2 transposes first, bit 1 then flips the rows, bit 0 the columns. View 0 is the identity,
+    3 the half turn, 5 and 6 are the quarter turns to the right and to the left.
+    """
+    if not 0 <= view < N_VIEWS:
+        raise ValueError(f"view must be in [0, {N_VIEWS}), got {view}")
+    if view & 4:
+        image = image.transpose(-2, -1)
+    axes = [axis for bit, axis in ((2, -2), (1, -1)) if view & bit]
+    return image.flip(axes) if axes else image
+
+
+def turn_back(image: Tensor, view: int) -> Tensor:
+    """The inverse of :func:`turn` with the same ``view``."""
+    flips = turn(image, view & 3)
+    return flips.transpose(-2, -1) if view & 4 else flips
+
+
+def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
+    """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped."""
+    require_even(*raw.shape[-2:])
+    kept = aligned(turn(raw, view), CFA(cfa).turned(view), CFA(cfa))
+    if not all(kept.shape[-2:]):
+        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping its CFA")
+    return kept
+
+
+def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+    """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
+    if any(value % 2 for value in (top, left, height, width)):
+        raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
+    return cropped(raw, top, left, height, width)
+
+
+def cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+    sides = tuple(raw.shape[-2:])
+    if min(top, left) < 0 or min(height, width) < 1 or top + height > sides[0] or left + width > sides[1]:
+        raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {sides}")
+    return raw[..., top : top + height, left : left + width]
+
+
+def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False) -> Tensor:
+    """A mosaic ``(..., 1, H, W)`` at 1 / ``factor`` of its sides, each site the mean of its colour around its place.
+
+    The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
+    the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
+    of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
+    independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
+    With ``together`` the four sites of a new cell are means over the same area, as a pixel of full colour needs them.
+    ValueError if the CFA is not Bayer's, or a side is not a multiple of 2 ``factor``.
+
+    Example:
+        >>> bin_mosaic(torch.rand(1, 16, 24), "GRBG", 4).shape
+        torch.Size([1, 4, 6])
+    """
+    if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
+        raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
+    CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
+    move = 0.0 if together else (factor - 1) / 4
+    rows = [_window_means(raw[..., i::2, :], -2, factor, move * (2 * i - 1)) for i in (0, 1)]
+    sites = [[_window_means(row[..., j::2], -1, factor, move * (2 * j - 1)) for j in (0, 1)] for row in rows]
+    return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
+
+
+def binned_variance(factor: int, together: bool = False) -> float:
+    """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
+    part = 0.0 if together else (factor - 1) / 4 % 1
+    return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
+
+
+def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
+    """Means over ``factor`` sites of one colour, of windows moved by so many of its sites."""
+    first, part = math.floor(move), move % 1
+    sites = torch.arange(plane.shape[axis], device=plane.device)
+    near, far = (
+        plane.index_select(axis, (sites + k).clamp(0, len(sites) - 1)).unflatten(axis, (-1, factor)).mean(axis)
+        for k in (first, first + 1)
+    )
+    return torch.lerp(near, far, part)
+
+
+def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
+    """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
+    rows, columns = cfa.shift_to(target)
+    height, width = mosaic.shape[-2:]
+    return mosaic[..., rows : height - rows, columns : width - columns]

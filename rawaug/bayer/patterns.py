@@ -1,0 +1,145 @@
+"""Colour filter arrays beside Bayer's.
+
+X-Trans (Fujifilm; 6 x 6 sites, as LibRaw reads it from an origin where it begins with G B G G R G) and Quad-Bayer
+(each site of a Bayer cell is 2 x 2 pixels). Their RAW has no packed form: networks read the mosaic with the pattern as
+one-hot planes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rawaug.bayer.cfa import CFA, cropped, require_channels, turn
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A colour filter array.
+
+    Args:
+        name: as :func:`pattern` knows it.
+        rows: the cell from the top left, a string of ``R``, ``G``, ``B`` for each row; as many rows as columns.
+
+    Example:
+        >>> xtrans = pattern("XTRANS")
+        >>> raw = xtrans.mosaic(torch.rand(2, 3, 24, 36))
+        >>> raw.shape, torch.cat([raw, xtrans.planes(24, 36).expand(2, -1, -1, -1)], dim=1).shape
+        (torch.Size([2, 1, 24, 36]), torch.Size([2, 4, 24, 36]))
+    """
+
+    name: str
+    rows: tuple[str, ...]
+
+    @property
+    def period(self) -> int:
+        """Side of the cell."""
+        return len(self.rows)
+
+    def channels(self, height: int, width: int) -> Tensor:
+        """The colour of each site as an index into RGB, int64 ``(H, W)``."""
+        cell = torch.tensor([["RGB".index(colour) for colour in row] for row in self.rows])
+        times = (-(-height // self.period), -(-width // self.period))
+        return cell.repeat(*times)[:height, :width]
+
+    def planes(self, height: int, width: int) -> Tensor:
+        """One plane a colour that is 1 at its sites and 0 elsewhere, float32 ``(3, H, W)``: an input of networks."""
+        return (self.channels(height, width) == torch.arange(3)[:, None, None]).float()
+
+    def mosaic(self, rgb: Tensor) -> Tensor:
+        """Full-colour ``(..., 3, H, W)`` to the mosaic ``(..., 1, H, W)``."""
+        require_channels(rgb, 3, "an RGB image")
+        index = self.channels(*rgb.shape[-2:]).to(rgb.device)
+        return rgb.gather(-3, index.expand(*rgb.shape[:-3], 1, *index.shape))
+
+    def demosaic(self, raw: Tensor) -> Tensor:
+        """Mosaic ``(B, 1, H, W)`` to ``(B, 3, H, W)``, for the eye: what a site measured stays, the rest are means.
+
+        The mean is that of the sites of the colour nearby, with the weights of a tent as wide as the cell (normalised
+        convolution: Knutsson and Westin, CVPR 1993); of Bayer's patterns it is bilinear interpolation.
+        """
+        planes, inverse = (kept.to(raw) for kept in _sites(self.name, *raw.shape[-2:]))
+        return torch.where(planes > 0, raw, _tent(raw * planes, self.period) * inverse)
+
+    def crop(self, raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+        """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size."""
+        if top % self.period or left % self.period:
+            raise ValueError(f"offset ({top}, {left}) must be a multiple of {self.period} to keep {self.name}")
+        return cropped(raw, top, left, height, width)
+
+    def shift_after(self, view: int) -> tuple[int, int]:
+        """Rows and columns, less than the period, from which a turned mosaic of whole cells reads the pattern again."""
+        cell = self.channels(self.period, self.period)
+        turned = turn(cell, view)
+        sites = [(i, j) for i in range(self.period) for j in range(self.period)]
+        return next((i, j) for i, j in sites if torch.equal(turned.roll((-i, -j), (0, 1)), cell))
+
+    def turn_keeping(self, raw: Tensor, view: int) -> Tensor:
+        """Turn ``(..., H, W)`` as :func:`turn` does, and crop to the whole cells of the pattern.
+
+        A side, which must have whole cells, is one cell shorter where the pattern had moved.
+
+        Example:
+            >>> pattern("XTRANS").turn_keeping(torch.rand(1, 1, 24, 36), view=1).shape  # mirrored
+            torch.Size([1, 1, 24, 30])
+        """
+        height, width = raw.shape[-2:]
+        if height % self.period or width % self.period:
+            raise ValueError(f"{height} x {width} must be multiples of {self.period} to turn {self.name}; crop it")
+        turned, (rows, columns) = turn(raw, view), self.shift_after(view)
+        height, width = turned.shape[-2] - bool(rows) * self.period, turned.shape[-1] - bool(columns) * self.period
+        if height < 1 or width < 1:
+            raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping {self.name}")
+        return turned[..., rows : rows + height, columns : columns + width]
+
+
+def _tent(image: Tensor, period: int) -> Tensor:
+    """``(B, C, H, W)`` through a separable tent that reaches half a cell to each side; 0 beyond the edges."""
+    reach = period // 2
+    for axis in (-2, -1):
+        side = image.shape[axis]
+        padded = F.pad(image, (0, 0, reach, reach) if axis == -2 else (reach, reach))
+        image = padded.narrow(axis, reach, side) * (reach + 1.0)
+        for step in range(1, reach + 1):
+            for start in (reach - step, reach + step):
+                image.add_(padded.narrow(axis, start, side), alpha=reach + 1.0 - step)
+    return image
+
+
+@lru_cache(maxsize=4)
+def _sites(name: str, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """The planes of a pattern, and one over the sum of the tent's weights on them, each ``(1, 3, H, W)``."""
+    known = pattern(name)
+    planes = known.planes(height, width)[None]
+    return planes, 1.0 / _tent(planes, known.period)
+
+
+def _quad(cfa: CFA) -> Pattern:
+    first, second = (2 * cfa.value[k] + 2 * cfa.value[k + 1] for k in (0, 2))
+    return Pattern(f"QUAD-{cfa.value}", (first, first, second, second))
+
+
+_XTRANS = Pattern("XTRANS", ("GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "GRGGBG"))
+
+PATTERNS: dict[str, Pattern] = {
+    **{cfa.value: Pattern(cfa.value, (cfa.value[:2], cfa.value[2:])) for cfa in CFA},
+    **{_quad(cfa).name: _quad(cfa) for cfa in CFA},
+    _XTRANS.name: _XTRANS,
+}
+"""The patterns by name."""
+
+
+def pattern(name: str) -> Pattern:
+    """The pattern of this name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
+
+    Example:
+        >>> pattern("QUAD-RGGB").rows
+        ('RRGG', 'RRGG', 'GGBB', 'GGBB')
+    """
+    if str(name) not in PATTERNS:
+        raise ValueError(f"CFA {name!r} is unknown; use one of {', '.join(PATTERNS)}")
+    return PATTERNS[str(name)]

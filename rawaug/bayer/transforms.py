@@ -1,0 +1,119 @@
+"""Crops, turns and packing of mosaics as modules: `sample` draws, `apply` does it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import get_worker_info
+
+from rawaug.bayer.cfa import CFA, N_VIEWS, crop, pack, turn, turn_keeping_cfa
+
+
+class _Transform(nn.Module, ABC):
+    """A module with an ``apply(raw, params)`` of its own; with a function alone it is still ``nn.Module.apply``.
+
+    Without a generator, as in ``nn.Sequential``, it draws by ``seed``, the worker that it is in and the call's number.
+    """
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.seed, self._calls = seed, 0
+
+    def _own(self, generator: torch.Generator | None) -> torch.Generator:
+        if generator is not None:
+            return generator
+        from rawaug.seeding import keyed_generator, rank_key  # late: what only turns mosaics, denoisers, needs no seeds
+
+        self._calls += 1
+        worker = get_worker_info()
+        return keyed_generator(self.seed, type(self).__name__, worker.seed if worker else 0, self._calls, *rank_key())
+
+    def apply(self, raw: Any, params: Tensor | None = None) -> Any:
+        return super().apply(raw) if params is None else self._apply_params(raw, params)
+
+    @abstractmethod
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor: ...
+
+
+class RandomCrop(_Transform):
+    """A crop ``(..., size, size)`` of mosaics ``(..., H, W)`` at a random even offset: the pattern stays.
+
+    One draw serves all that is in the tensor: noisy and clean, stacked, are cropped alike.
+
+    Args:
+        size: even side, or (height, width), in mosaic pixels, at most those of the mosaics.
+        seed: of its own draws, where no generator is passed.
+
+    Example:
+        >>> crop = RandomCrop(4)
+        >>> raw, generator = torch.rand(2, 1, 8, 12), torch.Generator().manual_seed(0)
+        >>> params = crop.sample(8, 12, generator)
+        >>> crop.apply(raw, params).shape
+        torch.Size([2, 1, 4, 4])
+    """
+
+    def __init__(self, size: int | tuple[int, int], seed: int = 0) -> None:
+        super().__init__(seed)
+        self.size = (size, size) if isinstance(size, int) else size
+        if any(side % 2 or side < 2 for side in self.size):
+            raise ValueError(f"crop must be even and at least 2, got {size}")
+
+    def sample(self, height: int, width: int, generator: torch.Generator) -> Tensor:
+        """``(2,)``: top and left of a crop of a mosaic of ``height`` x ``width``."""
+        rows, columns = self.size
+        if height < rows or width < columns:
+            raise ValueError(f"{height} x {width} is smaller than the crop {rows} x {columns}; choose a smaller crop")
+        free = ((height - rows) // 2 + 1, (width - columns) // 2 + 1)
+        return 2 * torch.stack([torch.randint(n, (), generator=generator) for n in free])
+
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
+        top, left = params.tolist()
+        return crop(raw, top, left, *self.size)
+
+    def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._apply_params(raw, self.sample(raw.shape[-2], raw.shape[-1], self._own(generator)))
+
+
+class RandomTurn(_Transform):
+    """One of the eight flips and quarter turns of mosaics ``(..., H, W)``, the same for all that is in the tensor.
+
+    Args:
+        cfa: pattern of the mosaics.
+        keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turned(view)``.
+        quarter: draw quarter turns too; without them the sides are not exchanged.
+        seed: of its own draws, where no generator is passed.
+
+    Example:
+        >>> turn = RandomTurn("GRBG")
+        >>> turn.apply(torch.rand(1, 1, 8, 12), torch.tensor(2)).shape
+        torch.Size([1, 1, 6, 12])
+    """
+
+    def __init__(self, cfa: CFA | str, keep_cfa: bool = True, quarter: bool = True, seed: int = 0) -> None:
+        super().__init__(seed)
+        self.cfa, self.keep_cfa, self.views = CFA(cfa), keep_cfa, N_VIEWS if quarter else N_VIEWS // 2
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """The view, ``()``."""
+        return torch.randint(self.views, (), generator=generator)
+
+    def _apply_params(self, raw: Tensor, params: Tensor) -> Tensor:
+        view = int(params)
+        return turn_keeping_cfa(raw, self.cfa, view) if self.keep_cfa else turn(raw, view)
+
+    def forward(self, raw: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self._apply_params(raw, self.sample(self._own(generator)))
+
+
+class Pack(nn.Module):
+    """:func:`pack` as a module."""
+
+    def __init__(self, cfa: CFA | str) -> None:
+        super().__init__()
+        self.cfa = CFA(cfa)
+
+    def forward(self, mosaic: Tensor) -> Tensor:
+        return pack(mosaic, self.cfa)
