@@ -16,7 +16,7 @@ from rawaug.bayer.cfa import (
     turn_keeping_cfa,
     unpack,
 )
-from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, demosaic, require_method, stencils_of
+from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, require_method, stencils_of
 from rawaug.bayer.patterns import PATTERNS, Pattern, pattern
 from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
 
@@ -26,6 +26,7 @@ __all__ = [
     "METHODS",
     "N_VIEWS",
     "PATTERNS",
+    "STENCILS",
     "Pack",
     "Pattern",
     "RandomCrop",

@@ -57,7 +57,7 @@ class JointRecipe(Recipe):
         test_noise: of validation and test frames, in place of ``noise``.
         rivals: denoisers of RAW to compare with, as ``rawaug benchmark`` names them, in place of ``classical`` and
             ``untouched``.
-        demosaicing: what each of them is followed by: bilinear, malvar, adams, ahd, or LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
+        demosaicing: what each of them is followed by: bilinear, malvar, or LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
     """
 
     target: ClassVar[Target] = "rgb"
@@ -68,8 +68,8 @@ class JointRecipe(Recipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.demosaicing:
-            if name not in (*bayer.METHODS, *LIBRAW):
-                known = ", ".join((*bayer.METHODS, *LIBRAW))
+            if name not in (*bayer.STENCILS, *LIBRAW):
+                known = ", ".join((*bayer.STENCILS, *LIBRAW))
                 raise ValueError(f"demosaicing {name!r} is unknown; use one of {known}")
         if self.classical or self.untouched:
             raise ValueError("classical and untouched: denoisers to compare with are named in rivals")

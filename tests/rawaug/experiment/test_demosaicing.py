@@ -82,7 +82,7 @@ def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys:
 
 
 def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="demosaicing 'AMAZE' is unknown; use one of bilinear, malvar, adams, ahd, VNG"):
+    with pytest.raises(ValueError, match="demosaicing 'AMAZE' is unknown; use one of bilinear, malvar, VNG"):
         small(tmp_path, demosaicing=["AMAZE"])
     with pytest.raises(ValueError, match=r"classical and untouched: .* are named in rivals"):
         small(tmp_path, classical=["Wavelet"])
