@@ -365,6 +365,7 @@ class DRUNet(Denoiser):
     """
 
     tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2, "blocks": 1}
+    mixed: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ from rawaug.evaluation.scores import counted, denoise, require_classical
 from rawaug.files import sha256
 from rawaug.io import RawFrame
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import find_device
+from rawaug.kernels.runtime import fast_in_bfloat16, find_device
 from rawaug.noise import (
     EldLevels,
     FixedLevels,
@@ -203,7 +203,8 @@ def network_denoiser(weights: str | Path, self_ensemble: bool = False, device: s
     own, views = CFA(info.get("cfa", "RGGB")), 8 if self_ensemble else 1
 
     def run(packed: Tensor, levels: tuple[float, float], cfa: CFA) -> Tensor:
-        return denoise(model, Sample(packed, packed, bayer.noise_variance(packed, *levels)), cfa, views, own)
+        with torch.autocast(where.type, torch.bfloat16, enabled=model.mixed and fast_in_bfloat16(where)):
+            return denoise(model, Sample(packed, packed, bayer.noise_variance(packed, *levels)), cfa, views, own)
 
     settings = {"denoiser_sha256": sha256(path), "self_ensemble": self_ensemble}
     return FrameDenoiser(run, settings, model.reads_variance, model.upscale > 1)

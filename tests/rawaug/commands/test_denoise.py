@@ -169,6 +169,15 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
 
 
+def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, results = gradient(), []
+    for fast in (False, True):
+        monkeypatch.setattr("rawaug.commands.frame_denoisers.fast_in_bfloat16", lambda device, fast=fast: fast)
+        results.append(frame_denoiser("rawaug-base", device="cpu")(frame, (1e-3, 1e-5)))
+    assert results[1].dtype == torch.float32 and not torch.equal(*results)
+    assert (results[0] - results[1]).std() < 0.03 * (results[0] - frame.mosaic).std()
+
+
 def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> None:
     clean = a_scene(CFA.RGGB)
     source = shot(tmp_path / "a.dng", bayer_dng)
