@@ -94,8 +94,11 @@ def _coloured(raw: Tensor, other: Tensor, cfa: CFA) -> Tensor:
     known = raw.new_zeros(len(raw), 2, *raw.shape[-2:])
     for k, (i, j) in enumerate((red, blue)):
         known[:, k, i::2, j::2] = (raw - green)[:, 0, i::2, j::2]
-    tent = raw.new_tensor([[1.0, 2, 1], [2, 4, 2], [1, 2, 1]]).expand(2, 1, 3, 3) / 4
-    spread = green + F.conv2d(F.pad(known, (1, 1, 1, 1), mode="reflect"), tent, groups=2)
+    for axis, ends in ((-2, (0, 0, 1, 1)), (-1, (1, 1, 0, 0))):
+        padded = F.pad(known, ends, mode="reflect")
+        before, after = (padded.narrow(axis, k, known.shape[axis]) for k in (0, 2))
+        known = known + (before + after) / 2
+    spread = green + known
     rgb = torch.stack([spread[:, 0], green[:, 0], spread[:, 1]], dim=1)
     for k, (i, j) in ((0, red), (2, blue)):
         rgb[:, k, i::2, j::2] = raw[:, 0, i::2, j::2]
