@@ -161,7 +161,10 @@ class FastForward(nn.Module):
             return bayer.demosaic(raw, self.cfa, method)
         balance = gains[:3, None, None]
         sites = bayer.mosaic(balance.expand(3, 2, 2), self.cfa).repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
-        return bayer.demosaic((raw * sites).clamp_min(0.0), self.cfa, method) / balance
+        balanced = (raw * sites).clamp_min(0.0)
+        return fastest(
+            "directional", balanced, self.cfa, method, otherwise=lambda: bayer.demosaic(balanced, self.cfa, method)
+        ).div_(balance)
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
         matrix, floor, frame, curves, shading = _batch_params(self.stages, linear, params, place, self.table)

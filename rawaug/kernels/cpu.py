@@ -22,6 +22,7 @@ from numba.np.arrayobj import make_array
 from torch import Tensor
 
 from rawaug.bayer import CFA, stencils_of
+from rawaug.kernels.directions import directional as directional
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
 from rawaug.kernels.runtime import compiled, over_rows, part
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader, Dataset
 
+from rawaug import bayer
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels import runtime
 from rawaug.plugin.augment import RawAugment
@@ -42,6 +43,20 @@ def test_an_error_in_a_thread_is_raised(two_threads: None) -> None:
 
     with pytest.raises(RuntimeError, match="no"):
         runtime.over_rows(8, 10**6, fail)
+
+
+@pytest.mark.skipif(not runtime.has_numba(), reason="without Numba there are no loops")
+@pytest.mark.parametrize("method", bayer.DIRECTIONAL)
+@pytest.mark.parametrize("cfa", list(bayer.CFA))
+def test_choices_of_direction_are_those_of_pytorch(cfa: bayer.CFA, method: str, two_threads: None) -> None:
+    """But near the border, where the loops reflect the mosaic once and PyTorch every step."""
+    from rawaug.kernels.cpu import directional
+
+    raw = torch.rand(2, 1, 200, 700, generator=torch.Generator().manual_seed(0))
+    ours, expected = directional(raw, cfa, method), bayer.demosaic(raw, cfa, method)
+    torch.testing.assert_close(ours[..., 6:-6, 6:-6], expected[..., 6:-6, 6:-6], atol=1e-5, rtol=0)
+    assert torch.equal(bayer.mosaic(ours, cfa), raw)
+    assert directional(raw[..., :4, :4], cfa, method).isfinite().all()
 
 
 class Augmented(Dataset[torch.Tensor]):

@@ -1,0 +1,124 @@
+"""The demosaicings of :mod:`rawaug.bayer.demosaicing` that choose between row and column, as loops for the CPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.bayer import CFA
+from rawaug.kernels.runtime import compiled, over_rows, part
+
+_MARGIN = 6
+"""Green looks 2 sites around, colour 1, steps of colour 1, their count 1; even, so that the pattern stays."""
+_HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
+
+
+def directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
+    """Mosaics ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
+    batch, _, height, width = raw.shape
+    rgb = torch.empty(batch, 3, height, width)
+    ends = ((_MARGIN, _MARGIN), (_MARGIN, _MARGIN))
+    for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):
+        padded = np.pad(mosaic, ends, mode="reflect")
+        settings = (padded, *cfa.sites[0], method == "ahd", out)
+        over_rows(height, width, lambda start, stop, given=settings: _rows(*given, start, stop))  # type: ignore[misc]
+    return rgb
+
+
+@compiled
+def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: ignore[no-untyped-def]
+    """Rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
+    own = mosaic[start : stop + 2 * _MARGIN]
+    rows, width = own.shape
+    first = (start + red_row) % 2  # of the rows with red
+    pictures = np.zeros((2, 3, rows, width), np.float32)  # along rows, along columns
+    for i in range(2, rows - 2):
+        for j in range(2, width - 2):
+            _green(own, i, j, (i + first + j + red_column) % 2 == 1, homogeneous, pictures)
+    directions = 2 if homogeneous else 1
+    for d in range(directions):
+        for i in range(3, rows - 3):
+            _colours(own, i, (i + first) % 2 == 0, red_column, pictures[d])
+    lead = np.zeros((rows, width), np.int8)
+    if homogeneous:
+        _leads(pictures, lead)
+    for i in range(_MARGIN, rows - _MARGIN):
+        for j in range(_MARGIN, width - _MARGIN):
+            total = np.int32(1)
+            if homogeneous:
+                total = np.int32(0)
+                for k in range(-1, 2):
+                    total += lead[i + k, j - 1] + lead[i + k, j] + lead[i + k, j + 1]
+            for c in range(3):
+                row, column = pictures[0, c, i, j], pictures[1, c, i, j]
+                value = row if total > 0 else column if total < 0 else _HALF * (row + column)
+                rgb[c, start + i - _MARGIN, j - _MARGIN] = value
+
+
+@part
+def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-def]
+    """Green of a site in both pictures; without ``homogeneous`` that of the lesser change in the first."""
+    here = own[i, j]
+    if known:
+        pictures[0, 1, i, j] = pictures[1, 1, i, j] = here
+        return
+    left, right, above, below = own[i, j - 1], own[i, j + 1], own[i - 1, j], own[i + 1, j]
+    bend = _TWO * here - own[i, j - 2] - own[i, j + 2]
+    bend_down = _TWO * here - own[i - 2, j] - own[i + 2, j]
+    row, column = (left + right) * _HALF + bend * _QUARTER, (above + below) * _HALF + bend_down * _QUARTER
+    if not homogeneous:
+        change, change_down = abs(left - right) + abs(bend), abs(above - below) + abs(bend_down)
+        if change > change_down:
+            row = column
+        elif change == change_down:
+            row = _HALF * (row + column)
+    pictures[0, 1, i, j], pictures[1, 1, i, j] = row, column
+
+
+@part
+def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-def]
+    """Red and blue of a row: green plus the mean of what the sites of the colour nearby are above green."""
+    green, near, far = picture[1], 0 if with_red else 2, 2 if with_red else 0
+    for j in range(3, own.shape[1] - 3):
+        across = (own[i, j - 1] - green[i, j - 1]) + (own[i, j + 1] - green[i, j + 1])
+        down = (own[i - 1, j] - green[i - 1, j]) + (own[i + 1, j] - green[i + 1, j])
+        if ((j + red_column) % 2 == 0) == with_red:  # a site of the row's colour
+            corners = own[i - 1, j - 1] - green[i - 1, j - 1] + own[i - 1, j + 1] - green[i - 1, j + 1]
+            corners += own[i + 1, j - 1] - green[i + 1, j - 1] + own[i + 1, j + 1] - green[i + 1, j + 1]
+            picture[near, i, j], picture[far, i, j] = own[i, j], green[i, j] + corners * _QUARTER
+        else:
+            picture[near, i, j], picture[far, i, j] = green[i, j] + across * _HALF, green[i, j] + down * _HALF
+
+
+@part
+def _leads(pictures, lead):  # type: ignore[no-untyped-def]
+    """How many more of a site's four neighbours are like it in the first picture than in the second."""
+    rows, width = lead.shape
+    steps = np.zeros((2, 2, 2, rows, width), np.float32)  # picture; to the right, below; of light, of colour
+    for d in range(2):
+        red, green, blue = pictures[d]
+        for down in range(2):
+            for i in range(3, rows - 4):
+                for j in range(3, width - 4):
+                    i2, j2 = i + down, j + 1 - down
+                    light = green[i, j] - green[i2, j2]
+                    warm, cold = red[i, j] - red[i2, j2] - light, blue[i, j] - blue[i2, j2] - light
+                    steps[d, down, 0, i, j], steps[d, down, 1, i, j] = light * light, warm * warm + cold * cold
+    for i in range(4, rows - 4):
+        for j in range(4, width - 4):
+            light = min(
+                max(steps[0, 0, 0, i, j - 1], steps[0, 0, 0, i, j]), max(steps[1, 1, 0, i - 1, j], steps[1, 1, 0, i, j])
+            )
+            colour = min(
+                max(steps[0, 0, 1, i, j - 1], steps[0, 0, 1, i, j]), max(steps[1, 1, 1, i - 1, j], steps[1, 1, 1, i, j])
+            )
+            found = 0
+            for d in range(2):
+                across, down = steps[d, 0], steps[d, 1]
+                number = np.int32((across[0, i, j - 1] <= light) & (across[1, i, j - 1] <= colour))
+                number += (across[0, i, j] <= light) & (across[1, i, j] <= colour)
+                number += (down[0, i - 1, j] <= light) & (down[1, i - 1, j] <= colour)
+                number += (down[0, i, j] <= light) & (down[1, i, j] <= colour)
+                found += number if d == 0 else -number
+            lead[i, j] = found
