@@ -19,18 +19,20 @@ import torch
 from torch import Tensor
 
 from benchmarks.measure import parser
-from rawaug.isp.cameras import published_cameras
-from rawaug.isp.dictionary import DECIBEL, CameraDictionary, nearest_in_hull, psnr
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import tone_tables
-from rawaug.isp.universal import (
+from benchmarks.universal import (
+    DECIBEL,
     camera_points,
     chosen_atoms,
     chosen_gains,
     held,
     inverse_gains_in_any_light,
+    psnr,
     tone_points,
 )
+from rawaug.isp.cameras import published_cameras
+from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.tone import tone_tables
 
 
 def halves(points: Tensor, atoms: int, count: int) -> list[float]:

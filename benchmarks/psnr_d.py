@@ -29,8 +29,7 @@ from rawaug.evaluation.scores import classical_method, score_method
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.universal import of_cameras
+from rawaug.isp.model import DictionaryISP, of_cameras
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.baselines import UPI
 from rawaug.paper.downstream import DownstreamConfig, DownstreamScore, MadeCrops, mean_of, score_on, trained_on

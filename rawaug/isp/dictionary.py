@@ -4,13 +4,6 @@ r"""Dictionaries of camera parameters: atoms, their convex hull, and settings dr
 "Parameter Dictionaries"). Colour atoms act from sRGB to camera; each row of theirs (a column in the paper, where pixels
 are row vectors) has l1 norm 1. The atoms of published cameras have rows of sum 1 instead, negative entries or not.
 
-*The hull.* Two matrices C and C' differ on pictures of second moment :math:`S = E[x x^T]`, x in linear sRGB, by
-
-.. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 ,
-
-a squared distance in the coordinates :math:`C S^{1/2} / \sqrt 3`. The best mixture is the projection on the hull of the
-atoms, found by accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts.
-
 *Sampling.* One draw is a camera in a light, not a colour matrix and gains on their own:
 
 .. math:: y = h(C\,T(x);\, g \, 2^{-e}), \qquad g = \mathrm{wb}(M, L) / \min \mathrm{wb}(M, L),
@@ -50,11 +43,8 @@ EXPOSURE = (-0.5, 1.0)
 these the mean RAW of photographs is 0.136, and 71 % of the cells whose green is clipped have red to spare, as in real
 files; with a ceiling of 1.5 stops 45 %."""
 CAMERAS_MIXED, TONES_MIXED = 2, 3
-DECIBEL = 45.0
-"""A point this near to a hull is held by it."""
 _ROUNDS = 100
 _STEPS = 400
-_CANDIDATES = 24
 
 
 def l1_normalised(matrices: Tensor) -> Tensor:
@@ -203,15 +193,11 @@ def sparse_shares(batch: int, atoms: int, mixed: int, generator: torch.Generator
     return chosen, squares / squares.sum(dim=1, keepdim=True)
 
 
-def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
-    """``(N, 3, 3)`` to points ``(N, 9)`` whose squared distance is the mean squared error on such pictures."""
-    values, vectors = torch.linalg.eigh(moment.double())
-    root = vectors @ torch.diag(values.clamp_min(0.0).sqrt()) @ vectors.T
-    return (matrices.double() @ root / 3**0.5).flatten(1)
-
-
 def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, to ``points`` ``(P, D)``."""
+    """The convex combinations of ``atoms`` ``(..., N, D)``, one hull or several, nearest to ``points`` ``(P, D)``.
+
+    Accelerated projected gradients (Beck and Teboulle, FISTA, 2009) with restarts; returns weights and squared errors.
+    """
     gram, correlation = atoms @ atoms.mT, points @ atoms.mT
     rate = 1.0 / torch.linalg.eigvalsh(gram)[..., -1:, None]
     weights = torch.full_like(correlation, 1.0 / atoms.shape[-2])
@@ -225,35 +211,6 @@ def nearest_in_hull(points: Tensor, atoms: Tensor) -> tuple[Tensor, Tensor]:
         ahead = new + (momentum - 1.0) / later * (new - weights)
         weights, momentum = new, later
     return weights, (weights @ atoms - points).square().sum(dim=-1)
-
-
-def psnr(squared_error: Tensor) -> Tensor:
-    """PSNR in dB, data range 1."""
-    return -10.0 * squared_error.clamp_min(1e-20).log10()
-
-
-def greedy_atoms(points: Tensor, count: int) -> list[int]:
-    """Indices of ``count`` points ``(P, D)`` whose hull reaches as many of all of them as possible."""
-    # The first is the point farthest from the mean. Each next one is, among the 24 farthest from the hull so far, the
-    # one that leaves the least total squared error over the points that the hull does not hold.
-    chosen = [int((points - points.mean(dim=0)).square().sum(dim=1).argmax())]
-    while len(chosen) < min(count, len(points)):
-        errors = nearest_in_hull(points, points[chosen])[1]
-        farthest = errors.topk(min(_CANDIDATES, len(points))).indices.tolist()
-        candidates = [index for index in farthest if index not in chosen]
-        open_ = psnr(errors) < DECIBEL
-        if not open_.any():
-            open_ = torch.ones_like(open_)
-        hulls = points[torch.tensor([[*chosen, new] for new in candidates])]
-        chosen.append(candidates[int(nearest_in_hull(points[open_], hulls)[1].sum(dim=1).argmin())])
-    return chosen
-
-
-def extreme_points(points: Tensor) -> Tensor:
-    """Indices of the points ``(P, D)``, D small, that are corners of the hull of all: only these make it wide."""
-    from scipy.spatial import ConvexHull  # slow to import, and needed by nothing else
-
-    return torch.from_numpy(ConvexHull(points.numpy()).vertices).long().sort().values
 
 
 class CameraSampler:

@@ -9,7 +9,7 @@ Source: Conde et al., "Model-Based Image Signal Processors via Learnable Diction
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,11 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import staged, stages
-from rawaug.isp.cameras import light_range
+from rawaug.isp.cameras import light_range, published_cameras
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
 from rawaug.isp.staged import StagedISP, thumbnail
+from rawaug.registry import spelled
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)
@@ -249,6 +250,27 @@ class DictionaryISP(StagedISP):
             reason = " ".join(str(error).split())
             raise ValueError(f"{path}: its configuration is damaged ({reason}); {_ADVICE}") from error
         return isp.eval()
+
+
+@torch.no_grad()
+def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
+    """The ISP with the published cameras of these names for its atoms: all lights, the same tones."""
+    if not isinstance(isp.colour, CameraDictionary):
+        raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
+    listed = published_cameras()
+    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
+    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
+    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
+    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
+    narrowed.load_state_dict(kept | own)
+    assert isinstance(narrowed.colour, CameraDictionary)
+    narrowed.colour.set_cameras(listed.named(known), torch.eye(len(known)))
+    narrowed.info = {**isp.info, "cameras": known}
+    return narrowed.to(isp.colour.matrices.device).eval()
+
+
+def _of_colour(key: str) -> bool:
+    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
 
 
 def _scene_referred(raw: Tensor) -> Tensor:

@@ -27,8 +27,7 @@ from rawaug.bayer import CFA, pattern
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP, FastForward
-from rawaug.isp.model import DictionaryISP
-from rawaug.isp.universal import of_cameras
+from rawaug.isp.model import DictionaryISP, of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.plugin.params import AugmentParams, RawPair

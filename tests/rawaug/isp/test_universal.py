@@ -1,20 +1,43 @@
-"""The universal ISP as shipped: what its hulls hold, and that tone curves go both ways."""
+"""The universal ISP: how its atoms are chosen, what its hulls hold as shipped, and that tone curves go both ways."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from rawaug.isp.cameras import published_cameras
+from benchmarks.universal import (
+    camera_points,
+    colour_coordinates,
+    greedy_atoms,
+    held,
+    inverse_gains_in_any_light,
+)
+from rawaug.isp.cameras import colour_matrix, published_cameras
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.universal import TONE_AND_CAMERAS, camera_points, held, inverse_gains_in_any_light
-from rawaug.metrics import psnr as image_psnr
+from rawaug.metrics import psnr
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def test_squared_distance_is_the_error_on_pictures() -> None:
+    colours = torch.rand(3, 500, generator=generator()).double() ** 2
+    first, second = colour_matrix(published_cameras().distinct()[[3, 90]])
+    a, b = colour_coordinates(torch.stack([first, second]), colours @ colours.T / 500)
+    error = (first @ colours - second @ colours).square().mean()
+    assert (a - b).square().sum().item() == pytest.approx(error.item(), rel=1e-9)
+
+
+def test_greedy_atoms_of_some_cameras_reach_the_others() -> None:
+    photographs = torch.tensor([[0.130, 0.122, 0.118], [0.122, 0.128, 0.130], [0.118, 0.130, 0.148]])
+    points = colour_coordinates(colour_matrix(published_cameras().distinct()), photographs)
+    seen, unseen = points[0::8], points[4::8]
+    greedy = held(unseen, seen[greedy_atoms(seen, 4)])
+    by_chance = held(unseen, seen[torch.randperm(len(seen), generator=generator())[:4]])
+    assert greedy > max(0.65, by_chance + 0.4)
 
 
 @pytest.mark.parametrize(("name", "least"), [("universal", 0.97), ("universal-small", 0.9)])
@@ -41,12 +64,12 @@ def test_readings_find_tone_and_camera_as_well(universal: DictionaryISP) -> None
     value = raw[0, 0, place[0, :, 0], place[0, :, 1]]
     given = torch.cat([place.float(), value[None, :, None]], dim=2)
     known, blind = universal.reverse(srgb, raw_samples=given).raw, universal.reverse(srgb).raw
-    assert image_psnr(known, raw) > image_psnr(blind, raw) + 15
-    assert image_psnr(known, raw) > 42
+    assert psnr(known, raw) > psnr(blind, raw) + 15
+    assert psnr(known, raw) > 42
 
 
 def test_a_curve_stands_in_place_of_tone_and_gamma() -> None:
     with pytest.raises(ValueError, match="replaces tone and gamma"):
         DictionaryISP(ISPConfig(stages=("tone", "curve"), tone_atoms=2))
     with pytest.raises(ValueError, match="with the stage curve"):
-        ISPConfig(stages=TONE_AND_CAMERAS)
+        ISPConfig(stages=("curve", "colour", "gains"))

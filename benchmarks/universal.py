@@ -1,42 +1,40 @@
-"""The universal ISP, from published figures alone: ``python -m rawaug.isp.universal --out universal.safetensors``.
+r"""The universal ISP, from published figures alone: ``python -m benchmarks.universal --out universal.safetensors``.
 
-Colour atoms are chosen greedily among the published cameras (:mod:`rawaug.isp.dictionary`), so that their hull holds
-as many of all of them as it can on the colours of the package's photographs. Tone atoms are the published curves, or
-as many of them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a
-picture's setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and
-light.
+Colour atoms are chosen greedily among the published cameras, so that their hull holds as many of all of them as it can
+on the colours of the package's photographs. Two matrices C and C' differ on pictures of second moment
+:math:`S = E[x x^T]`, x in linear sRGB, by
+
+.. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 ,
+
+a squared distance in the coordinates :math:`C S^{1/2} / \sqrt 3`. Tone atoms are the published curves, or as many of
+them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a picture's
+setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and light.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import (
-    DECIBEL,
-    CameraDictionary,
-    colour_coordinates,
-    extreme_points,
-    greedy_atoms,
-    nearest_in_hull,
-    plausible,
-    psnr,
-)
+from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull, plausible
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import STEPS, tone_tables
-from rawaug.registry import spelled
 from rawaug.seeding import keyed_generator
 
 COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 0.0503))
 """Second moment of linear sRGB: mean of the six photographs of :mod:`rawaug.data.demo`, every fourth row and column."""
 LIGHTS = 4000
 """Draws of camera and light that the gain atoms are chosen for: of 400, the corners of the hull are too few."""
+DECIBEL = 45.0
+"""A point this near to a hull is held by it."""
+CANDIDATES = 24
+"""Points farthest from the hull so far that are tried as its next atom."""
 TONE_AND_CAMERAS = ("curve", "colour", "gains")
 
 
@@ -88,26 +86,16 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
     return isp.eval()
 
 
-@torch.no_grad()
-def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
-    """The ISP with the published cameras of these names for its atoms: all lights, the same tones."""
-    if not isinstance(isp.colour, CameraDictionary):
-        raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
-    listed = published_cameras()
-    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
-    narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
-    kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
-    own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
-    narrowed.load_state_dict(kept | own)
-    assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.named(known), torch.eye(len(known)))
-    narrowed.info = {**isp.info, "cameras": known}
-    return narrowed.to(isp.colour.matrices.device).eval()
-
-
 def camera_points(xyz_to_camera: Tensor) -> Tensor:
     """Cameras as points ``(N, 9)`` whose squared distance is the error of their colour on photographs."""
     return colour_coordinates(colour_matrix(xyz_to_camera), torch.tensor(COLOURS))
+
+
+def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
+    """``(N, 3, 3)`` to points ``(N, 9)`` whose squared distance is the mean squared error on such pictures."""
+    values, vectors = torch.linalg.eigh(moment.double())
+    root = vectors @ torch.diag(values.clamp_min(0.0).sqrt()) @ vectors.T
+    return (matrices.double() @ root / 3**0.5).flatten(1)
 
 
 def tone_points(tables: Tensor) -> Tensor:
@@ -139,13 +127,36 @@ def chosen_gains(inverse: Tensor, count: int) -> Choice:
     return Choice(chosen.tolist(), nearest_in_hull(points.mean(dim=0, keepdim=True), points[chosen])[0][0].float())
 
 
+def psnr(squared_error: Tensor) -> Tensor:
+    """PSNR in dB, data range 1."""
+    return -10.0 * squared_error.clamp_min(1e-20).log10()
+
+
+def greedy_atoms(points: Tensor, count: int) -> list[int]:
+    """Indices of ``count`` points ``(P, D)`` whose hull reaches as many of all of them as possible."""
+    # The first is the point farthest from the mean. Each next one is, among the farthest from the hull so far, the one
+    # that leaves the least total squared error over the points that the hull does not hold.
+    chosen = [int((points - points.mean(dim=0)).square().sum(dim=1).argmax())]
+    while len(chosen) < min(count, len(points)):
+        errors = nearest_in_hull(points, points[chosen])[1]
+        farthest = errors.topk(min(CANDIDATES, len(points))).indices.tolist()
+        candidates = [index for index in farthest if index not in chosen]
+        open_ = psnr(errors) < DECIBEL
+        if not open_.any():
+            open_ = torch.ones_like(open_)
+        hulls = points[torch.tensor([[*chosen, new] for new in candidates])]
+        chosen.append(candidates[int(nearest_in_hull(points[open_], hulls)[1].sum(dim=1).argmin())])
+    return chosen
+
+
+def extreme_points(points: Tensor) -> Tensor:
+    """Indices of the points ``(P, D)``, D small, that are corners of the hull of all: only these make it wide."""
+    return torch.from_numpy(ConvexHull(points.numpy()).vertices).long().sort().values
+
+
 def held(points: Tensor, atoms: Tensor) -> float:
     """Share of ``points`` within 45 dB of the hull of ``atoms``, to four digits."""
     return round((psnr(nearest_in_hull(points, atoms)[1]) >= DECIBEL).double().mean().item(), 4)
-
-
-def _of_colour(key: str) -> bool:
-    return key.startswith("colour.") or ("_encoders." in key and ".gain.prior" not in key)
 
 
 def _name_of(matrix: Tensor, names: Sequence[str], matrices: Tensor) -> str:
