@@ -75,12 +75,10 @@ class NoisePoints:
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """The fitted line, its standard errors, R^2 over the used points, and these; ``read_var`` 0 if unmeasurable."""
+    """The fitted line, R^2 over the used points, and all points; ``read_var`` 0 if unmeasurable."""
 
     shot_var: float
     read_var: float
-    shot_var_error: float
-    read_var_error: float
     r2: float
     points: NoisePoints
 
@@ -127,12 +125,12 @@ def estimate_noise(
     levels = _split_levels(_Blocks(*map(torch.cat, zip(*measured, strict=True))))
     points = _start(levels)
     for _ in range(_ROUNDS):
-        shot, read = _fit(points, read_var)[0]
+        shot, read, _ = _fit(points, read_var)
         points = _points(levels, shot, read)
-    (shot, read), errors, points = _fit(points, read_var)
+    shot, read, points = _fit(points, read_var)
     x, y = points.signal[points.used], points.variance[points.used]
     r2 = float(1 - (y - shot * x - read).square().sum() / (y - y.mean()).square().sum())
-    return NoiseEstimate(shot, read, *errors, r2, points)
+    return NoiseEstimate(shot, read, r2, points)
 
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
@@ -216,10 +214,8 @@ def _gather(levels: list[tuple[_Blocks, Tensor]]) -> NoisePoints:
     )
 
 
-def _fit(
-    points: NoisePoints, known_read_var: float | None
-) -> tuple[tuple[float, float], tuple[float, float], NoisePoints]:
-    """Robust weighted least squares: ((shot, read), their standard errors, the points with outliers unused)."""
+def _fit(points: NoisePoints, known_read_var: float | None) -> tuple[float, float, NoisePoints]:
+    """Robust weighted least squares: shot, read, and the points with outliers unused."""
     used = points.used
     x, y, n = points.signal, points.variance, points.blocks.double()
     if int(used.sum()) < _MIN_POINTS or x[used].max() < 1.5 * x[used].min().clamp(min=1e-6):
@@ -229,26 +225,24 @@ def _fit(
     variance, trust = y, used
     for _ in range(_ROUNDS):
         weight = trust * n / variance.square()
-        shot, read, shot_error, read_error = _line(x, y, weight, known_read_var)
+        shot, read = _line(x, y, weight, known_read_var)
         variance = (shot * x.clamp(min=0) + read).clamp(min=1e-12)
         residual = y / variance - 1
         scale = max(1.4826 * float(residual[used].abs().median()), 0.02)
         trust = used & (residual.abs() < 4 * scale)
-    points = replace(points, used=trust)
-    sd = scale * math.sqrt(float(n[points.used].mean()))
-    return (shot, read), (shot_error * sd, read_error * sd), points
+    return shot, read, replace(points, used=trust)
 
 
-def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) -> tuple[float, float, float, float]:
-    """Weighted least squares: slope, intercept and their standard errors for weights 1 / variance."""
+def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) -> tuple[float, float]:
+    """Weighted least squares: slope, and intercept unless it is known; an intercept below 0 is 0."""
     w, wx, wxx = (float((weight * t).sum()) for t in (torch.ones_like(x), x, x * x))
     wy, wxy = float((weight * y).sum()), float((weight * x * y).sum())
     determinant = w * wxx - wx * wx
     read = (wxx * wy - wx * wxy) / determinant if known_read_var is None else known_read_var
     if known_read_var is None and read >= 0:
-        return (w * wxy - wx * wy) / determinant, read, (w / determinant) ** 0.5, (wxx / determinant) ** 0.5
+        return (w * wxy - wx * wy) / determinant, read
     read = max(read, 0.0)
-    return (wxy - read * wx) / wxx, read, wxx**-0.5, 0.0
+    return (wxy - read * wx) / wxx, read
 
 
 def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:

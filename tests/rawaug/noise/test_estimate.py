@@ -71,16 +71,6 @@ def test_textured_and_clipped_frames_give_both_levels_within_5_percent(shot: flo
     assert estimate.r2 > 0.98
 
 
-def test_errors_are_of_the_right_size() -> None:
-    """On frames without texture the standard errors are those of the estimates, within a factor of 2."""
-    frames = [shoot(scene(seed, 512, texture=0.0), 1e-3, 1e-5, seed) for seed in range(12)]
-    estimates = [estimate_noise(frame, "GRBG") for frame in frames]
-    shot_error = np.sqrt(np.mean([(e.shot_var - 1e-3) ** 2 for e in estimates]))
-    read_error = np.sqrt(np.mean([(e.read_var - 1e-5 - ROUNDING) ** 2 for e in estimates]))
-    assert 0.5 < shot_error / np.mean([e.shot_var_error for e in estimates]) < 2
-    assert 0.5 < read_error / np.mean([e.read_var_error for e in estimates]) < 2
-
-
 def test_banding_and_defects_do_not_count() -> None:
     estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0, row_var=5e-6, dead=5e-4, hot=5e-4), "GRBG")
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
@@ -125,7 +115,7 @@ def test_known_read_noise_is_kept() -> None:
     read_var = from_dark_frames(dark, "GRBG").read_var
     assert read_var == pytest.approx(1e-5 + ROUNDING, rel=0.02)
     estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0), "GRBG", read_var=read_var)
-    assert estimate.read_var == read_var and estimate.read_var_error == 0
+    assert estimate.read_var == read_var
     assert estimate.shot_var == pytest.approx(1e-3, rel=0.05)
 
 
