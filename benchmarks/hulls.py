@@ -24,15 +24,16 @@ from benchmarks.universal import (
     camera_points,
     chosen_atoms,
     chosen_gains,
+    distinct_cameras,
     held,
     inverse_gains_in_any_light,
     psnr,
     tone_points,
+    tone_tables,
 )
 from rawaug.isp.cameras import published_cameras
 from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import tone_tables
 
 
 def halves(points: Tensor, atoms: int, count: int) -> list[float]:
@@ -85,7 +86,7 @@ def draw(path: Path) -> None:
         )
     by_camera.set(xlim=(35, 70), xlabel="PSNR of linear colour (dB)", ylabel=f"% of {len(cameras)} cameras above it")
     atoms = 1.0 / DictionaryISP.from_pretrained("universal").gain.channel_gains().double()
-    inverse = inverse_gains_in_any_light(published_cameras().distinct(), "figure", 400)
+    inverse = inverse_gains_in_any_light(distinct_cameras(), "figure", 400)
     kept = psnr(nearest_in_hull(inverse / 3**0.5, atoms / 3**0.5)[1]) >= DECIBEL
     for points, style, label in (
         (1.0 / inverse[kept], "o", f"{int(kept.sum())} draws held"),
@@ -122,7 +123,7 @@ def main() -> None:
         return
     for name, value in left_out_tones().items():
         print(f"tone {name}: {value:.1f} dB under the others")
-    cameras = published_cameras().distinct()
+    cameras = distinct_cameras()
     points = camera_points(cameras)
     print(f"{len(points)} distinct matrices, {options.atoms} atoms", flush=True)
     for seed, share in enumerate(halves(points, options.atoms, options.halves)):

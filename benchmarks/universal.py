@@ -7,16 +7,24 @@ on the colours of the package's photographs. Two matrices C and C' differ on pic
 .. math:: \mathrm{MSE} = \tfrac{1}{3} \| (C - C') S^{1/2} \|_F^2 ,
 
 a squared distance in the coordinates :math:`C S^{1/2} / \sqrt 3`. Tone atoms are the published curves, or as many of
-them as are asked for, chosen likewise on the grey levels of a picture. Gain atoms, which only a guess of a picture's
-setting needs, hold the gains of all cameras in all lights; when augmenting, gains follow from camera and light.
+them as are asked for, chosen likewise on the grey levels of a picture. These are monotone cubics (Fritsch and Carlson,
+1980) through the points of darktable's base curves, measured against cameras' JPEGs or drawn after a maker's; besides
+them ``linear``, LibRaw's rendering, which has no curve, and ``upi``, the smoothstep and gamma 2.2 of Brooks et al.
+(CVPR 2019). Gain atoms, which only a guess of a picture's setting needs, hold the gains of all cameras in all lights;
+when augmenting, gains follow from camera and light.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.interpolate import PchipInterpolator
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
@@ -24,9 +32,10 @@ from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, 
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull, plausible
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.tone import STEPS, tone_tables
+from rawaug.isp.tone import NODES, STEPS, inverse_smoothstep, srgb_to_linear
 from rawaug.seeding import keyed_generator
 
+CURVES = Path(__file__).with_name("tone_curves.json")
 COLOURS = ((0.1469, 0.0839, 0.0661), (0.0839, 0.0620, 0.0536), (0.0661, 0.0536, 0.0503))
 """Second moment of linear sRGB: mean of the six photographs of :mod:`rawaug.data.demo`, every fourth row and column."""
 LIGHTS = 4000
@@ -48,7 +57,7 @@ class Choice(NamedTuple):
 def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_atoms: int = 16) -> DictionaryISP:
     """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB."""
     cameras, names, tables = published_cameras(), list(tone_tables()), torch.stack(list(tone_tables().values()))
-    distinct = cameras.distinct()
+    distinct = distinct_cameras()
     points = camera_points(distinct)
     colour = chosen_atoms(points, colour_atoms)
     tone = chosen_atoms(tone_points(tables), len(names) if tone_atoms is None else tone_atoms)
@@ -84,6 +93,33 @@ def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_at
         },
     }
     return isp.eval()
+
+
+@cache
+def tone_tables() -> dict[str, Tensor]:
+    """The published curves by name: tables ``(1021,)`` float32 from 0 to 1, not decreasing."""
+    code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
+    display = srgb_to_linear(code)
+    tables = {"linear": display.float(), "upi": inverse_smoothstep(code).clamp_min(0.0).pow(2.2).float()}
+    for name, points in json.loads(CURVES.read_text("utf-8"))["curves"].items():
+        tables[name] = _inverse(points, display).float()
+    return tables
+
+
+def _inverse(points: Sequence[Sequence[float]], display: Tensor) -> Tensor:
+    """Camera light ``(N,)`` at which the monotone cubic through ``points`` (camera, display) reaches ``display``."""
+    camera, shown = np.array(points).T
+    shown[0] = 0.0  # a measured curve may start at an offset
+    light = np.linspace(0.0, 1.0, 2**16) ** 2  # dense near black
+    reached = np.maximum.accumulate(PchipInterpolator(camera, shown)(light))
+    reached = reached / reached[-1]
+    rising = np.concatenate([[True], np.diff(reached) > 0])
+    return torch.from_numpy(np.interp(display.numpy(), reached[rising], light[rising]))
+
+
+def distinct_cameras() -> Tensor:
+    """The different matrices among the published ones ``(M, 3, 3)``: bodies that share a sensor often share theirs."""
+    return torch.unique(published_cameras().xyz_to_camera, dim=0)
 
 
 def camera_points(xyz_to_camera: Tensor) -> Tensor:

@@ -54,10 +54,6 @@ class CameraMatrices(NamedTuple):
     names: tuple[str, ...]
     xyz_to_camera: Tensor
 
-    def distinct(self) -> Tensor:
-        """The different ones among the matrices ``(M, 3, 3)``: bodies that share a sensor often share a matrix."""
-        return torch.unique(self.xyz_to_camera, dim=0)
-
     def named(self, names: Sequence[str]) -> Tensor:
         """The matrices ``(len(names), 3, 3)`` of these cameras, whatever the case of the letters."""
         return self.xyz_to_camera[[self.names.index(spelled(name, self.names)) for name in names]]

@@ -6,9 +6,7 @@ is kept as a table over the sRGB code s,
 .. math:: T(s) = t^{-1}(\mathrm{EOTF}(s)), \qquad s = 0, \tfrac{1}{4 \cdot 255}, \dots, 1,
 
 of which every fourth entry is an 8-bit code, without interpolation (EOTF: IEC 61966-2-1). A convex combination of
-tables is monotone as they are. The curves t are monotone cubics (Fritsch and Carlson, 1980) through the points of
-darktable's base curves, measured against cameras' JPEGs or drawn after a maker's; besides them ``linear``, LibRaw's
-rendering, which has no curve, and ``upi``, the smoothstep and gamma 2.2 of Brooks et al. (CVPR 2019).
+tables is monotone as they are.
 
 The stage :class:`ToneCurve` is ``x2 = T(x)`` with ``T = sum_k v_k T_k``, in place of the paper's tone network and
 gamma. The forward pass looks the code up on the same curve; where the curve is flat, the lowest code is taken. A fit
@@ -19,12 +17,8 @@ bends a standard's curve :math:`T_0` by scaling its slope on each of 51 pieces o
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
-from functools import cache
-from importlib import resources
+from collections.abc import Iterator
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -38,7 +32,6 @@ STEPS = 4
 NODES = 255 * STEPS + 1
 PIECES = 51
 """Pieces of a curve whose slopes a fit scales."""
-_FINE = 2**16
 
 
 def srgb_to_linear(code: Tensor) -> Tensor:
@@ -63,31 +56,6 @@ def to_code(linear: Tensor, tables: Tensor) -> Tensor:
     low, high = tables.gather(1, right - 1), tables.gather(1, right)
     share = ((light - low) / (high - low).clamp_min(1e-12)).clamp(0.0, 1.0)
     return ((right - 1 + share) / (NODES - 1)).reshape(linear.shape)
-
-
-@cache
-def tone_tables() -> dict[str, Tensor]:
-    """The published curves by name: tables ``(1021,)`` float32 from 0 to 1, not decreasing."""
-    code = torch.linspace(0.0, 1.0, NODES, dtype=torch.float64)
-    display = srgb_to_linear(code)
-    tables = {"linear": display.float(), "upi": inverse_smoothstep(code).clamp_min(0.0).pow(2.2).float()}
-    text = resources.files("rawaug.isp").joinpath("facts/tone_curves.json").read_text("utf-8")
-    for name, points in json.loads(text)["curves"].items():
-        tables[name] = _inverse(points, display).float()
-    return tables
-
-
-def _inverse(points: Sequence[Sequence[float]], display: Tensor) -> Tensor:
-    """Camera light ``(N,)`` at which the monotone cubic through ``points`` (camera, display) reaches ``display``."""
-    from scipy.interpolate import PchipInterpolator  # slow to import, and needed by nothing else
-
-    camera, shown = np.array(points).T
-    shown[0] = 0.0  # a measured curve may start at an offset
-    light = np.linspace(0.0, 1.0, _FINE) ** 2  # dense near black
-    reached = np.maximum.accumulate(PchipInterpolator(camera, shown)(light))
-    reached = reached / reached[-1]
-    rising = np.concatenate([[True], np.diff(reached) > 0])
-    return torch.from_numpy(np.interp(display.numpy(), reached[rising], light[rising]))
 
 
 class ToneDictionary(nn.Module):

@@ -1,46 +1,16 @@
-"""Inverse tone curves: monotone from black to white, true to their points, exact on 8 bits."""
+"""Inverse tone curves: there and back, and mixtures of them."""
 
 from __future__ import annotations
 
-import json
-from importlib import resources
-
-import pytest
 import torch
 
-from rawaug.isp.tone import NODES, STEPS, ToneDictionary, srgb_to_linear, to_code, to_linear, tone_tables
+from rawaug.isp.model import DictionaryISP
+from rawaug.isp.tone import ToneDictionary, to_code, to_linear
 
 
-def tables_of(*names: str) -> torch.Tensor:
-    return torch.stack([tone_tables()[name] for name in names or tone_tables()])
-
-
-def test_curves_rise_from_black_to_white() -> None:
-    tables = tables_of()
-    assert tables.shape == (27, NODES)
-    assert (tables.diff(dim=1) >= 0).all()
-    assert (tables[:, 0].abs() < 1e-6).all() and torch.allclose(tables[:, -1], torch.ones(len(tables)))
-
-
-def test_every_inverse_passes_through_the_measured_points() -> None:
-    curves = json.loads(resources.files("rawaug.isp").joinpath("facts/tone_curves.json").read_text())["curves"]
-    display = srgb_to_linear(torch.linspace(0, 1, NODES, dtype=torch.float64))
-    for name, points in curves.items():
-        table = tone_tables()[name].double()
-        for light, shown in points[1:]:
-            right = int(torch.searchsorted(display, shown).clamp(1, NODES - 1))
-            assert table[right - 1] - 1e-6 <= light <= table[right] + 1e-6, name
-
-
-def test_cameras_lift_the_middle_where_the_linear_rendering_does_not() -> None:
-    middle = tables_of()[:, 118 * STEPS]
-    linear = tone_tables()["linear"][118 * STEPS]
-    assert linear.item() == pytest.approx(0.1812, abs=1e-4)  # sRGB's definition at 118 / 255
-    assert (torch.log2(linear / middle[2:]) > 0.25).all()
-
-
-def test_curves_go_both_ways() -> None:
-    tables = tables_of()
+def test_curves_go_both_ways(universal: DictionaryISP) -> None:
+    assert universal.tone is not None
+    tables = universal.tone.curves
     code = torch.rand(len(tables), 3, 8, 8, generator=torch.Generator().manual_seed(0))
     there = to_linear(code, tables)
     torch.testing.assert_close(to_linear(to_code(there, tables), tables), there, atol=1e-5, rtol=0)
