@@ -1,41 +1,14 @@
-r"""Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich, RawBench, and the package's own.
+"""Published sets of RAW files or crops: MIT-Adobe FiveK, RAWIR, RGB2RAW, Zurich, RawBench, and the package's own.
 
-*FiveK* (Canon EOS 5D and Nikon D700, split as for InvISP): each DNG is developed by LibRaw with the camera's white
-balance and without automatic brightness. ``fivek.json`` beside this file lists the numbers of the splits: 650 and 127
-frames of the Canon, 414 and 73 of the Nikon. InvISP's pictures (``invisp_canon:``, ``invisp_nikon:``) differ: LibRaw
-scales each frame by its own maximum (``adjust_maximum_thr`` 0.75, its default), and they are JPEGs of quality 90.
-Source: V. Bychkovsky, S. Paris, E. Chan, F. Durand, "Learning photographic global tonal adjustment with a database of
-input/output image pairs", CVPR 2011; Y. Xing, Z. Qian, Q. Chen, "Invertible image signal processing", CVPR 2021.
+docs/datasets.md describes them, with their sources and licences. What is assumed besides:
 
-*RAWIR* and AIM 2022 Reversed ISP: ``.npy`` files of uint16 ``(h, w, 4)`` in the order R, G of the red row, G of the
-blue row, B, taken to be black-subtracted, with the phone's picture ``(2h, 2w)`` of the same stem. White is 2^10 where
-it is a JPEG (AIM 2022: Samsung S7, Huawei P20), 2^12 - 1 where it is a PNG (RAWIR, NTIRE 2024 and 2025). An ``.npz``
-holds the same array as ``raw`` and its white level as ``max_val``. White balance and colour matrix come as pickles,
-which are not opened: gains are 1 and the matrix is the identity. The P20's pictures are cropped and zoomed against
-their RAW: they are not registered. Source: M. V. Conde et al., "Reversed image signal processing and RAW
-reconstruction", ECCV workshops 2022, and the pages of both datasets.
-
-*RGB2RAW* (NTIRE 2025): the same for crops of three phones, ``PHONE/RAWID_CROP.npy``. Only the training pairs are
-public, so the splits are this package's own: of each folder's RAW files in the order of their names every tenth is for
-the test and the one after it for validation, with all of its crops. Source:
-<https://huggingface.co/datasets/marcosv/rgb2raw>.
-
-*Zurich RAW to RGB*: RAW of a Huawei P20, RGGB, ``SPLIT/huawei_raw/0.png``, 16 bits with 10 of them used, and the same
-scene by a Canon 5D Mark IV, ``SPLIT/canon/0.jpg``, from another place: the pairs are not registered, and no camera's
-ISP leads from one to the other. There is no white balance. Source: A. Ignatov, L. Van Gool, R. Timofte, "Replacing
-mobile camera ISP with a single deep learning model", CVPR workshops 2020, whose loader divides by 1020 and leaves black
-in; the black level is that of Z. Zhang et al., "Learning RAW-to-sRGB mappings with inaccurately aligned supervision",
-ICCV 2021.
-
-*RawBench*: 15 scenes at ISO 200 to 51,200 with shots at ISO 100, CC BY-SA 4.0. Source:
-<https://huggingface.co/datasets/AyedaOk/rawbench-dataset>.
-
-``real:`` has nine frames of three cameras: references, and a fit's first material. They are photographs of colour
-charts, a printed strip and a product's box by a Canon PowerShot S40 and G2 and a GoPro HERO7, binned 4 x 4 by colour
-site (``python -m benchmarks.real_frames`` makes them). ``train`` has three scenes of the S40, ``validation`` the G2,
-``test`` two other scenes of the S40 and the HERO7: no scene of a camera is in two splits. There is no noisy frame, so
-that noise is added; the picture of a pair is a plain development, without the camera's tone curve.
-``real_frames/LICENCE.md`` names source and licence (CC0).
+- *FiveK*: ``fivek.json`` beside this file lists the numbers of the splits, those of InvISP.
+- *RAWIR*, AIM 2022 and *RGB2RAW*: planes are R, G of the red row, G of the blue row, B, taken to be black-subtracted.
+  White is 2^10 where the picture is a JPEG (AIM 2022), 2^12 - 1 where it is a PNG, ``max_val`` of an ``.npz``. White
+  balance and colour matrix come as pickles, which are not opened: gains are 1 and the matrix is the identity.
+- *Zurich*: its loader divides by 1020 and leaves black in; the black level is that of Z. Zhang et al., "Learning
+  RAW-to-sRGB mappings with inaccurately aligned supervision", ICCV 2021.
+- ``real:``: ``real_frames/LICENCE.md`` names source and licence (CC0).
 """
 
 from __future__ import annotations

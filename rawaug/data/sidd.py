@@ -1,25 +1,14 @@
 """SIDD: full frames of five phones, noisy and clean, with their pictures; blocks of 256 x 256; and the blocks of SIDD+.
 
-*Frames.* A scene instance is a folder named ``INSTANCE_SCENE_PHONE_ISO_SHUTTER_KELVIN_BRIGHTNESS``. RAW frames are
-MATLAB files of version 7.3 with the mosaic ``x``, white 1, black-subtracted and, by their makers, clipped at black;
-METADATA are of version 5 and hold the DNG's tags. Pictures are PNGs turned upright, the mosaics are not. The pattern
-goes by phone (the dataset's ``bayer_patterns.csv``). The S6's is GRBG; it looks like GBRG to those who read the files
-of version 7.3 without exchanging the axes.
-
-*Blocks.* ``ValidationNoisyBlocksRaw.mat`` and ``ValidationGtBlocksRaw.mat`` hold an array of the same name, (40 scene
-instances, 32 blocks, rows, columns), black at 0, white at 1, whose patterns go by the phone of :data:`HELD_BACK`. SIDD+
-(NTIRE 2020) holds (1024, rows, columns), 32 blocks a frame, with the pattern of each frame in a line of
-``siddplus_*bayer_patterns.csv``.
-
-Pictures of blocks are read from ``ValidationGtBlocksSrgb.mat`` and ``ValidationNoisyBlocksSrgb.mat`` (SIDD+:
-``siddplus_valid_gt_srgb.mat``), uint8 (scene instances, blocks, rows, columns, RGB), where these are below the same
-folder. These files do not say how they were turned upright: of the eight turns, a frame's blocks take the one in which
-their green agrees best with the green of the mosaics. Gains and colour matrix are those of METADATA files. Where there
-is neither, the gains are 1, the matrix is the identity, the picture shows camera colour, and the pair says so
-(``rendered`` is False): it can test a denoiser, but no ISP.
+docs/datasets.md shows the files. RAW frames and blocks have white at 1, are black-subtracted and, by their makers,
+clipped at black; METADATA hold the DNG's tags. The pattern goes by phone (the dataset's ``bayer_patterns.csv``), that
+of a block by the phone of its scene instance in :data:`HELD_BACK`. Pictures of frames are upright and turned back by
+METADATA; those of blocks do not say how they were turned: a frame's blocks take that of the eight turns in which their
+green agrees best with the green of the mosaics. Blocks without pictures and METADATA have gains of 1 and show camera
+colour (``rendered`` is False): they can test a denoiser, but no ISP.
 
 Source: A. Abdelhamed, S. Lin, M. S. Brown, "A high-quality denoising dataset for smartphone cameras", CVPR 2018, and
-the dataset's ``noise_level_functions.csv``.
+the dataset's ``noise_level_functions.csv``; SIDD+: NTIRE 2020.
 """
 
 from __future__ import annotations

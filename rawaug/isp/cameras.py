@@ -42,11 +42,6 @@ SRGB_TO_XYZ = torch.tensor(
 """Linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
 XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)
 
-DAYLIGHT_GAINS = (0.6, 4.0)
-"""Red and blue gains under D65 of a plausible camera."""
-LARGEST_ENTRY = 2.0
-"""Of C, in absolute value, of a plausible camera."""
-
 
 class CameraMatrices(NamedTuple):
     """Matrices from CIE XYZ to camera RGB, each scaled to a green response of 1 to D65."""
@@ -61,26 +56,13 @@ class CameraMatrices(NamedTuple):
 
 @cache
 def published_cameras() -> CameraMatrices:
-    """The plausible cameras of the package's table; where two sources name one camera LibRaw's comes first."""
+    """The cameras of the package's table; where two sources name one camera LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
     rows = [line.split("\t") for line in text.splitlines()[2:]]
     matrices = torch.tensor([[float(value) for value in row[2:11]] for row in rows], dtype=torch.float64)
     matrices = matrices.reshape(-1, 3, 3) / 1e4
-    gains = white_balance(matrices, white_point(D65))[:, 0::2]
-    believed = (
-        torch.tensor([row[12] == "" for row in rows])  # three colours
-        & (torch.linalg.det(matrices).abs() >= 1e-3)
-        & (responses(matrices, white_point(D65)) > 0).all(dim=1)
-        & ((gains >= DAYLIGHT_GAINS[0]) & (gains <= DAYLIGHT_GAINS[1])).all(dim=1)
-        & (colour_matrix(matrices).abs().amax(dim=(1, 2)) <= LARGEST_ENTRY)
-    )
-    names = tuple(f"{row[0]} {row[1]}" for row, kept in zip(rows, believed.tolist(), strict=True) if kept)
-    return CameraMatrices(names, normalised(matrices[believed]))
-
-
-def normalised(xyz_to_camera: Tensor) -> Tensor:
-    """Matrices ``(..., 3, 3)`` scaled to a green response of 1 to D65, so that they may be averaged."""
-    return xyz_to_camera / responses(xyz_to_camera, white_point(D65))[..., 1, None, None]
+    green = responses(matrices, white_point(D65))[:, 1, None, None]
+    return CameraMatrices(tuple(f"{maker} {model}" for maker, model, *_ in rows), matrices / green)
 
 
 def colour_matrix(xyz_to_camera: Tensor) -> Tensor:
