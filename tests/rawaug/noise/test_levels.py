@@ -1,4 +1,4 @@
-"""Published levels: what is sampled against the laws as published."""
+"""Levels: what is sampled against the laws as published, cameras' profiles, and noise at a stated PSNR."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import pytest
 import torch
 from scipy import stats
 
+from rawaug.metrics import psnr
 from rawaug.noise import (
+    CalibratedNoise,
     EldLevels,
     EldNoise,
     FixedLevels,
@@ -23,7 +25,9 @@ from rawaug.noise import (
     noise_model,
     noise_names,
 )
+from rawaug.noise.cameras import READ_ON_MOSAIC, SHOT_ON_MOSAIC, ProfileLevels, published_profiles
 from rawaug.noise.levels import MixedLevels
+from rawaug.noise.models import NoiseModel
 
 N = 20_000
 LAWS = {  # name: base of the logarithm, shot range, slope, intercept, sigma
@@ -172,3 +176,126 @@ def test_a_mixture_draws_each_picture_s_levels_from_one_of_its_laws_all_alike() 
     assert torch.equal(again[0], shot) and torch.equal(again[1], read)
     with pytest.raises(ValueError, match="at least one law"):
         MixedLevels([])
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize(("iso", "shot", "read"), [(100, 1.392e-06, 7.017e-11), (6400, 5.747e-05, 1.727e-07)])
+def test_a_row_of_the_file_is_hit(iso: int, shot: float, read: float) -> None:
+    """The green figures of the Sony ILCE-7M3, as they stand in profiles.tsv."""
+    shot_var, read_var = ProfileLevels("Sony ILCE-7M3", iso=iso).sample(3, generator())
+    torch.testing.assert_close(shot_var, torch.full((3,), shot * SHOT_ON_MOSAIC), rtol=1e-5, atol=0)
+    torch.testing.assert_close(read_var, torch.full((3,), read * READ_ON_MOSAIC), rtol=1e-5, atol=0)
+
+
+def test_between_two_rows_the_logarithms_are_interpolated() -> None:
+    profiles = published_profiles()
+    index = profiles.names.index("Sony ILCE-7M3")
+    (x0, x1), (s0, s1), _ = profiles.table[:, index, 2:4].tolist()
+    iso = math.exp(0.25 * x0 + 0.75 * x1)
+    shot_var, _ = ProfileLevels("sony ilce-7m3", iso=iso).sample(1, generator())
+    assert shot_var.item() == pytest.approx(math.exp(0.25 * s0 + 0.75 * s1), rel=1e-5)
+
+
+def test_levels_stay_within_the_profile_and_replay() -> None:
+    profiles = published_profiles()
+    levels = ProfileLevels("Nikon D750")
+    shot_var, read_var = levels.sample(2000, generator(3))
+    index = profiles.names.index("Nikon D750")
+    shot = profiles.table[1, index, : profiles.rows[index]].exp()
+    assert shot.min() * 0.999 <= shot_var.min() <= shot.min() * 1.1
+    assert shot.max() * 0.9 <= shot_var.max() <= shot.max() * 1.001
+    assert all(torch.equal(a, b) for a, b in zip(levels.sample(2000, generator(3)), (shot_var, read_var), strict=True))
+
+
+def test_any_camera_draws_each_camera_alike() -> None:
+    levels = ProfileLevels("any camera")
+    assert len(levels.cameras) == len(published_profiles().names) == 369
+    one_row = published_profiles().rows == 1
+    fixed = published_profiles().table[1, one_row, 0].exp().float()
+    shot_var, _ = levels.sample(200_000, generator())
+    hits = torch.isclose(shot_var[:, None], fixed, rtol=1e-6, atol=0).float().mean(dim=0)
+    torch.testing.assert_close(hits, torch.full_like(hits, 1 / 369), atol=5e-4, rtol=0)
+
+
+def test_limits_of_iso_leave_out_the_cameras_without_a_share() -> None:
+    profiles = published_profiles()
+    high = ProfileLevels("any camera", iso=(51_200, 102_400))
+    ends = profiles.limits()[:, 1].exp()
+    assert len(high.cameras) == int((ends > 51_199).sum()) < 150
+    assert (
+        high.sample(500, generator())[0].median()
+        > 20 * ProfileLevels("any camera", iso=400).sample(500, generator())[0].median()
+    )
+
+
+def test_names_reach_the_noise_model() -> None:
+    params = noise_model("any camera").sample(4, generator())
+    clean = torch.full((4, 4, 8, 8), 0.2)
+    assert torch.equal(noise_model("any camera").apply(clean, params), noise_model("Any Camera").apply(clean, params))
+    with pytest.raises(ValueError, match="similar: Nikon D750"):
+        noise_model("Nikon D 750")
+    with pytest.raises(ValueError, match=r"ISO 50 is outside the measured range of Sony ILCE-7M3"):
+        noise_model("Sony ILCE-7M3", iso=50)
+
+
+def measured(model: NoiseModel, clean: torch.Tensor) -> float:
+    params = model.sample(len(clean), torch.Generator().manual_seed(1))
+    return float(psnr(model.apply(clean, params), clean).mean())
+
+
+def pictures(*signals: float) -> torch.Tensor:
+    """1536 ramps ``(4, 12, 12)``, of these mean signals in turn."""
+    ramp = torch.linspace(0.2, 1.8, 144).reshape(12, 12)
+    means = torch.tensor(signals).repeat(1536 // len(signals))
+    return means[:, None, None, None] * ramp.expand(4, 12, 12)
+
+
+@pytest.mark.parametrize("levels", [(2e-3, 1e-5), (0.0, 1e-4), "cycleisp_sidd", "Google Pixel"])
+@pytest.mark.parametrize("pair_psnr", [36.0, 41.18])
+def test_pairs_have_the_stated_psnr(levels: str | tuple[float, float], pair_psnr: float) -> None:
+    model = CalibratedNoise(pair_psnr, 0.1, levels)
+    spread = 0.05 if isinstance(levels, tuple) else 0.5  # three standard errors of the law's own draws
+    assert measured(model, pictures(0.1)) == pytest.approx(pair_psnr, abs=spread)
+
+
+def test_pictures_of_different_light_have_it_on_average() -> None:
+    signals = (0.01, 0.05, 0.3)
+    model = CalibratedNoise(40.0, signals, (1e-3, 1e-6))
+    assert measured(model, pictures(*signals)) == pytest.approx(40.0, abs=0.05)
+    assert measured(model, pictures(0.01)) > 43.0 and measured(model, pictures(0.3)) < 37.0
+
+
+def test_the_law_keeps_its_shape_and_the_calibration_is_the_same_each_time() -> None:
+    one, again = (CalibratedNoise(41.18).sample(5, torch.Generator().manual_seed(2)) for _ in range(2))
+    shot_var, read_var = noise_levels("cycleisp_sidd").sample(5, torch.Generator().manual_seed(2))
+    assert torch.equal(one["shot_var"], again["shot_var"])
+    ratio = one["shot_var"] / shot_var
+    assert torch.allclose(ratio, ratio[0].expand(5)) and torch.allclose(one["read_var"] / read_var, ratio)
+
+
+def test_what_cannot_be_calibrated_is_refused() -> None:
+    with pytest.raises(ValueError, match="pair_psnr must be finite, got inf"):
+        CalibratedNoise(math.inf)
+    none: list[float] = []
+    for signal in (0.0, 1.5, none):
+        with pytest.raises(ValueError, match="signal: mean signals must be above 0 and at most 1"):
+            CalibratedNoise(41.18, signal)
+    with pytest.raises(ValueError, match="have no noise"):
+        CalibratedNoise(41.18, 0.1, (0.0, 0.0))
+
+
+def test_recipes_name_it_by_the_figure_alone() -> None:
+    bare, full = (
+        noise_model(spec)
+        for spec in (
+            {"pair_psnr": 41.18, "levels": "upi"},
+            {"name": "CalibratedNoise", "settings": {"pair_psnr": 41.18, "levels": "upi"}},
+        )
+    )
+    drawn = [model.sample(3, torch.Generator().manual_seed(0)) for model in (bare, full)]
+    assert isinstance(bare, CalibratedNoise) and torch.equal(drawn[0]["shot_var"], drawn[1]["shot_var"])
+    with pytest.raises(ValueError, match="signl"):
+        noise_model({"pair_psnr": 41.18, "signl": 0.1})

@@ -1,4 +1,4 @@
-"""Physics of the noise models on fixed seeds, 262144 pixels a level, and the contract of sample and apply."""
+"""Physics of the noise models on fixed seeds, 262144 pixels a level; the contract of sample and apply; Poisson."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from rawaug.noise import (
     BlackOffset,
@@ -25,6 +26,7 @@ from rawaug.noise import (
     ShotReadNoise,
     TukeyLambdaNoise,
 )
+from rawaug.noise.models import INVERSION_LIMIT, _walked, poisson
 
 LEVELS = torch.tensor([0.0, 1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 0.8])
 STRONG = FixedLevels(1e-3, 2e-5)
@@ -239,3 +241,49 @@ def test_quantised_levels_lie_on_the_grid() -> None:
     numbers = noisy * 959
     assert torch.allclose(numbers, numbers.round(), atol=1e-3) and (numbers.round() == -1).any()
     assert Quantisation(10, 64).quanta == [1 / 959]
+
+
+N = 400_000
+
+
+def draw(rate: float, device: str, n: int = N) -> torch.Tensor:
+    normals = torch.empty(n, device=device).normal_(generator=torch.Generator(device).manual_seed(7))
+    return poisson(torch.full((n,), rate, device=device), normals).double().cpu()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("rate", [0.02, 0.5, 3.0, 9.99, 10.0, 12.5, 40.0, 300.0])
+def test_counts_follow_the_distribution(rate: float, device: str) -> None:
+    counts = draw(rate, device)
+    assert torch.equal(counts, counts.round()) and counts.min() >= 0
+    low, high = int(stats.poisson.ppf(1e-4, rate)), int(stats.poisson.ppf(1 - 1e-4, rate))
+    edges = range(low, high + 1)
+    observed = (
+        [int((counts <= low).sum())] + [int((counts == k).sum()) for k in edges[1:]] + [int((counts > high).sum())]
+    )
+    expected = [stats.poisson.cdf(low, rate), *stats.poisson.pmf(edges[1:], rate), stats.poisson.sf(high, rate)]
+    assert stats.chisquare(observed, [N * p for p in expected], sum_check=False).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("rate", [10.0, 10.5, 14.3, 40.0])
+def test_expansion_gives_the_exact_quantiles(rate: float) -> None:
+    uniform = (torch.arange(50_000, dtype=torch.float64) + 0.5) / 50_000
+    counts = poisson(torch.full_like(uniform, rate), torch.special.ndtri(uniform)).numpy()
+    assert (counts != stats.poisson.ppf(uniform, rate)).mean() < 1e-3
+
+
+@pytest.mark.parametrize("rate", [INVERSION_LIMIT, 1e3, 1e5, 1e7])
+def test_high_rates_have_the_right_mean_and_variance(rate: float) -> None:
+    deviation = draw(rate, "cpu") - rate
+    assert abs(deviation.mean()) < 3 * (rate / N) ** 0.5
+    assert deviation.var() == pytest.approx(rate, rel=0.01)
+
+
+def test_far_tail_is_neither_cut_nor_endless() -> None:
+    counts = draw(0.1, "cpu", 4_000_000)
+    assert stats.poisson.isf(1e-5, 0.1) <= counts.max() <= stats.poisson.isf(1e-11, 0.1)
+    w = torch.tensor([-5.9, -3.0, 0.0, 3.0, 4.5, 5.2, 5.6, 5.9])
+    for rate in (0.1, 2.0, 9.9):
+        exact = stats.poisson.isf(stats.norm.sf(w.double().numpy()), float(torch.tensor(rate)))
+        assert _walked(torch.full_like(w, rate), w).tolist() == exact.tolist()
+        assert _walked(torch.tensor([rate]), torch.tensor([40.0])) < stats.poisson.isf(1e-15, rate)
