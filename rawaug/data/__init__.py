@@ -31,27 +31,10 @@ from rawaug.io.pictures import MAX_PIXELS
 from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
-    "Binned",
-    "DemoCamera",
-    "Dnd",
-    "Pair",
-    "PairFolder",
-    "PictureFolder",
-    "RawFolder",
-    "Shapes",
-    "SiddBenchmark",
-    "check",
-    "check_dnd_submission",
-    "check_submission",
-    "dead_leaves",
-    "demo_pairs",
-    "demo_photographs",
-    "demo_pictures",
-    "open_pairs",
-    "open_pictures",
-    "write_dnd_submission",
-    "write_submission",
-]
+    "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes", "SiddBenchmark",
+    "check", "check_dnd_submission", "check_submission", "dead_leaves", "demo_pairs", "demo_photographs",
+    "demo_pictures", "open_pairs", "open_pictures", "write_dnd_submission", "write_submission",
+]  # fmt: skip
 
 _SPLITS = ("train", "validation", "test")
 

@@ -68,11 +68,8 @@ class ISPConfig:
             require_between("encoder_widths", width, 1, MOST_FEATURES)
         if self.knee is not None:
             require_between("knee", self.knee, 0.0, 0.999)
-        if (
-            not self.stages
-            or not all(isinstance(s, str) for s in self.stages)
-            or len({*self.stages}) < len(self.stages)
-        ):
+        named = all(isinstance(stage, str) for stage in self.stages)
+        if not self.stages or not named or len({*self.stages}) < len(self.stages):
             raise ValueError(f"stages must be one or more names, each at most once, got {self.stages!r:.100}")
         if (self.tone_atoms > 0) != ("curve" in self.stages):
             raise ValueError(f"tone_atoms must be at least 1 with the stage curve and 0 without, got {self.tone_atoms}")

@@ -98,11 +98,8 @@ class ToneCurve(Stage):
 
     def __init__(self, config: ISPConfig) -> None:
         super().__init__(config)
-        if config.tone_atoms < 1 or {"tone", "gamma"} & set(config.stages):
-            raise ValueError(
-                f"stages: 'curve' takes tone_atoms, at least 1, and replaces tone and gamma; got "
-                f"{config.tone_atoms} and {' '.join(config.stages)}"
-            )
+        if {"tone", "gamma"} & set(config.stages):
+            raise ValueError(f"stages: 'curve' replaces tone and gamma, got {' '.join(config.stages)}")
         self.dictionary = ToneDictionary(config.tone_atoms)
         self.slopes: Tensor | None = None  # (K, PIECES), l, during a fit
 

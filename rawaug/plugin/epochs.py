@@ -112,9 +112,6 @@ class Visits(_Epochs):
     also have the rank as a key.
     """
 
-    def __init__(self, size: int) -> None:
-        super().__init__(size)
-
     def key(self, index: int) -> tuple[int, ...]:
         """Count a visit of picture ``index``; return epoch, index and rank, which key its draw."""
         if self.pinned is not None:

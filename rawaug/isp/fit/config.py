@@ -83,13 +83,10 @@ class FitConfig:
         return replace(self, steps=2, curve_steps=10, pixels=512, batch=128, prior_steps=20, encoder_steps=4)
 
     def __post_init__(self) -> None:
-        positive, counts = (
-            ("atoms", "pixels", "batch"),
-            ("steps", "joint_steps", "curve_steps", "prior_steps", "encoder_steps"),
-        )
-        for key, least in {**dict.fromkeys(positive, 1), **dict.fromkeys(counts, 0)}.items():
+        steps = ("steps", "joint_steps", "curve_steps", "prior_steps", "encoder_steps")
+        for key in ("atoms", "pixels", "batch", *steps):
             if getattr(self, key) is not None:
-                require_between(key, getattr(self, key), least, MOST)
+                require_between(key, getattr(self, key), 0 if key in steps else 1, MOST)
         require_between("seed", self.seed, -(2**63), 2**63 - 1)
         require_between("reach", self.reach, 1.0, float(MOST))
         for key in ("learning_rate", "mse_floor", "intermediate", "consistency"):

@@ -20,14 +20,6 @@ from rawaug.paper.baselines.upi import UPI, TunedUPI
 from rawaug.registry import BASELINES
 
 __all__ = [
-    "BASELINES",
-    "UPI",
-    "BaselineISP",
-    "CycleISP",
-    "InvISP",
-    "InvertibleGrey",
-    "Training",
-    "TunedUPI",
-    "UNetISP",
+    "BASELINES", "UPI", "BaselineISP", "CycleISP", "InvISP", "InvertibleGrey", "Training", "TunedUPI", "UNetISP",
     "fit_baseline",
-]
+]  # fmt: skip

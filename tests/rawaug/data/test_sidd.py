@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from rawaug.data import (
     SiddBenchmark,
     check,
     check_submission,
-    demo_photographs,
     open_pairs,
     sidd,
     write_submission,
@@ -318,43 +316,6 @@ def test_a_file_of_blocks_found_wrong_is_not_read_for_every_block(
         with pytest.raises(ValueError, match=r"bayer_patterns\.csv: is not a list of patterns") as error:
             SiddPlusBlocks(tmp_path)
         assert "\n" not in str(error.value)
-
-
-SMALL = [
-    *("--train.steps", "2", "--train.batch", "2", "--train.crop", "32", "--train.workers", "0", "--train.warmup", "1"),
-    *("--train.validate-every", "2", "--train.checkpoint-every", "2", "--train.precision", "32-true"),
-    *("--isp.steps", "2", "--isp.curve-steps", "5", "--isp.pixels", "512", "--isp.batch", "128", "--device", "cpu"),
-    *("--denoiser", '{"name": "UNet", "settings": {"width": 4, "scales": 2, "variance_map": false}}'),
-    *("--data.test-count", "4", "--classical", "[]", "--self-ensemble", "false"),
-    *("--arms", '{"dhdn": {"augmented": 0.0}, "ours": {"augmented": 0.75, "sampling": "convex"}}', "--untouched", "[]"),
-]
-"""Of the recipe's network, steps and five arms; 1,280 blocks, so that the benchmark takes the file: 5 s of CPU."""
-
-
-@pytest.mark.long
-def test_sidd_full_trains_scores_and_writes_what_the_benchmark_takes(
-    blocks: Path, tmp_path: Path, mat73: Writer, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("0001_001_S6_00100_00060_3200_L", "0002_001_S6_00100_00020_3200_N", "0004_001_S6_00100_00060_4400_L"):
-        write_scene(tmp_path / "medium", mat73, name, ("010",))
-    (tmp_path / "mirflickr").mkdir()
-    for name, picture in demo_photographs("validation").items():
-        write_picture(tmp_path / "mirflickr" / f"{name}.png", picture[:, :64, :64])
-    places = ["--data.pairs", f"sidd:{tmp_path / 'medium'}", "--data.pictures", str(tmp_path / "mirflickr")]
-    places += ["--data.test", f"sidd:{blocks}", "--out", str(tmp_path)]
-    assert main(["run", "sidd/full", *places, *SMALL]) == 0
-    run = tmp_path / "sidd" / "full"
-    results = json.loads((run / "results.json").read_text())["results"]
-    assert set(results) == {"dhdn", "ours"}
-    for (scores,) in results.values():
-        assert len(scores["plain"]["images"]) == 4 and 15.0 < scores["plain"]["psnr"] < 60.0
-    weights, out = run / "seed0" / "ours" / "denoiser.safetensors", tmp_path / "SubmitRaw.csv"
-    capsys.readouterr()
-    assert main(["submit", f"sidd:{blocks}", str(out), "--denoiser", str(weights)]) == 0
-    assert "1280 blocks, checked" in capsys.readouterr().out
-    noisy = torch.stack([block.mosaic for block in SiddBenchmark(blocks)])
-    shift = (check_submission(out, SIDE) - noisy).abs().mean((1, 2, 3))
-    assert (shift > 0.0).all() and shift.max() < 0.2, "each block is a denoised one of its own"
 
 
 SCENES = ("0009_001_S6_00800_00350_3200_L", "0021_001_GP_10000_05000_5500_N")

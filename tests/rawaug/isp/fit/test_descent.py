@@ -54,15 +54,6 @@ def test_a_stage_that_is_done_takes_no_step_and_another_begins_anew(tmp_path: Pa
         run(path, key="other", stop=1)
 
 
-def test_an_unreadable_state_is_named(tmp_path: Path) -> None:
-    for damage in (b"", b"\x00" * 20, b"no state at all"):
-        (tmp_path / "camera.state").write_bytes(damage)
-        with pytest.raises(
-            ValueError, match=r"camera\.state: not a readable safetensors file.*delete this state of an interrupted fit"
-        ):
-            Descent(tmp_path / "camera.state", "key", 0, False)
-
-
 def test_watched_tensors_come_back_from_their_best_step() -> None:
     x = torch.zeros(3)
     worker = Descent(None, "key", 0, False)
