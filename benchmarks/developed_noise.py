@@ -99,7 +99,7 @@ def draw(found: dict[str, list[tuple[Tensor, Tensor]]], path: Path) -> None:
 
     figure = Figure(figsize=(7.8, 3.1), layout="constrained")
     near, bright = figure.subplots(1, 2)
-    for (name, seen), colour in zip(found.items(), ("0.6", "black", "tab:blue", "tab:orange"), strict=True):
+    for (name, seen), colour in zip(found.items(), ("0.6", "black", "C0", "C1", "C2", "C3"), strict=True):
         correlations = torch.stack([correlation(*one) for one in seen])
         near.plot(range(LAGS), correlations.mean(0), "o-", color=colour, markersize=3, label=name)
         if name != "RAW":
