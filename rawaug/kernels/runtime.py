@@ -49,7 +49,7 @@ def fast_in_bfloat16(device: torch.device) -> bool:
     """Whether dense convolutions take less time in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    able = getattr(torch.cpu, "get_capabilities", dict)() if device.type == "cpu" else {}
+    able: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)() if device.type == "cpu" else {}
     return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
 
 
