@@ -4,6 +4,9 @@ Domain: packed RAW, float, white = 1, not clipped at black; any height and width
 times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by reflection
 without repeating the edge (as often as needed, so a 2 x 2 picture passes too), and the result is cropped back.
 
+With ``pyramid`` the result of one scale, f, is mended by what f finds at half the sides, where wide noise is narrow:
+``f(y) + U(f(B y) - B f(y))``, B binning by 2 and U interpolating.
+
 The noise map is the standard deviation by default. UPI's is the variance, whose values of 1e-5 to 1e-2 move the first
 layer little: after 400 steps at a learning rate of 1e-3 the U-Net of width 8 had taken 12 % off the l1 error with the
 deviation and 6 % with the variance. The residual's last convolution starts at zero, so that an untrained network is the
