@@ -184,9 +184,10 @@ def binned_variance(factor: int, together: bool = False) -> float:
 def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
     """Means over ``factor`` sites of one colour, of windows moved by so many of its sites."""
     first, part = math.floor(move), move % 1
-    sites = torch.arange(plane.shape[axis], device=plane.device)
+    size = plane.shape[axis]  # not len(), which an exported network would keep
+    sites = torch.arange(size, device=plane.device)
     near, far = (
-        plane.index_select(axis, (sites + k).clamp(0, len(sites) - 1)).unflatten(axis, (-1, factor)).mean(axis)
+        plane.index_select(axis, (sites + k).clamp(0, size - 1)).unflatten(axis, (-1, factor)).mean(axis)
         for k in (first, first + 1)
     )
     return torch.lerp(near, far, part)

@@ -156,6 +156,7 @@ class OnnxNetwork(nn.Module):
         stride = self.stated.get("stride", "")
         self.stride = (int(stride) if stride.isdecimal() else 0) or _STRIDE
         self.upscale = 2 if self.stated.get("upscale") == "2" else 1
+        self.mixed = False
 
     def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
         """``(B, 4, h, w)`` denoised, on the CPU."""

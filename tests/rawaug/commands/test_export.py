@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -21,11 +22,21 @@ from rawaug.io import RawFrame
 
 @pytest.mark.parametrize(
     ("name", "config", "linear"),
-    [("PMRID", {"width": 4, "variance_map": True}, False), ("JointDRUNet", {"width": 4, "scales": 2}, True)],
+    [
+        ("PMRID", {"width": 4, "variance_map": True}, False),
+        ("DRUNet", {"width": 4, "scales": 2, "variance_map": False, "domain": "anscombe", "pyramid": True}, False),
+        ("JointDRUNet", {"width": 4, "scales": 2}, True),
+    ],
 )
 def test_any_size_gives_pytorch_s_numbers(
-    name: str, config: dict[str, int], linear: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    config: dict[str, Any],
+    linear: bool,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("rawaug.commands.frame_denoisers.fast_in_bfloat16", lambda device: False)
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library, reason="pip install rawaug[export]")
     model, weights, out = denoisers.build(name, **config), tmp_path / "small.safetensors", tmp_path / "small.onnx"
