@@ -3,9 +3,9 @@ r"""Denoisers of developed pictures: trained on sRGB, tested on camera frames wi
 .. math:: x = L(y + n), \qquad \operatorname{var}(n) = \mathrm{shot\_var} \cdot y + \mathrm{read\_var}
 
 L is LibRaw's own way from a DNG to sRGB: its demosaicing (AHD), its colours and its tone curve, not the forward pass
-that a training with camera noise has seen. The truth is L(y). Noise is keyed by (frame, levels), the same for every
-method. Beside the arms stand classical filters on sRGB, whose strength validation chooses for each level, and trained
-RAW denoisers, which are given the levels and developed after.
+that a training with camera noise has seen, though ``ahd`` is a relative. The truth is L(y). Noise is keyed by (frame,
+levels), the same for every method. Beside the arms stand classical filters on sRGB, whose strength validation chooses
+for each level, and trained RAW denoisers, which are given the levels and developed after.
 """
 
 from __future__ import annotations
