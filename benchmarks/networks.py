@@ -9,7 +9,7 @@ with it, RawAugment makes it of sRGB first; with ``--workers``, RawPairs makes i
 the networks have the sizes of :data:`GPU_SIZES` and train in bf16. ``--compile`` times the steps once more under
 torch.compile in each of the modes, of which reduce-overhead uses CUDA graphs. Each network runs in a process of its
 own, whose peak memory in training is reported; steps are timed in turn, and the fastest counts. With ``--minutes``
-each network, in the form of :data:`SIZES`, is trained for the same time on what ``recipes/pretrain.yaml`` describes,
+each network, in the form of :data:`SIZES`, is trained for the same time on RAW of published cameras with :data:`NOISE`
 and scored on the validation frames, beside NonLocalMeans, ``rawaug-small`` and, with ``--pmrid FILE``, PMRID's
 published weights.
 """
@@ -179,7 +179,7 @@ def middles(args: argparse.Namespace) -> list[Pair]:
 
 
 def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[str, float]:
-    """PSNR in dB of one network after ``args.minutes`` of training on what ``recipes/pretrain.yaml`` describes.
+    """PSNR in dB of one network after ``args.minutes`` of training on RAW of published cameras.
 
     Args:
         size: the network's settings, but for its domain.

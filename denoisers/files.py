@@ -3,7 +3,7 @@
 A file is safetensors with string metadata that say how to build the network again: ``{"format": "rawaug", "kind":
 "denoiser", "model": "UNet", "config": <JSON: the constructor's arguments>, "info": <JSON: anything else>}``. Nothing in
 it is code; only the classes in :data:`rawaug.registry.DENOISERS` can be named. Shipped weights have a model card beside
-them; ``rawaug-small`` is PMRID's network at its published width, trained by ``recipes/pretrain.yaml``.
+them, and ``recipes/base.yaml`` trained them.
 """
 
 from __future__ import annotations

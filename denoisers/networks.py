@@ -380,14 +380,14 @@ class DRUNet(Denoiser):
         domain: str = "linear",
         seed: int = 0,
         patch: int = 1,
-        pyramid: bool = False,
+        pyramid: int = 0,
     ) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
         require_between("patch", patch, 1, 8)
         require_bounded(seed, blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
-        config |= ({} if patch == 1 else {"patch": patch}) | ({"pyramid": True} if pyramid else {})
+        config |= ({} if patch == 1 else {"patch": patch}) | ({"pyramid": pyramid} if pyramid else {})
         cell = 2 ** (scales - 1)
         stride = patch * CONTEXT * cell
         super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend, pyramid)

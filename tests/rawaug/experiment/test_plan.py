@@ -177,7 +177,7 @@ def test_recipes_are_listed_and_explained_with_their_own_values(capsys: pytest.C
     lines = recipe_list().splitlines()
     assert recipe_list() in capsys.readouterr().out
     assert len(lines) == len(shipped_recipes()) >= 10 and all(len(line.split(maxsplit=1)[1]) > 30 for line in lines)
-    for name, value in (("unsupervised", " 4000"), ("pretrain", '"PMRID"')):
+    for name, value in (("unsupervised", " 4000"), ("base", '"DRUNet"')):
         assert main(["run", name, "--help"]) == 0
         shown = capsys.readouterr().out
         assert value in shown and "--train.learning-rate" in shown and "--arms.NAME.augmented" in shown
