@@ -431,6 +431,15 @@ def test_a_pyramid_takes_out_wide_noise_and_leaves_the_scene(channels: int) -> N
 
 
 @torch.no_grad()
+def test_a_pyramid_asks_nothing_of_clipped_values() -> None:
+    bright = 1.1 + 0.1 * torch.randn((1, 4, 64, 64), generator=torch.Generator().manual_seed(0))
+    bright[..., 32:] -= 0.6
+    plain, pyramid = (Mean(4, halvings)(bright.clamp_max(1.0)) for halvings in (0, 2))
+    torch.testing.assert_close(pyramid[..., :20], plain[..., :20], rtol=0.0, atol=0.0)
+    assert (pyramid[..., 44:] - plain[..., 44:]).std() > 0.003
+
+
+@torch.no_grad()
 def test_a_pyramid_is_built_again_and_a_defect_stays_small() -> None:
     settings: dict[str, Any] = {"width": 4, "scales": 2, "blocks": 1, "variance_map": False, "domain": "anscombe"}
     net = awake(DRUNet(**settings, mend=True, pyramid=2))
