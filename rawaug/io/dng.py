@@ -312,7 +312,7 @@ def read_carried_tags(path: Path, size: tuple[int, int]) -> CarriedTags:
 
     try:
         with opened_tiff(path) as tiff, path.open("rb") as file:
-            pages = list(all_pages(tiff.pages))
+            pages = all_pages(tiff)
             first = pages[0].tags
             dng = any(DNG_VERSION in page.tags for page in pages)
             mosaics = [mosaic] if dng and (mosaic := main_mosaic(pages)) is not None else []

@@ -1,23 +1,17 @@
 """TIFF-based RAW files (DNG, NEF, CR2, ...): the tags that LibRaw does not expose, read by tifffile.
 
-A directory (IFD) names its successor and its children (SubIFDs, tag 330) by their offset. Damaged offsets make circles,
-in which a reader that trusts them never ends, so directories are followed once before tifffile follows them. Source:
-TIFF 6.0, section 2; BigTIFF; TIFF Technical Note 1 (SubIFDs).
-
 A DNG's NoiseProfile (tag 51041, DNG specification 1.3 and later) holds pairs (S, O), one for all colour planes or one a
 plane, with noise variance S y + O for a signal y whose black is 0 and white 1: our ``shot_var`` and ``read_var``.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from graphlib import CycleError, TopologicalSorter
-from os import SEEK_END
+from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,80 +19,8 @@ from rawaug.errors import extra
 from rawaug.io.gain_map import GainMap, parse_gain_maps
 from rawaug.io.isolated import damage_as_os_error
 
-MOST_DIRECTORIES = 512
-_SUB_DIRECTORIES = 330
-_OFFSETS = {4: "I", 13: "I", 16: "Q", 18: "Q"}
-"""TIFF types that hold offsets (LONG, IFD, LONG8, IFD8), as struct names them."""
-
-
-class _Layout(NamedTuple):
-    """Formats of struct: of an offset, of the number of entries, of an entry up to its value."""
-
-    offset: str
-    number: str
-    entry: str
-
-
-_LAYOUTS = {42: _Layout("I", "H", "HHI"), 43: _Layout("Q", "Q", "HHQ")}
-"""Of TIFF and BigTIFF, by the number after the byte order."""
-
-
-def require_no_circle(path: Path) -> None:
-    """Raise ValueError if the directories of a TIFF form a circle; other files are not checked."""
-    # a directory that two others name is no circle: some writers chain the children that a parent lists as well
-    with path.open("rb") as file:
-        start = file.read(4)
-        order = {b"II": "<", b"MM": ">"}.get(start[:2])
-        if order is None or len(start) < 4:
-            return
-        layout = _LAYOUTS.get(struct.unpack(order + "H", start[2:])[0])
-        if layout is None:
-            return
-        end = file.seek(0, SEEK_END)
-        todo = [_number(file, order + layout.offset, 8 if layout.offset == "Q" else 4)]
-        named: dict[int, list[int]] = {}
-        while todo:
-            place = todo.pop()
-            if place in named or not 0 < place < end:
-                continue
-            if len(named) == MOST_DIRECTORIES:
-                raise ValueError(f"it has more than {MOST_DIRECTORIES} directories")
-            named[place] = _followed(file, order, layout, place, end)
-            todo += named[place]
-    try:
-        TopologicalSorter(named).prepare()
-    except CycleError as error:
-        place = error.args[1][0]
-        raise ValueError(f"its directories point at one another in a circle, at byte {place}") from None
-
-
-def _followed(file: BinaryIO, order: str, layout: _Layout, place: int, end: int) -> list[int]:
-    """Offsets that a directory names: of its successor and of its children."""
-    place += struct.calcsize(order + layout.number)
-    count = _number(file, order + layout.number, place - struct.calcsize(order + layout.number))
-    size, wide = struct.calcsize(order + layout.entry), struct.calcsize(order + layout.offset)
-    if place + count * (size + wide) > end:
-        return []  # what is cut off is left to whoever reads it
-    file.seek(place)
-    table = file.read(count * (size + wide))
-    followed = [_number(file, order + layout.offset, place + count * (size + wide))]
-    for at in range(0, len(table), size + wide):
-        code, kind, values = struct.unpack_from(order + layout.entry, table, at)
-        if code == _SUB_DIRECTORIES and kind in _OFFSETS:
-            each = struct.calcsize(order + _OFFSETS[kind])
-            inside = values * each <= wide
-            where = place + at + size if inside else struct.unpack_from(order + layout.offset, table, at + size)[0]
-            values = min(values, MOST_DIRECTORIES + 1)
-            followed += [_number(file, order + _OFFSETS[kind], where + k * each) for k in range(values)]
-    return followed
-
-
-def _number(file: BinaryIO, form: str, place: int) -> int:
-    """The number at ``place``; 0 behind the end of the file."""
-    file.seek(place)
-    data = file.read(struct.calcsize(form))
-    return int(struct.unpack(form, data)[0]) if len(data) == struct.calcsize(form) else 0
-
+MOST_PAGES = 64
+"""More than any RAW file has. Damaged offsets make circles of directories, in which a reader never ends."""
 
 MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
 _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
@@ -130,7 +52,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
     try:
         with opened_tiff(path) as tiff:
-            pages = list(all_pages(tiff.pages))
+            pages = all_pages(tiff)
             make, model = (pages[0].tags.valueof(code) if pages else None for code in (MAKE, MODEL))
             if not any(DNG_VERSION in page.tags for page in pages):
                 return TiffTags(make, model)
@@ -148,14 +70,12 @@ def read_tiff_tags(path: Path) -> TiffTags:
 
 @contextmanager
 def opened_tiff(path: Path) -> Iterator[Any]:
-    """Open a TIFF after checking its directories; damage becomes an OSError that names the file."""
+    """Open a TIFF; damage becomes an OSError that names the file."""
     with extra("raw"):
         import tifffile
 
-    with tag_damage(path):
-        require_no_circle(path)
-        with tifffile.TiffFile(path) as tiff:
-            yield tiff
+    with tag_damage(path), tifffile.TiffFile(path) as tiff:
+        yield tiff
 
 
 def tag_damage(path: Path) -> AbstractContextManager[None]:
@@ -166,11 +86,18 @@ def tag_damage(path: Path) -> AbstractContextManager[None]:
     return damage_as_os_error(path, "its TIFF tags are damaged", tifffile.TiffFileError, OSError)
 
 
-def all_pages(pages: Any) -> Iterator[Any]:
+def all_pages(tiff: Any) -> list[Any]:
     """Every page of a file, those of its SubIFDs after the one that they belong to."""
+    pages = list(islice(_pages(tiff.pages), MOST_PAGES + 1))
+    if len(pages) > MOST_PAGES:
+        raise ValueError(f"it has more than {MOST_PAGES} directories, or they point at one another in a circle")
+    return pages
+
+
+def _pages(pages: Any) -> Iterator[Any]:
     for page in pages:
         yield page
-        yield from all_pages(getattr(page, "pages", None) or ())
+        yield from _pages(getattr(page, "pages", None) or ())
 
 
 def main_mosaic(pages: list[Any]) -> Any:

@@ -13,7 +13,7 @@ import torch
 from rawaug.bayer import CFA, pack
 from rawaug.io import read_raw, write_dng
 from rawaug.io.gain_map import GainMap, gains_at_sites, opcode_list, parse_gain_maps
-from rawaug.io.tiff import MOST_DIRECTORIES, require_no_circle
+from rawaug.io.tiff import all_pages, opened_tiff
 
 LONG = 4
 
@@ -53,23 +53,15 @@ def test_a_dng_whose_directories_point_in_a_circle(
     if not children:
         changed(bad, successor, start)
     for read in (lambda: read_raw(bad), lambda: write_dng(tmp_path / "out.dng", good, source=bad)):
-        with pytest.raises(OSError, match=r"bad\.dng: its TIFF tags are damaged \(.*in a circle, at byte 8\)"):
+        with pytest.raises(OSError, match=r"bad\.dng: its TIFF tags are damaged \(.*in a circle\)"):
             read()
 
 
-def test_long_chains_and_other_files(tmp_path: Path) -> None:
-    path = tmp_path / "chain.tif"
-    chain(path, MOST_DIRECTORIES, 0)
-    require_no_circle(path)
-    chain(path, MOST_DIRECTORIES + 1, 0)
-    with pytest.raises(ValueError, match=f"more than {MOST_DIRECTORIES} directories"):
-        require_no_circle(path)
-    chain(path, 200, 8 + 6 * 150)  # a circle that does not hold the first
-    with pytest.raises(ValueError, match="in a circle, at byte 908"):
-        require_no_circle(path)
-    for content in (b"", b"II", b"II*\0", b"MM\0*\xff\xff\xff\xff", b"\x89PNG" * 8):
-        path.write_bytes(content)
-        require_no_circle(path)
+@pytest.mark.parametrize("last", [8, 8 + 6 * 150])  # to the first one, and a circle that does not hold it
+def test_chains_without_an_end(last: int, tmp_path: Path) -> None:
+    chain(tmp_path / "a.tif", 200, last)
+    with pytest.raises(OSError, match="in a circle"), opened_tiff(tmp_path / "a.tif") as tiff:
+        all_pages(tiff)
 
 
 def a_map(**changes: object) -> GainMap:
