@@ -13,8 +13,7 @@ import json
 import logging
 import timeit
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,6 +26,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
+from rawaug.data.pairs import centre
 from rawaug.errors import extra
 from rawaug.evaluation.contestants import feeds, session_of
 from rawaug.evaluation.scores import frozen_sample
@@ -56,7 +56,8 @@ def write_onnx(
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
-    with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of torchvision's absence
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
         program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
@@ -65,18 +66,6 @@ def write_onnx(
         made.model.metadata_props.update(stated or {})
         made.save(str(path), external_data=False)
     return session_of(path)
-
-
-@contextmanager
-def errors_only(name: str) -> Iterator[None]:
-    """A logger and those below it say nothing less than an error."""
-    logger = logging.getLogger(name)
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
 
 
 def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:
@@ -223,8 +212,6 @@ def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
         sample = frozen_sample(pair, noise_model("cycleisp_sidd"), CFA(pair.cfa), seed=0)
         return sample.noisy, sample.variance
     raw = read_raw(frame)
-    height, width = raw.mosaic.shape[-2:]
-    top, left = (max(0, side - SIDE) // 4 * 2 for side in (height, width))
-    packed = bayer.pack(raw.mosaic[None, :, top : top + SIDE, left : left + SIDE], raw.cfa).contiguous()
+    packed = bayer.pack(centre(raw.mosaic[None], SIDE, SIDE), raw.cfa).contiguous()
     shot_var, read_var = raw.noise_profile or (1e-3, 1e-5)
     return packed, bayer.noise_variance(packed, shot_var, read_var)

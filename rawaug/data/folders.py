@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 
 from rawaug.bayer import turn_back
-from rawaug.data.pairs import LazyPairs, Pair, SomePairs
+from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
 from rawaug.errors import escape
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
 from rawaug.io.pictures import MAX_PIXELS, through_jpeg
@@ -316,19 +316,13 @@ class RawFolder(LazyPairs):
             size = [min(a, b) // 2 * 2 for a, b in zip(srgb.shape[-2:], frame.mosaic.shape[-2:], strict=True)]
             sides = (*srgb.shape[-2:], *frame.mosaic.shape[-2:])
             if all(side - least <= _JPEG_MARGIN * side for side, least in zip(sides, size * 2, strict=True)):
-                frame = replace(frame, mosaic=_centre(frame.mosaic, *size))
-                return Pair.of_frame(self.names[index], frame, _centre(srgb, *size), registered=False)
+                frame = replace(frame, mosaic=centre(frame.mosaic, *size))
+                return Pair.of_frame(self.names[index], frame, centre(srgb, *size), registered=False)
             sizes = "is {} x {} but its RAW file is {} x {}".format(*sides)
             warnings.warn(f"{jpeg}: {sizes}; using LibRaw's rendering instead", stacklevel=2)
         frame, srgb = read_raw_and_develop(file, self.adjust_maximum_thr)
         srgb = srgb if self.jpeg_quality is None else through_jpeg(srgb, self.jpeg_quality)
         return Pair.of_frame(self.names[index], frame, srgb)
-
-
-def _centre(image: Tensor, height: int, width: int) -> Tensor:
-    """The middle of ``(C, H, W)``, from an even row and column on."""
-    top, left = (image.shape[-2] - height) // 4 * 2, (image.shape[-1] - width) // 4 * 2
-    return image[:, top : top + height, left : left + width].contiguous()
 
 
 def _names(files: Sequence[Path]) -> list[str]:

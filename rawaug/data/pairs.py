@@ -16,7 +16,7 @@ noise.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, groupby
 from pathlib import Path
@@ -127,13 +127,11 @@ class Pair:
         if not (top or left):
             return self
         height, width = ((size - first) // 2 * 2 for size, first in zip(self.raw.shape[-2:], (top, left), strict=True))
-        return self._window(slice(top, top + height), slice(left, left + width), CFA(cfa))
+        return self._changed(lambda image: image[:, top : top + height, left : left + width].contiguous(), cfa=CFA(cfa))
 
     def middle(self, side: int) -> Pair:
         """The middle ``side x side`` of the frame, or all of it along a side that is shorter; the CFA is kept."""
-        top, left = ((size - side) // 4 * 2 if size > side else 0 for size in self.raw.shape[-2:])
-        rows, columns = slice(top, top + side // 2 * 2), slice(left, left + side // 2 * 2)
-        return self._window(rows, columns, self.cfa)
+        return self._changed(lambda image: centre(image, side // 2 * 2, side // 2 * 2))
 
     def binned(self, factor: int, together: bool = False) -> Pair:
         """The frame at 1 / ``factor`` of its sides, whose noise has about 1 / ``factor``^2 of the variance.
@@ -148,30 +146,39 @@ class Pair:
         height, width = (side // (2 * factor) * 2 * factor for side in self.raw.shape[-2:])
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
-        changed: dict[str, Any] = {}
+        levels: dict[str, Any] = {}
         left = binned_variance(factor, together)
-        for key in ("raw", "noisy", "srgb", "noisy_srgb"):
-            image = getattr(self, key)
-            if image is None:
-                continue
-            cut = image[:, :height, :width]
-            changed[key] = bin_mosaic(cut, self.cfa, factor, together) if len(cut) == 1 else _bin_picture(cut, factor)
         if self.shot_var is not None and self.read_var is not None:
-            changed |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
+            levels |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
         if self.own_noise is not None:
-            changed["own_noise"] = (self.own_noise[0] * left, self.own_noise[1] * left)
-        return replace(self, **changed)
+            levels["own_noise"] = (self.own_noise[0] * left, self.own_noise[1] * left)
 
-    def _window(self, rows: slice, columns: slice, cfa: CFA) -> Pair:
+        def binned(image: Tensor) -> Tensor:
+            cut = image[:, :height, :width]
+            return bin_mosaic(cut, self.cfa, factor, together) if len(cut) == 1 else _bin_picture(cut, factor)
+
+        return self._changed(binned, **levels)
+
+    def _changed(self, change: Callable[[Tensor], Tensor], **known: Any) -> Pair:
+        """With every image changed, and attributes that are ``known`` besides."""
         images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
-        cut = {key: image[:, rows, columns].contiguous() for key, image in images.items() if image is not None}
-        return replace(self, **cut, cfa=cfa)
+        return replace(self, **{key: change(image) for key, image in images.items() if image is not None}, **known)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])
         if tuple(image.shape) != expected or image.dtype != dtype:
             got = f"{image.dtype} {tuple(image.shape)}"
             raise ValueError(f"pair {self.name}: {field} must be {dtype} {expected}, got {got}")
+
+
+def centre(image: Tensor, height: int, width: int, step: int = 2) -> Tensor:
+    """The middle of ``(..., H, W)``, or all of it along a side that is shorter.
+
+    It begins at a multiple of ``step``: 2 keeps the pattern of a mosaic, 1 is that of packed RAW.
+    """
+    sides = zip(image.shape[-2:], (height, width), strict=True)
+    top, left = (max(0, size - side) // (2 * step) * step for size, side in sides)
+    return image[..., top : top + height, left : left + width].contiguous()
 
 
 def _bin_picture(srgb: Tensor, factor: int) -> Tensor:

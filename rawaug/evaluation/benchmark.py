@@ -23,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
-from rawaug.data.pairs import Pair, Sample
+from rawaug.data.pairs import Pair, Sample, centre
 from rawaug.evaluation.contestants import Contestant
 from rawaug.evaluation.scores import compared
 from rawaug.evaluation.tables import METRICS, Row, both
@@ -109,9 +109,7 @@ def _estimated(sample: Sample, cfa: CFA) -> Sample | None:
 
 def middle_of(sample: Sample, crop: int) -> Sample:
     """The middle of packed RAW as :meth:`rawaug.data.Pair.middle` takes it, ``crop`` pixels of the mosaic."""
-    top, left = ((2 * side - crop) // 4 if 2 * side > crop else 0 for side in sample.noisy.shape[-2:])
-    side = crop // 2
-    return Sample(*(image[..., top : top + side, left : left + side].contiguous() for image in sample))
+    return Sample(*(centre(image, crop // 2, crop // 2, step=1) for image in sample))
 
 
 def hash_of(columns: Columns) -> str:

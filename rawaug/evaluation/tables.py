@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pairs import Pair
+from rawaug.data.pairs import Pair, centre
 from rawaug.errors import escape, extra
 
 PANEL = 256
@@ -80,20 +80,13 @@ def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
     for row, first in zip(rows, accumulate(lines, initial=0), strict=False):
         exposure = exposure_of(list(row.panels.values())[-1], row.pair)
         for axis, (title, packed) in zip(axes[first:].flat, row.panels.items(), strict=False):
-            panel = develop_packed(_centre(packed), cfa, row.pair, exposure)
+            panel = develop_packed(centre(packed, PANEL // 2, PANEL // 2, step=1), cfa, row.pair, exposure)
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"
             axis.set_title(caption, fontsize=9, parse_math=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     return path
-
-
-def _centre(packed: Tensor) -> Tensor:
-    height, width = packed.shape[-2:]
-    rows, columns = min(height, PANEL // 2), min(width, PANEL // 2)
-    top, left = (height - rows) // 2, (width - columns) // 2
-    return packed[..., top : top + rows, left : left + columns]
 
 
 def mean_and_spread(values: Sequence[float], digits: int) -> str:
