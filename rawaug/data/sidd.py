@@ -49,28 +49,17 @@ PHONES = {
 _NAME = re.compile(r"\d{4}_(\d{3})_([A-Z0-9]{2})_(\d{5})_\d{5}_\d{4}_[LNH]")
 
 
-class SiddScene(NamedTuple):
-    """A scene instance: the name of its folder, and the physical scene, phone and ISO that it states."""
+def label_of(name: str) -> FrameLabel:
+    """What the name of a scene instance, that of its folder, states."""
+    found = _NAME.fullmatch(name)
+    if found is None or found[2] not in PHONES:
+        raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
+    return FrameLabel(found[1], found[2], int(found[3]))
 
-    name: str
-    scene: str
-    phone: str
-    iso: int
 
-    @classmethod
-    def parse(cls, name: str) -> SiddScene:
-        found = _NAME.fullmatch(name)
-        if found is None or found[2] not in PHONES:
-            raise ValueError(f"{name}: is not a SIDD scene instance such as 0052_002_S6_01600_01000_5500_N")
-        return cls(name, found[1], found[2], int(found[3]))
-
-    @property
-    def cfa(self) -> CFA:
-        return PHONES[self.phone][1]
-
-    @property
-    def camera(self) -> str:
-        return PHONES[self.phone][0]
+def phone_of(name: str) -> tuple[str, CFA]:
+    """Of a scene instance the phone, and the pattern of its frames."""
+    return PHONES[label_of(name).phone]
 
 
 def is_scene(name: str) -> bool:
@@ -95,7 +84,7 @@ class SiddFrames(LazyPairs):
     def __init__(self, path: str | Path, left_out: Sequence[str] = HELD_BACK) -> None:
         self.path = Path(path)
         self.shots = [
-            (SiddScene.parse(scene), number, files)
+            (scene, number, files)
             for (scene, number), files in sorted(indexed(self.path).items())
             if "NOISY_RAW" in files and scene not in left_out
         ]
@@ -106,8 +95,8 @@ class SiddFrames(LazyPairs):
         if not self.shots:
             raise ValueError(f"{path}: contains no NOISY_RAW training frames of SIDD")
         self.levels = noise_level_functions(self.path)
-        self.labels = [FrameLabel(scene.scene, scene.phone, scene.iso) for scene, *_ in self.shots]
-        super().__init__([f"{scene.name}_{number}" for scene, number, _ in self.shots])
+        self.labels = [label_of(scene) for scene, *_ in self.shots]
+        super().__init__([f"{scene}_{number}" for scene, number, _ in self.shots])
 
     def read(self, index: int) -> Pair:
         scene, _, files = self.shots[index]
@@ -116,14 +105,14 @@ class SiddFrames(LazyPairs):
             sizes = f"{tuple(clean.shape[1:])} and {tuple(noisy.shape[1:])}"
             raise ValueError(f"{files['NOISY_RAW']}: the clean and the noisy frame differ in size, {sizes}")
         gains, matrix, view = colour_of(files["METADATA_RAW"])
-        published = self.levels.get(scene.name)
+        (camera, cfa), published = phone_of(scene), self.levels.get(scene)
         shot_var, read_var = published or measured_levels(clean, noisy)
-        known: dict[str, Any] = {"noisy": noisy, "shot_var": shot_var, "read_var": read_var, "camera": scene.camera}
+        known: dict[str, Any] = {"noisy": noisy, "shot_var": shot_var, "read_var": read_var, "camera": camera}
         for key, kind in (("srgb", "GT_SRGB"), ("noisy_srgb", "NOISY_SRGB")):
             if kind in files:
                 known[key] = _turned_back(files[kind], view, self.max_pixels)
         known["levels_from_clean"] = published is None
-        return developed_pair(self.names[index], clean, scene.cfa, gains, matrix, **known)
+        return developed_pair(self.names[index], clean, cfa, gains, matrix, **known)
 
 
 def mosaic_of(file: Path) -> Tensor:
@@ -216,9 +205,6 @@ def _correlation(a: Tensor, b: Tensor) -> Tensor:
 BLOCKS = 32
 """Blocks of a frame."""
 
-MOST_FRAMES = 1000
-"""Of SIDD+, which has 32."""
-
 _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
 
@@ -244,8 +230,8 @@ class _Known(NamedTuple):
     """What is stated of a frame: published levels, and its colour, if there are any."""
 
     name: str
-    cfa: CFA
     camera: str
+    cfa: CFA
     levels: tuple[float, float] | None = None
     colour: Colour | None = None
 
@@ -307,8 +293,8 @@ class SiddBlocks(_Blocks):
         super().__init__(Path(path), HELD_BACK)
 
     def _known(self, number: int) -> _Known:
-        shot = SiddScene.parse(HELD_BACK[number])
-        return _Known(shot.name, shot.cfa, shot.camera, self._levels.get(shot.name), self._colours.get(shot.name))
+        name = HELD_BACK[number]
+        return _Known(name, *phone_of(name), self._levels.get(name), self._colours.get(name))
 
     def _read_all(self) -> dict[str, Tensor]:
         clean, noisy = (blocks_of_scenes(file) for file in self.files)
@@ -329,7 +315,7 @@ class SiddPlusBlocks(_Blocks):
         super().__init__(Path(path), [f"siddplus_{k:02d}" for k in range(len(self.cfas))])
 
     def _known(self, number: int) -> _Known:
-        return _Known(f"frame {number}", self.cfas[number], "SIDD+")
+        return _Known(f"frame {number}", "SIDD+", self.cfas[number])
 
     def _read_all(self) -> dict[str, Tensor]:
         clean, noisy = (normalised(read_array(file, file.stem), 3, file) for file in self.files)
@@ -396,10 +382,7 @@ def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -
 def _patterns(file: Path) -> list[CFA]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
-            names = [row[0].strip().upper() for row in csv.reader(stream) if row]
-        if len(names) > MOST_FRAMES:
-            raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
-        return [CFA(name) for name in names]
+            return [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
 

@@ -31,7 +31,7 @@ from rawaug.bayer import CFA
 from rawaug.data.development import color_matrix, white_balance
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import Lazy, Pair
-from rawaug.data.sidd import BLOCKS, HELD_BACK, Once, SiddScene, blocks_of_scenes, find_file, noise_level_functions
+from rawaug.data.sidd import BLOCKS, HELD_BACK, Once, blocks_of_scenes, find_file, noise_level_functions, phone_of
 from rawaug.io import RawFrame
 from rawaug.registry import DATASETS
 
@@ -52,7 +52,7 @@ class SiddBenchmark(Lazy[RawFrame]):
 
     def read(self, index: int) -> RawFrame:
         scene, block = divmod(index, BLOCKS)
-        cfa, levels = SiddScene.parse(HELD_BACK[scene]).cfa, self.levels.get(HELD_BACK[scene])
+        (_, cfa), levels = phone_of(HELD_BACK[scene]), self.levels.get(HELD_BACK[scene])
         return RawFrame(self._all()[scene, block], cfa, noise_profile=levels, name=self.names[index], color_known=False)
 
 

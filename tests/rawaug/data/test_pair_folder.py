@@ -180,7 +180,7 @@ def test_what_is_no_mosaic_or_no_pair_is_refused(tmp_path: Path) -> None:
     assert "a.npz: cannot be read as NPZ" in refused(other)
     (other / "a.npz").unlink()
     (other / "a.mat").write_bytes(b"no")
-    assert "a.mat: is not a MATLAB file" in refused(other)
+    assert "a.mat: cannot be read as a MATLAB file" in refused(other)
 
 
 def cut(folder: Path) -> Path:
