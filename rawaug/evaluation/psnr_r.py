@@ -10,52 +10,38 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.data.pairs import Pair
 from rawaug.isp import staged
-from rawaug.isp.config import ISPParams
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float, place_in_frame
-from rawaug.metrics import PATCH, patch_psnr, psnr
+from rawaug.metrics import PATCH, patch_psnr
 from rawaug.seeding import keyed_generator
-
-STRIP = 256
 
 
 @torch.no_grad()
 def psnr_r(isp: DictionaryISP, pair: Pair, white_balance: bool = False, patches: int | None = None) -> float:
     """PSNR_r of one frame, with its as-shot ``white_balance`` if asked; of an unregistered pair that of block averages.
 
-    With ``patches``, so many of a registered frame are scored (:func:`windows_of`). ValueError if the picture is not in
-    the camera's colours, as SIDD's blocks without their sRGB files.
+    Of a registered frame ``patches`` are scored, all by default. ValueError if the picture is not in the camera's
+    colours, as SIDD's blocks without their sRGB files.
     """
     pair.require_rendered()
     given = pair.white_balance if white_balance else None
     if pair.registered:
         params = staged.with_white_balance(isp, isp.choose(pair.srgb[None]), given, None)
-        if patches is not None:
-            return windows_psnr(lambda patch, place: isp.reverse(patch, params, place=place).raw, pair, patches)
-        return patch_psnr(mosaic_of(isp, pair, params), pair.raw[None]).item()
+
+        def made(patch: Tensor, place: Tensor) -> Tensor:
+            return bayer.mosaic(isp.reverse_pixels(as_float(patch), params, place), pair.cfa)
+
+        return windows_psnr(made, pair, patches)
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     params = staged.with_white_balance(isp, isp.choose(blocks.srgb[None]), given, None)
-    made = isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0]
-    return block_psnr(made, blocks.raw, blocks.clipped)
+    return block_psnr(isp.reverse_pixels(blocks.srgb[None], params, blocks.place)[0], blocks.raw, blocks.clipped)
 
 
 def block_psnr(made: Tensor, raw: Tensor, clipped: Tensor) -> float:
     """PSNR between block averages ``(3, h, w)``, blocks with a clipped reading ``(h, w)`` left out."""
     error = (made.clamp(0.0, 1.0) - raw) ** 2
     return -10.0 * error[:, ~clipped].mean().log10().item()
-
-
-@torch.no_grad()
-def mosaic_of(isp: DictionaryISP, pair: Pair, params: ISPParams) -> Tensor:
-    """The RAW ``(1, 1, H, W)`` that ``params`` make of the pair's sRGB, in [0, 1], strip by strip to bound memory."""
-    height, width = pair.raw.shape[-2:]
-    strips = []
-    for top in range(0, height, STRIP):
-        strip = as_float(pair.srgb[None, :, top : top + STRIP])
-        place = place_in_frame(strip.shape[-2], width, (top, 0), (height, width))
-        strips.append(bayer.mosaic(isp.reverse_pixels(strip, params, place), pair.cfa).clamp_(0.0, 1.0))
-    return torch.cat(strips, dim=-2)
 
 
 def windows_of(pair: Pair, count: int | None) -> list[tuple[int, int]]:
@@ -75,5 +61,5 @@ def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: in
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
         place = place_in_frame(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
-        values.append(psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]).item())
-    return sum(values) / len(values)
+        values.append(patch_psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]))
+    return torch.cat(values).mean().item()
