@@ -15,7 +15,7 @@ from rawaug.commands import YAML
 from rawaug.files import require_writable
 from rawaug.io import read_picture, write_picture
 from rawaug.io.isolated import isolated
-from rawaug.io.pictures import MAX_PIXELS, read_exposure
+from rawaug.io.pictures import read_exposure
 from rawaug.isp.exposures import merge_exposures, render_exposure
 from rawaug.isp.model import DictionaryISP
 from rawaug.registry import require_between
@@ -32,7 +32,6 @@ def run(
     exposure: float = 0.0,
     isp: str = "universal",
     overwrite: bool = False,
-    max_pixels: int = MAX_PIXELS,
 ) -> None:
     """Merge exposures of a scene in RAW, or change the exposure of a single picture.
 
@@ -43,13 +42,12 @@ def run(
         exposure: exposure of the result in stops, relative to the picture at 0 EV.
         isp: ISP file of the camera, or the name of a shipped ISP.
         overwrite: replace the output file if it exists.
-        max_pixels: a larger picture is refused before it is decoded.
     """
     target = Path(out)
     require_writable(target)
     if target.exists() and not overwrite:
         raise FileExistsError(f"{out}: exists; choose another name, or add --overwrite")
-    srgb = hdr(pictures, ev, exposure, isp, max_pixels)
+    srgb = hdr(pictures, ev, exposure, isp)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_picture(target, srgb)
     print(out)
@@ -60,14 +58,13 @@ def hdr(
     ev: Sequence[float] | None = None,
     exposure: float = 0.0,
     isp: str | Path = "universal",
-    max_pixels: int = MAX_PIXELS,
 ) -> Tensor:
     """The merged picture ``(3, H, W)`` in [0, 1]; arguments and errors as in :func:`run`."""
     stops = exposures(pictures, ev)
     for value in (*stops, exposure):
         require_between("an exposure", value, -MOST_STOPS, MOST_STOPS)
     camera = DictionaryISP.from_pretrained(isp)
-    merged = merge_exposures(camera, [srgb[None] for srgb in _read(pictures, max_pixels)], stops)
+    merged = merge_exposures(camera, [srgb[None] for srgb in _read(pictures)], stops)
     return render_exposure(camera, merged.image, merged.params, exposure)[0]
 
 
@@ -84,8 +81,8 @@ def exposures(pictures: Sequence[str | Path], ev: Sequence[float] | None) -> lis
     return [stops - median for stops in stated]
 
 
-def _read(pictures: Sequence[str | Path], max_pixels: int) -> list[Tensor]:
-    read = [isolated(read_picture, path, max_pixels) for path in pictures]
+def _read(pictures: Sequence[str | Path]) -> list[Tensor]:
+    read = [isolated(read_picture, path) for path in pictures]
     for path, picture in zip(pictures, read, strict=True):
         if picture.shape != read[0].shape:
             size, first = (f"{one.shape[1]} x {one.shape[2]}" for one in (picture, read[0]))

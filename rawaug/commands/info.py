@@ -38,23 +38,18 @@ def as_json(weights: str | Path) -> dict[str, Any]:
 def describe(weights: str | Path) -> str:
     """Kind, size, settings and, for an ISP, its atoms as numbers."""
     path = find_weights(weights, FOLDER)
-    kind = read_header(path)["kind"]
-    if kind == "isp":
+    if read_header(path)["kind"] == "isp":
         return _describe_isp(path)
-    model, info = denoisers.load(path)
-    lines = [f"{path}: denoiser {type(model).__name__}, {_millions(model)} M parameters"]
-    lines += [f"  {key}: {dumps(value)}" for key, value in {**model.config, **info}.items()]
+    content = as_json(path)
+    lines = [f"{path}: denoiser {content['name']}, {content['parameters'] / 1e6:.3f} M parameters"]
+    lines += [f"  {key}: {dumps(value)}" for key, value in {**content["config"], **content["info"]}.items()]
     return "\n".join(lines)
-
-
-def _millions(model: DictionaryISP | denoisers.Denoiser) -> str:
-    return f"{sum(p.numel() for p in model.parameters()) / 1e6:.3f}"
 
 
 def _describe_isp(path: Path) -> str:
     isp = DictionaryISP.from_pretrained(path)
-    config = isp.config
-    lines = [f"{path}: dictionary ISP, {_millions(isp)} M parameters, {isp.cfa} output"]
+    config, parameters = isp.config, sum(p.numel() for p in isp.parameters())
+    lines = [f"{path}: dictionary ISP, {parameters / 1e6:.3f} M parameters, {isp.cfa} output"]
     lines.append(f"  stages: {' '.join(config.stages)} mosaic; encoders {'on' if config.encoders else 'off'}")
     weights = isp.reverse_encoders.gain.prior.softmax(0)
     lines.append("  gain atoms (digital, red, blue; constant weight):")

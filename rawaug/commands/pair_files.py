@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from rawaug.commands.pair_maker import Format, Origin, PairMaker, noise_levels, replayed
-from rawaug.data.formats import write_npz, write_png, write_tiff
-from rawaug.files import digest, read_header, write_tensors
+from rawaug.data.formats import write_npz, write_tiff
+from rawaug.files import digest, read_header, replacing, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
+from rawaug.io.pictures import encode_png
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
@@ -110,7 +111,8 @@ def _write_tiffs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
 
 def _write_pngs(stem: Path, pair: RawPair, augment: RawAugment) -> None:
     for end, image in _images(pair, augment).items():
-        write_png(Path(f"{stem}{end}.png"), image)
+        with replacing(f"{stem}{end}.png") as partial:
+            partial.write_bytes(encode_png(image))
 
 
 _WRITERS: dict[Format, Callable[[Path, RawPair, RawAugment], None]] = {

@@ -200,16 +200,6 @@ def _read_png(file: Path, which: str, alone: bool, max_pixels: int) -> Found:
     return numbers, {}
 
 
-def write_png(file: Path, srgb: Tensor) -> None:
-    """sRGB ``(3, H, W)`` in [0, 1], 8 bits."""
-    with extra("raw"):
-        from PIL import Image
-
-    pixels = (srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous()
-    with replacing(file) as partial:
-        Image.fromarray(pixels.numpy()).save(partial, "PNG")
-
-
 READERS: dict[str, Callable[[Path, str, bool, int], Found]] = {
     ".npz": _read_npz,
     ".tif": _read_tiff,

@@ -18,7 +18,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -39,6 +38,7 @@ from rawaug.evaluation.tables import (
     levels_note,
     verdict,
 )
+from rawaug.io.pictures import encode_png
 
 WINDOW = 64
 """Side in packed pixels of the enlarged windows."""
@@ -181,16 +181,6 @@ def most_detailed(packed: Tensor) -> tuple[int, int]:
     scores = F.avg_pool2d(steep, size, stride=4)
     place = int(scores.argmax())
     return 4 * (place // scores.shape[-1]), 4 * (place % scores.shape[-1])
-
-
-def encode_png(srgb: Tensor) -> bytes:
-    """sRGB ``(3, H, W)`` in [0, 1] as a PNG file."""
-    with extra("train"):
-        from PIL import Image
-
-    file = io.BytesIO()
-    Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).numpy()).save(file, "PNG")
-    return file.getvalue()
 
 
 def draw_curves(logs: Mapping[str, Sequence[Path]]) -> dict[str, bytes]:

@@ -27,14 +27,14 @@ from denoisers.network import Denoiser
 from rawaug import bayer
 from rawaug.data.pairs import Pair, Sample
 from rawaug.evaluation.contestants import Contestant, contestant
-from rawaug.evaluation.page import Figure, Page, Part, draw_curves, encode_png, most_detailed
+from rawaug.evaluation.page import Figure, Page, Part, draw_curves, most_detailed
 from rawaug.evaluation.scores import label_of
 from rawaug.evaluation.tables import print_rows
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe
 from rawaug.files import write_json
 from rawaug.io import RawFrame, develop, write_dng
-from rawaug.io.pictures import write_picture
+from rawaug.io.pictures import encode_png, write_picture
 from rawaug.isp.model import DictionaryISP
 from rawaug.kernels.runtime import find_device
 from rawaug.metrics import psnr, ssim

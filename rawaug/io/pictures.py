@@ -104,6 +104,16 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_reason(output) or 'no reason given'})")
 
 
+def encode_png(srgb: Tensor) -> bytes:
+    """sRGB ``(3, H, W)`` in [0, 1] as a PNG file of 8 bits."""
+    with extra("raw"):
+        from PIL import Image
+
+    file = BytesIO()
+    Image.fromarray((srgb * 255.0).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()).save(file, "PNG")
+    return file.getvalue()
+
+
 def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     """Pixels uint8 ``(H, W, 3)`` as stored, and the EXIF orientation."""
 
