@@ -161,8 +161,10 @@ class Pair:
 
     def _changed(self, change: Callable[[Tensor], Tensor], **known: Any) -> Pair:
         """With every image changed, and attributes that are ``known`` besides."""
-        images = {key: getattr(self, key) for key in ("srgb", "raw", "noisy", "noisy_srgb")}
-        return replace(self, **{key: change(image) for key, image in images.items() if image is not None}, **known)
+        for key in ("srgb", "raw", "noisy", "noisy_srgb"):
+            if (image := getattr(self, key)) is not None:
+                known[key] = change(image)
+        return replace(self, **known)
 
     def _require_shape(self, field: str, image: Tensor, channels: int, dtype: torch.dtype) -> None:
         expected = (channels, *self.raw.shape[-2:])

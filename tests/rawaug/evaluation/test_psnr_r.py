@@ -19,7 +19,8 @@ def test_patch_by_patch_it_is_that_of_the_whole_mosaic() -> None:
     pair = demo_pairs("validation", count=1)[0]
     isp = DictionaryISP(ISPConfig(cfa="GRBG"))
     cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
-    tall = replace(pair, **{k: torch.cat([getattr(pair, k)] * 2, 1) for k in ("srgb", "raw", "noisy")})
+    twice: dict[str, Any] = {key: torch.cat([getattr(pair, key)] * 2, 1) for key in ("srgb", "raw", "noisy")}
+    tall = replace(pair, **twice)
     with torch.no_grad():
         whole = isp.reverse(tall.srgb[None]).raw.clamp(0.0, 1.0)
     assert psnr_r(isp, tall) == pytest.approx(patch_psnr(whole, tall.raw[None]).item(), abs=1e-5)
