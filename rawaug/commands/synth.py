@@ -104,14 +104,14 @@ def synth(
 ) -> Synthesis:
     """Make ``per_image`` pairs of every picture of a folder and its subfolders, or of one; existing pairs are kept.
 
+    The other arguments are as in :func:`run`; :mod:`rawaug.commands.pair_files` and
+    :mod:`rawaug.commands.pair_shards` say what is written.
+
     Args:
-        source: the folder of sRGB pictures, or one picture.
-        out: the folder of pairs: :mod:`rawaug.commands.pair_files` and :mod:`rawaug.commands.pair_shards` say how.
-        format: dng, npz, tiff, png or webdataset; dng for target raw, png for srgb only.
-        per_image: pairs per picture; may grow from run to run, but not in shards.
-        workers: number of processes; by default one per core, 0 for this process only. They start by forkserver or
-            spawn, so a script needs ``if __name__ == "__main__":`` around its main part.
-        seed, max_pixels, shard, per_shard: as in :func:`run`.
+        format: dng for target raw, png for srgb only.
+        per_image: may grow from run to run, but not in shards.
+        workers: 0 for this process only. Others start by forkserver or spawn, so a script needs
+            ``if __name__ == "__main__":`` around its main part.
         drawn: ``isp``, ``noise``, ``camera``, ..., as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
 
     Raises:

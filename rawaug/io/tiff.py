@@ -61,7 +61,8 @@ def read_tiff_tags(path: Path) -> TiffTags:
             if mosaic is None:
                 return TiffTags(make, model, profile)
             (above, rows), (beside, columns) = (_deltas(mosaic, code) for code in _BLACK_DELTAS)
-            black, end, maps = _black(mosaic, above + beside), _mosaic_end(mosaic), _gain_maps(mosaic)
+            black, maps = _black(mosaic, above + beside), _gain_maps(mosaic)
+            end = max(map(sum, zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)), default=None)
             area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
             return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2])
     except tifffile.TiffFileError:
@@ -115,11 +116,6 @@ def _noise_profile(pages: list[Any]) -> tuple[float, float] | None:
                 raise ValueError(f"NoiseProfile {shot_var:g}, {read_var:g}")
             return shot_var, read_var
     return None
-
-
-def _mosaic_end(mosaic: Any) -> int | None:
-    parts = zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)
-    return max((offset + count for offset, count in parts), default=None)
 
 
 def _numbers(tag: Any) -> Any:

@@ -26,7 +26,6 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import singledispatch
 from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean
@@ -147,28 +146,24 @@ def _makers(model: Method, pair: Pair) -> dict[str, Callable[[Tensor, Tensor], T
     return {row: maker(given) for row, given in settings(model, pair).items()}
 
 
-@singledispatch
-def settings(model: Any, pair: Pair) -> dict[str, Any]:
+def settings(model: Method, pair: Pair) -> dict[str, Any]:
     """Row to the camera setting that it is made with; a method that has no use for gains has one row."""
+    if isinstance(model, DictionaryISP):
+        return dictionary_params(model, pair)
     balanced = model.balanced(pair.white_balance) if pair.balance_known else None
     return {"blind": None} | ({} if balanced is None else {"as-shot": balanced})
 
 
-@singledispatch
-def _block_rows(model: Any, pair: Pair) -> dict[str, float]:
+def _block_rows(model: Method, pair: Pair) -> dict[str, float]:
+    if isinstance(model, DictionaryISP):
+        rows = {"blind": psnr_r(model, pair)}
+        return rows | ({"as-shot": psnr_r(model, pair, white_balance=True)} if pair.balance_known else {})
     blocks = block_averages(pair.srgb, pair.raw, pair.cfa)
     with torch.no_grad():
         made = model.unprocess(blocks.srgb[None])[0]
     return {"blind": block_psnr(made, blocks.raw, blocks.clipped)}
 
 
-@_block_rows.register
-def _(model: DictionaryISP, pair: Pair) -> dict[str, float]:
-    rows = {"blind": psnr_r(model, pair)}
-    return rows | ({"as-shot": psnr_r(model, pair, white_balance=True)} if pair.balance_known else {})
-
-
-@settings.register
 def dictionary_params(isp: DictionaryISP, pair: Pair) -> dict[str, ISPParams]:
     """The camera settings of the dictionary's rows for a frame."""
     with torch.no_grad():
@@ -194,15 +189,12 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
 def cycle_psnr(fitted: Fitted, pictures: Sequence[Tensor]) -> dict[str, float]:
     """Mean PSNR of sRGB -> RAW -> sRGB over pictures ``(3, H, W)`` uint8; empty for a method without a way back."""
     model, shown = fitted.model, [as_float(picture[None]) for picture in pictures]
-    if isinstance(model, DictionaryISP):
-        without = fmean(psnr(cycled_without_mosaic(model, x), x).item() for x in shown)
-        return {"cycle": fmean(psnr(_cycled(model, x), x).item() for x in shown), "cycle_without_mosaic": without}
-    return {"cycle": fmean(psnr(model.cycle(x), x).item() for x in shown)} if model.bidirectional else {}
-
-
-def _cycled(isp: DictionaryISP, srgb: Tensor) -> Tensor:
-    result = isp.reverse(srgb)
-    return isp.forward(result.raw.clamp(0.0, 1.0), result.params).srgb
+    if not isinstance(model, DictionaryISP):
+        return {"cycle": fmean(psnr(model.cycle(x), x).item() for x in shown)} if model.bidirectional else {}
+    made = (model.reverse(x) for x in shown)
+    cycled = [model.forward(result.raw.clamp(0.0, 1.0), result.params).srgb for result in made]
+    ways = {"cycle": cycled, "cycle_without_mosaic": [cycled_without_mosaic(model, x) for x in shown]}
+    return {way: fmean(psnr(a, b).item() for a, b in zip(found, shown, strict=True)) for way, found in ways.items()}
 
 
 def cycled_without_mosaic(isp: DictionaryISP, srgb: Tensor) -> Tensor:

@@ -98,14 +98,6 @@ def test_the_pairs_are_those_of_other_formats(pictures: Path, whole: Path, tmp_p
     assert described["shot_var"] == pytest.approx(FIXED[0]) and described["isp"] == "universal"
 
 
-def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path, tmp_path: Path) -> None:
-    described = json.loads(samples(whole)["00000004_1"]["json"])
-    (tmp_path / "sub").mkdir()
-    (tmp_path / described["picture"]).write_bytes((pictures / "z.png").read_bytes())
-    with pytest.raises(ValueError, match=r"sub/a\.png: the picture .* has changed since"):
-        replay_sample(described, tmp_path)
-
-
 def test_bursts_of_developed_pictures_are_replayed(pictures: Path, tmp_path: Path) -> None:
     form: dict[str, Any] = {"target": "srgb", "jpeg": (60, 90), "burst": 2}
     synth(pictures / "z.png", tmp_path, "webdataset", noise=FIXED, workers=0, **form)

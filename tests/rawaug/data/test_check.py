@@ -99,22 +99,6 @@ def test_blocks_of_a_submission_are_counted(tmp_path: Path, monkeypatch: pytest.
     assert (part.items, part.examined, dict(part.counts["sizes"])) == (6, 5, {"8 x 8": 5})
 
 
-def test_what_crashes_the_helper_is_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_pictures(tmp_path, 4)
-    module = sys.modules["rawaug.data.check"]
-    whole = module.isolated
-
-    def isolated(read: Any, opening: bytes, index: int, name: object) -> Any:
-        if index == 1:
-            raise OSError(f"{name}: crashes the decoder")
-        return whole(read, opening, index, name=name)
-
-    monkeypatch.setattr(module, "isolated", isolated)
-    (part,) = check(tmp_path).parts
-    assert part.counts["sizes"].total() == 3 and part.items == part.examined == 4
-    assert part.broken == [f"{tmp_path / '1.png'}: crashes the decoder"]
-
-
 def test_what_is_unknown_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
         check(tmp_path / "none")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -80,18 +79,6 @@ def test_a_file_cut_short_is_one_line(written: Callable[[dict[str, Any]], Path],
     with pytest.raises(OSError, match=r"a\.mat: cannot be read as a MATLAB file .*; copy it again") as caught:
         read_array(path, "x")
     assert "\n" not in str(caught.value)
-
-
-def _crash(path: Path, name: str, plain: bool) -> None:
-    ctypes.string_at(0)
-
-
-def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    savemat(tmp_path / "a.mat", {"x": ARRAY})
-    monkeypatch.setattr("rawaug.data.mat._read", _crash)
-    monkeypatch.setenv("RAWAUG_READ_SECONDS", "60")
-    with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(SIGSEGV"):
-        read_array(tmp_path / "a.mat", "x")
 
 
 def test_variables_beyond_reason_and_in_other_files_are_refused(tmp_path: Path, mat73: Writer) -> None:

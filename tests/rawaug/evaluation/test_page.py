@@ -84,11 +84,3 @@ def test_a_curve_of_one_point_is_seen(tmp_path: Path) -> None:
         pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
         legend_alone = 60  # pixels of the line beside the arm's name
         assert (pixels == (31, 119, 180)).all(axis=2).sum() > legend_alone + 20
-
-
-def test_nothing_is_wider_than_a_phone_but_what_scrolls(page: str) -> None:
-    assert page.count('<div class="table"><table>') == page.count("<table>") == 4
-    (style,) = re.findall(r"<style>(.*?)</style>", page, re.DOTALL)
-    assert ".table { overflow-x: auto" in style and "img { max-width: 100%" in style
-    assert all(int(width) < 400 for width in re.findall(r"[^-]width: (\d+)px", style))
-    assert 'name="viewport" content="width=device-width, initial-scale=1"' in page

@@ -88,14 +88,6 @@ def test_exif_orientation_is_respected(tmp_path: Path, orientation: int) -> None
     assert np.array_equal(read_picture(tmp_path / "turned.png").permute(1, 2, 0).numpy(), upright)
 
 
-@pytest.mark.parametrize("extension", ["jpg", "tif"])
-def test_cmyk_is_refused(tmp_path: Path, extension: str) -> None:
-    path = tmp_path / f"print.{extension}"
-    Image.fromarray(PIXELS).convert("CMYK").save(path)
-    with pytest.raises(ValueError, match=rf"print\.{extension}: is CMYK; convert it to sRGB first"):
-        read_picture(path)
-
-
 @pytest.mark.parametrize("extension", ["gif", "webp"])
 @pytest.mark.parametrize("settings", [{}, {"duration": 100}], ids=["frames", "timed"])
 def test_animations_are_refused_and_stills_are_not(tmp_path: Path, extension: str, settings: dict[str, Any]) -> None:

@@ -43,9 +43,3 @@ def test_a_dry_run_tries_everything_once_and_writes_nothing(
 ) -> None:
     dry_run(settings.experiment, replace(settings, out=str(tmp_path)))
     assert "no problems found" in capsys.readouterr().out and not list(tmp_path.iterdir())
-
-
-def test_a_dry_run_finds_what_the_run_would(frames: list[Pair], tmp_path: Path) -> None:
-    del frames[1:]
-    with pytest.raises(ValueError, match="mine has 1 frame; leave-one-out needs two or more"):
-        dry_run("ablation", Ablation(data="mine", out=str(tmp_path)))
