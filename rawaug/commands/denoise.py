@@ -48,9 +48,6 @@ from rawaug.io.raw import develop
 from rawaug.progress import progress
 from rawaug.registry import Spec
 
-UNREADABLE = (".braw", ".crm", ".gpr", ".r3d", ".x3f")
-"""Extensions of RAW that the decoder does not read."""
-
 
 def run(
     source: str,
@@ -119,12 +116,11 @@ class Denoised:
 
 @dataclass
 class DenoisedFolder:
-    """What a run over a folder did: files done, done before, failed with the reason, and RAW of unknown kinds."""
+    """What a run over a folder did: files done, done before, and failed with the reason."""
 
     files: list[Denoised] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
-    unread: list[str] = field(default_factory=list)
 
 
 def denoise_file(
@@ -150,9 +146,6 @@ def denoise_file(
         FileNotFoundError, OSError: if a file is missing or cannot be read or written.
         ValueError: if the source is no Bayer RAW, its noise is unknown, ``strength`` is not in [0, 1], or ``out`` is
             no DNG, the source itself, or there already.
-
-    Example:
-        >>> denoise_file("shot.dng", "shot-denoised.dng")  # doctest: +SKIP
     """
     source, out = Path(source), Path(out)
     if out.suffix.lower() != ".dng":
@@ -246,10 +239,7 @@ def denoise_folder(
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
-    result = DenoisedFolder(
-        unread=[file.name for file in sorted(source.rglob("*")) if file.suffix.lower() in UNREADABLE]
-    )
-    read, unknown = partial(isolated, read_raw), []
+    result, read, unknown = DenoisedFolder(), partial(isolated, read_raw), []
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists() and not overwrite:
             result.existing += 1
@@ -306,5 +296,3 @@ def print_denoised(result: DenoisedFolder) -> None:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for reason in result.broken.values():
         print(escape(reason))
-    if result.unread:
-        print(escape(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))

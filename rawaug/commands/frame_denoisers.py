@@ -8,6 +8,7 @@ packed RAW and its noise map shot_var max(y, 0) + read_var, a filter the same RA
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -90,11 +91,10 @@ def _automatic(frame: RawFrame) -> tuple[float, float, str]:
         return _checked_profile(frame, frame.noise_profile)
     try:
         return _estimated(frame)
-    except UnknownNoise as error:
-        try:
+    except UnknownNoise:
+        with suppress(ValueError):
             return *_published(frame, frame.camera), f"published for {frame.camera}"
-        except ValueError:
-            raise error from None
+        raise
 
 
 def _estimated(frame: RawFrame) -> tuple[float, float, str]:
@@ -106,10 +106,9 @@ def _estimated(frame: RawFrame) -> tuple[float, float, str]:
     source = f"estimate, R^2 {estimate.r2:.2f}"
     if estimate.r2 < LOOSE:
         source += ": uncertain, the points follow no line"
-    try:
+    least = 0.0
+    with suppress(ValueError):
         least = _published(frame, frame.camera)[1] / 2
-    except ValueError:
-        least = 0.0
     if estimate.read_var < least:
         source += "; read_var is half the camera's published one"
     return estimate.shot_var, max(estimate.read_var, least), source

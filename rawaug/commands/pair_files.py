@@ -129,9 +129,6 @@ def replay(params: str | Path, picture: str | Path | None = None, isp: str | Pat
     Args:
         params: ``NAME.safetensors`` of a pair.
         picture, isp: the sRGB picture and the ISP's file, if they have moved since; ValueError if they have changed.
-
-    Example:
-        >>> pair = replay("pairs/photograph_0.safetensors")  # doctest: +SKIP
     """
     drawn, header = load_params(params), read_header(params)
     if "origin" not in header:

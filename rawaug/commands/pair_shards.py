@@ -136,9 +136,6 @@ def replay_sample(described: Mapping[str, Any], pictures: str | Path, isp: str |
         described: the sample's JSON.
         pictures: the folder that the shards were made from; ValueError if the picture has changed since.
         isp: the ISP's file, unless it is a shipped one.
-
-    Example:
-        >>> pair = replay_sample(sample["json"], "photographs")  # doctest: +SKIP
     """
     tensors = {key: torch.tensor(value) for key, value in described["params"].items()}
     origin = Origin(**{key: described[key] for key in Origin.__dataclass_fields__ if key in described})

@@ -200,9 +200,6 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
         split: ``"train"``, ``"validation"`` or ``"test"``.
         count: number of pairs, by default that of :data:`PAIRS`.
 
-    Raises:
-        ValueError: if there is no such split, or ``count`` is not positive.
-
     Example:
         >>> pair = demo_pairs("train", count=1)[0]
         >>> pair.raw.shape, pair.cfa, pair.noisy is not None

@@ -283,10 +283,6 @@ class RawFolder(LazyPairs):
         adjust_maximum_thr: LibRaw's scaling by the frame's own maximum, off by default.
         jpeg_quality: LibRaw's rendering as a JPEG of this quality gives it back; None leaves it as it is.
         max_pixels: of a JPEG; a larger one is an error of its pair.
-
-    Raises:
-        FileNotFoundError: if a file or the folder does not exist.
-        ValueError: if the folder holds no RAW file.
     """
 
     def __init__(

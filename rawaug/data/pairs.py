@@ -328,15 +328,7 @@ class Middles(SomePairs):
 
 
 class Binned(SomePairs):
-    """All pairs of a sequence, binned by colour site: references with less noise of their own.
-
-    Args:
-        pairs: the sequence.
-        factor: the mean of factor x factor sites of a colour is one site.
-        together: see :func:`rawaug.bayer.bin_mosaic`.
-
-    Raises:
-        ValueError: if the factor is below 1.
+    """All pairs of a sequence, :meth:`Pair.binned`: references with less noise of their own.
 
     Example:
         >>> from rawaug.data import demo_pairs

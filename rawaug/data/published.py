@@ -186,16 +186,11 @@ _BITS = 10
 
 @DATASETS.register("zurich")
 class Zurich(LazyPairs):
-    """The pairs of a split, sorted by number.
+    """The pairs of a split, sorted by number; PNGs of 8 bits hold a quarter of the digital numbers."""
 
-    ``black`` and ``white`` are in digital numbers of 10 bits; PNGs of 8 bits hold a quarter of them.
-    """
-
-    def __init__(
-        self, path: str | Path, split: str = "train", black: float = BLACK, white: float = ZURICH_WHITE
-    ) -> None:
+    def __init__(self, path: str | Path, split: str = "train") -> None:
         require_split("zurich", split, ("train", "test"))
-        self.folder, self.black, self.white = Path(path) / split, black, white
+        self.folder = Path(path) / split
         files = files_in(self.folder / "huawei_raw", "Zurich RAW to RGB", (".png",))
         self.files = sorted(files, key=lambda file: (len(file.stem), file.stem))  # 2 comes before 10
         existing = {file.stem for file in (self.folder / "canon").glob("*.jpg")}
@@ -210,7 +205,7 @@ class Zurich(LazyPairs):
         scale = 1.0 if numbers.dtype == np.uint16 else 0.25
         if numbers.max() >= scale * 2**_BITS:
             raise ValueError(f"{file}: has value {numbers.max()}, more than {_BITS} bits; it is of another dataset")
-        light = (numbers.astype(np.float32) - scale * self.black) / (scale * (self.white - self.black))
+        light = (numbers.astype(np.float32) - scale * BLACK) / (scale * (ZURICH_WHITE - BLACK))
         return Pair(
             name=self.names[index],
             srgb=read_picture(self.folder / "canon" / f"{file.stem}.jpg", self.max_pixels),

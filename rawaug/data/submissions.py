@@ -57,12 +57,9 @@ class SiddBenchmark(Lazy[RawFrame]):
 
 
 def write_submission(path: str | Path, blocks: Iterable[Tensor], side: int = SIDE) -> None:
-    """Write denoised mosaics, in the order of :class:`rawaug.data.SiddBenchmark`, as ``.csv`` or ``.mat``.
+    """Write 1,280 denoised mosaics ``(1, side, side)``, finite, in the order and patterns of :class:`SiddBenchmark`.
 
-    Args:
-        path: ``SubmitRaw.csv`` or ``SubmitRaw.mat``.
-        blocks: 1,280 tensors ``(1, side, side)``, finite, in the pattern that they came in; written as they are.
-        side: of the blocks.
+    ``path`` is ``SubmitRaw.csv`` or ``SubmitRaw.mat``; values are written as they are.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".mat"):
@@ -196,12 +193,7 @@ def no_clean_frames(path: str, split: str) -> Sequence[Pair]:
 
 
 def write_dnd_submission(folder: str | Path, denoised: Iterable[Tensor]) -> None:
-    """Write denoised boxes, in the order of :class:`Dnd`, as the benchmark's files ``0001.mat`` to ``0050.mat``.
-
-    Args:
-        folder: made where it does not exist.
-        denoised: 1,000 finite mosaics ``(1, H, W)``, in the pattern that they came in; written as they are.
-    """
+    """Write 1,000 denoised boxes ``(1, H, W)``, finite, in the order and patterns of :class:`Dnd`, as its 50 files."""
     from scipy.io import savemat
 
     folder = Path(folder)

@@ -81,10 +81,6 @@ def write_dng(
             the colour matrix or the orientation cannot be written.
         FileNotFoundError: if the source or the folder does not exist.
         OSError: if tags of the source are damaged.
-
-    Example:
-        >>> frame = read_raw("shot.cr2")  # doctest: +SKIP
-        >>> write_dng("shot.dng", frame, source="shot.cr2")  # doctest: +SKIP
     """
     path = Path(path)
     _require_colour(frame, path)

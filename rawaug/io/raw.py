@@ -158,11 +158,6 @@ def read_raw(path: str | Path) -> RawFrame:
         FileNotFoundError: if there is no such file.
         OSError: if LibRaw cannot read it, or it is truncated.
         ValueError: if it has no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
-
-    Example:
-        >>> frame = read_raw("shot.dng")  # doctest: +SKIP
-        >>> frame.mosaic.shape, frame.cfa  # doctest: +SKIP
-        (torch.Size([1, 3000, 4000]), <CFA.RGGB: 'RGGB'>)
     """
     with _opened(Path(path)) as (raw, tags):
         return _frame(Path(path), raw, tags)

@@ -326,17 +326,6 @@ out.write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
     assert int((tmp_path / "peak").read_text()) < 2 * 2**20  # KiB
 
 
-def test_a_real_dng_keeps_its_gain_maps(tmp_path: Path, camera_files: Path, identity: Path) -> None:
-    source = camera_files / "raw/gopro/hero6_0024.dng"
-    frame = read_raw(source)
-    cut = dataclasses.replace(frame, mosaic=frame.mosaic[:, :256, :256].contiguous())
-    write_dng(tmp_path / "cut.dng", cut, source)
-    denoise_file(tmp_path / "cut.dng", tmp_path / "b.dng", identity)
-    back = read_raw(tmp_path / "b.dng")
-    assert len(back.gain_maps) == 4 and back.orientation == 1 and back.iso == 100
-    assert torch.equal(back.shading_gains, cut.shading_gains) and torch.equal(back.mosaic, cut.mosaic)
-
-
 @pytest.fixture
 def joint(tmp_path: Path) -> Path:
     """The weights of a network that interpolates."""

@@ -48,11 +48,6 @@ def test_draws_go_by_seed_part_and_place(pictures: list[torch.Tensor]) -> None:
 SEEDS = ((3, "train"), (4, "train"), (3, "left-out"))
 
 
-def test_what_cannot_be_made_is_refused(pictures: list[torch.Tensor]) -> None:
-    with pytest.raises(ValueError, match="Nikon"):
-        synthetic_frames(pictures[:1], ["Nikon D7500X"], 0, "train")
-
-
 def grey(value: int) -> Pair:
     return Pair("g", torch.full((3, 2, 2), value, dtype=torch.uint8), torch.full((1, 2, 2), 0.3), CFA.RGGB)
 
