@@ -206,10 +206,7 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
         (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
     require_split("demo", split, PHOTOGRAPHS)
-    count = PAIRS[split] if count is None else count
-    if count < 1:
-        raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
-    return [_pair(split, k) for k in range(count)]
+    return [_pair(split, k) for k in range(PAIRS[split] if count is None else count)]
 
 
 def demo_pictures(count: int = 32) -> list[Tensor]:
@@ -217,8 +214,6 @@ def demo_pictures(count: int = 32) -> list[Tensor]:
 
     The photographs are those of the training pairs and five others, none of validation or test.
     """
-    if count < 1:
-        raise ValueError(f"demo: count must be at least 1, got {count}")
     photographs = _users_photographs()
     leaves = (_leaves(k) for k in range(count - len(photographs)))
     return [*photographs[:count], *leaves]

@@ -9,14 +9,6 @@ from rawaug.io.pictures import decode_srgb, encode_srgb, read_picture, write_pic
 from rawaug.io.raw import RawFrame, develop, read_raw, read_raw_and_develop
 
 __all__ = [
-    "GainMap",
-    "RawFrame",
-    "decode_srgb",
-    "develop",
-    "encode_srgb",
-    "read_picture",
-    "read_raw",
-    "read_raw_and_develop",
-    "write_dng",
-    "write_picture",
-]
+    "GainMap", "RawFrame", "decode_srgb", "develop", "encode_srgb", "read_picture", "read_raw", "read_raw_and_develop",
+    "write_dng", "write_picture",
+]  # fmt: skip

@@ -193,9 +193,6 @@ def fit_baseline(model: Model, pairs: Sequence[FramePair], training: Training) -
     """Fit one of :data:`rawaug.paper.baselines.BASELINES` in place; ``model.info`` records steps, seconds and loss.
 
     UPI as published comes back as it is; tuned UPI is solved in closed form, whatever the budget.
-
-    Raises:
-        ValueError: if there is no budget or no pair, or a frame is smaller than a crop or not registered.
     """
     if not pairs:
         raise ValueError("no RAW-sRGB pair to fit; give at least one RAW file")

@@ -340,14 +340,8 @@ def test_linear_dngs_have_the_colours_of_the_scene(tmp_path: Path, bayer_dng: Dn
     y, x = np.mgrid[0.05:0.6:96j, 0.05:0.8:128j]
     with rawpy.imread(str(out)) as file:
         numbers = file.raw_image_visible.astype(np.float64)
-        linear = {
-            "gamma": (1, 1),
-            "no_auto_bright": True,
-            "adjust_maximum_thr": 0,
-            "user_wb": [1, 1, 1, 1],
-            "output_bps": 16,
-        }
-        developed = file.postprocess(output_color=rawpy.ColorSpace.raw, user_flip=0, **linear) / 65535
+        linear = {"gamma": (1, 1), "no_auto_bright": True, "adjust_maximum_thr": 0, "output_bps": 16, "user_flip": 0}
+        developed = file.postprocess(output_color=rawpy.ColorSpace.raw, user_wb=[1, 1, 1, 1], **linear) / 65535
     signal = numbers[..., :3] / 65535
     assert developed.mean((0, 1)) == pytest.approx(signal.mean((0, 1)), rel=1e-3), "LibRaw shows it as bright"
     for colour, expected in enumerate((x, y, (x + y) / 2)):

@@ -28,12 +28,8 @@ def info(k: int) -> dict[str, Any]:
     """An element of ``info``; boxes of 6 x 8 from (2 b + k % 2, 3) on, counted from 1."""
     pattern = np.array(["RGB".index(colour) + 1.0 for colour in CFAS[k % 4]]).reshape(2, 2)
     boxes = np.array([[1 + b // 2 + k % 2, 4 + b % 4, 6 + b // 2 + k % 2, 11 + b % 4] for b in range(20)], float)
-    camera = {
-        "pattern": pattern,
-        "AsShotNeutral": np.array([[0.5], [1.0], [0.8]]),
-        "ColorMatrix2": np.eye(3).reshape(1, 9),
-    }
-    return {"boundingboxes": boxes, "camera": camera, "nlf": {"a": 1e-3 * (k + 1), "b": 1e-6}}
+    colour = {"AsShotNeutral": np.array([[0.5], [1.0], [0.8]]), "ColorMatrix2": np.eye(3).reshape(1, 9)}
+    return {"boundingboxes": boxes, "camera": {"pattern": pattern, **colour}, "nlf": {"a": 1e-3 * (k + 1), "b": 1e-6}}
 
 
 @pytest.fixture(scope="module")

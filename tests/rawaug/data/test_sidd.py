@@ -52,6 +52,11 @@ def noisy_frame(clean: torch.Tensor, seed: int = 0) -> torch.Tensor:
     return (clean + noise * (SHOT_VAR * clean + READ_VAR).sqrt()).clamp(0, 1)
 
 
+def write_levels(folder: Path, rows: list[str]) -> None:
+    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
+    (folder / "noise_level_functions.csv").write_text("\n".join([header, *rows]))
+
+
 def write_scene(
     folder: Path,
     mat73: Writer,
@@ -66,12 +71,7 @@ def write_scene(
         at = folder / name / f"{name[:4]}_"
         for kind, frame in (("GT", clean), ("NOISY", noisy_frame(clean, int(number)))):
             mat73(Path(f"{at}{kind}_RAW_{number}.MAT"), {"x": frame[0].numpy()})
-        tags = {
-            "Orientation": orientation,
-            "AsShotNeutral": [NEUTRAL],
-            "ColorMatrix2": COLOUR.reshape(1, 9),
-            "Make": "X",
-        }
+        tags = {"Orientation": orientation, "AsShotNeutral": [NEUTRAL], "ColorMatrix2": COLOUR.reshape(1, 9)}
         savemat(f"{at}METADATA_RAW_{number}.MAT", {"metadata": tags})
         if srgb:
             picture = (clean.expand(3, -1, -1) * torch.tensor([100, 150, 250]).reshape(3, 1, 1)).to(torch.uint8)
@@ -128,8 +128,7 @@ def test_noise_levels_are_measured_or_read_from_the_table(tmp_path: Path, mat73:
     write_scene(tmp_path, mat73, name, ("010",))
     pair = SiddFrames(tmp_path)[0]
     assert pair.shot_var == pytest.approx(SHOT_VAR, rel=0.1) and pair.read_var == pytest.approx(READ_VAR, rel=0.6)
-    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
-    (tmp_path / "noise_level_functions.csv").write_text(f"{header}\n{name}, 0.01, 1e-4, 0.02, 2e-4, 0.07, 3e-4\n")
+    write_levels(tmp_path, [f"{name}, 0.01, 1e-4, 0.02, 2e-4, 0.07, 3e-4"])
     pair = SiddFrames(tmp_path)[0]
     assert (pair.shot_var, pair.read_var) == pytest.approx((0.03, 2e-4)), "green counts twice"
 
@@ -231,9 +230,7 @@ def test_the_benchmark_and_its_submission(blocks: Path, tmp_path: Path) -> None:
 def test_the_command_takes_published_levels_or_asks_for_them(blocks: Path, tmp_path: Path) -> None:
     for file in blocks.iterdir():
         (tmp_path / file.name).symlink_to(file)
-    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
-    rows = [f"{name}, {k}, 1e-4, {k}, 1e-4, {k}, 1e-4" for k, name in enumerate(HELD_BACK)]
-    (tmp_path / "noise_level_functions.csv").write_text("\n".join([header, *rows]))
+    write_levels(tmp_path, [f"{name}, {k}, 1e-4, {k}, 1e-4, {k}, 1e-4" for k, name in enumerate(HELD_BACK)])
     seen: list[tuple[float, float]] = []
 
     def noted(packed: torch.Tensor, levels: tuple[float, float], cfa: CFA) -> torch.Tensor:
@@ -385,8 +382,7 @@ def test_without_pictures_or_metadata_psnr_r_is_refused(
     shot.mkdir()
     tags = {"AsShotNeutral": [(0.5, 1.0, 0.8)], "ColorMatrix2": np.eye(3).reshape(1, 9) + 0.1}
     savemat(shot / "0009_METADATA_RAW_010.MAT", {"metadata": tags})
-    header = "scene_instance_id, beta1_r, beta2_r, beta1_g, beta2_g, beta1_b, beta2_b"
-    (tmp_path / "noise_level_functions.csv").write_text(f"{header}\n{SCENES[0]}, 0.01, 1e-4, 0.01, 1e-4, 0.01, 1e-4\n")
+    write_levels(tmp_path, [f"{SCENES[0]}, 0.01, 1e-4, 0.01, 1e-4, 0.01, 1e-4"])
     pairs = SiddBlocks(tmp_path)
     assert pairs[0].rendered and psnr_r(camera, pairs[0]) < 60.0 and pairs[0].white_balance == (2.0, 1.0, 1.25)
     assert not pairs[0].levels_from_clean and pairs[32].levels_from_clean and pairs[32].white_balance == (1, 1, 1)

@@ -143,9 +143,8 @@ def folder(tmp_path: Path) -> Path:
     """Seven pictures, one of them too narrow for a frame."""
     (tmp_path / "pictures").mkdir()
     for k in range(7):
-        write_picture(
-            tmp_path / "pictures" / f"{k}.png", torch.full((3, 290, 300 if k == 3 else 450), 20 * k + 40).byte()
-        )
+        picture = torch.full((3, 290, 300 if k == 3 else 450), 20 * k + 40).byte()
+        write_picture(tmp_path / "pictures" / f"{k}.png", picture)
     return tmp_path
 
 
@@ -154,10 +153,10 @@ def settings(folder: Path, **changes: Any) -> ComponentAblation:
         "pictures": str(folder / "pictures"),
         "frames": 4,
         "left_out": 2,
-        "fit": LEARNED,
-        "variants": VARIANTS,
+        "seeds": 2,
+        "out": str(folder),
     }
-    return ComponentAblation(**{**given, "seeds": 2, "out": str(folder), **changes})
+    return ComponentAblation(**{"fit": LEARNED, "variants": VARIANTS, **given, **changes})
 
 
 def test_every_variant_of_a_seed_has_the_same_frames_and_is_scored_on_others(
