@@ -85,12 +85,9 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
-    """Identify the data in a folder (or a SIDD submission) and read it.
+    """Identify the data in a folder, a RAW file, a SIDD submission or ``pairs:PATH``, and read it.
 
-    Args:
-        path: a folder, a RAW file, a SIDD submission, or ``pairs:PATH``.
-        first: read at most this many items of each kind.
-        settings: of :class:`rawaug.data.PairFolder`, for ``pairs:PATH``; None is left out.
+    At most ``first`` items of each kind are read; ``settings`` are those of :class:`PairFolder`, for ``pairs:PATH``.
     """
     settings = {key: value for key, value in settings.items() if value is not None}
     if str(path).startswith(_PAIRS):

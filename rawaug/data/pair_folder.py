@@ -72,10 +72,6 @@ class PairFolder(LazyPairs):
         noisy: a pattern with a slash is one of paths; files of other names are left out. Without a pattern all readable
             files must belong to a pair by the naming of ``rawaug synth``.
         clean, cfa, black, white: as in :class:`PairSettings`.
-
-    Raises:
-        FileNotFoundError: if there is no such path, or a frame has no partner.
-        ValueError: if it contains no pair, a file belongs to none, or a pattern cannot be used.
     """
 
     def __init__(

@@ -125,7 +125,11 @@ class Rawir(LazyPairs):
 def read_packed(file: Path, picture: Path, white: float | None) -> Tensor:
     """Packed RAW ``(4, h, w)`` of a file, white at 1; an ``.npz`` or the picture beside it says which white level."""
     with damage_as_os_error(file, "cannot be read as packed RAW"):
-        numbers, stated = _archived(file) if file.suffix == ".npz" else (_array(file), None)
+        if file.suffix == ".npz":
+            arrays = read_npz(file, lambda names: ["raw", "max_val"])
+            numbers, stated = arrays["raw"], float(arrays["max_val"])
+        else:
+            numbers, stated = _array(file), None
     if numbers.ndim != 3 or numbers.shape[2] != 4 or numbers.dtype.kind != "u" or not numbers.size:
         raise ValueError(f"{file}: packed RAW must be unsigned (h, w, 4), got {numbers.dtype} {numbers.shape}")
     white = white or stated or WHITE[picture.suffix.lower()]
@@ -140,12 +144,6 @@ def _array(file: Path) -> np.ndarray:
         if opened.read(6) != b"\x93NUMPY":  # NumPy would open an archive of arrays, or a pickle
             raise ValueError("does not begin as an array")
     return np.load(file, mmap_mode="r", allow_pickle=False)
-
-
-def _archived(file: Path) -> tuple[np.ndarray, float]:
-    """``raw`` and ``max_val`` of an ``.npz`` file."""
-    arrays = read_npz(file, lambda names: ["raw", "max_val"])
-    return arrays["raw"], float(arrays["max_val"])
 
 
 def picture_beside(file: Path) -> Path:

@@ -130,9 +130,6 @@ def benchmark(
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
         condition and strength, means of :data:`rawaug.evaluation.tables.METRICS`.
-
-    Raises:
-        ValueError: if a denoiser fails, or its result is not finite or of another shape.
     """
     columns = columns_of(frames, crop, seed, strengths)
     frames = [frame.middle(crop) for frame in frames]

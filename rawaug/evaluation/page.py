@@ -224,11 +224,7 @@ def _draw_curve(key: str, title: str, logs: Mapping[tuple[str, int], Log], colou
 
 
 def draw_costs(rows: Mapping[str, tuple[float | None, float, float]]) -> bytes:
-    """PSNR of RAW and of sRGB over the multiplications a megapixel, a PNG file.
-
-    Args:
-        rows: by denoiser GMAC a megapixel and the two PSNR; without GMAC, a filter, it is a dashed line.
-    """
+    """A PNG file of the two PSNR over GMAC a megapixel, by denoiser; one without GMAC, a filter, is a dashed line."""
     with extra("train"):
         from matplotlib.figure import Figure
 

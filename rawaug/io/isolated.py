@@ -81,16 +81,13 @@ def _helper() -> Any:
 
     # the helper reads in its own process, and a crash is reported here, not by a traceback of its own
     env = {LIMIT: "0", "PYTHONFAULTHANDLER": "", "OPENBLAS_NUM_THREADS": "1"}
-    return ProcessPoolExecutor(1, timeout=_IDLE_SECONDS, initializer=_leave_interrupts, env=env)
+    interrupts = signal.SIGINT, signal.SIG_IGN  # they are for the parent
+    return ProcessPoolExecutor(1, timeout=_IDLE_SECONDS, initializer=signal.signal, initargs=interrupts, env=env)
 
 
 def _stop_helper() -> None:
     _helper().shutdown(kill_workers=True)
     _helper.cache_clear()
-
-
-def _leave_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # they are for the parent
 
 
 def _known(read: Callable[..., Any]) -> None:
