@@ -5,8 +5,8 @@ times needs sides that are multiples of its ``stride = 2^s``: the picture is pad
 without repeating the edge (as often as needed, so a 2 x 2 picture passes too), and the result is cropped back.
 
 With ``pyramid`` the result of one scale, f, is mended by what is found at half the sides, where wide noise is narrow:
-``g_n(y) = f(y) + U k(g_{n-1}(B y) - B f(y))`` and ``g_0 = f``, B binning by 2 and U interpolating. k is 1, and falls to 0
-where :data:`BLIND` of the values are clipped: their mean does not tell the light.
+``g_n(y) = f(y) + U k(g_{n-1}(B y) - B f(y))`` and ``g_0 = f``, B binning by 2 and U interpolating. k is 1, and falls
+to 0 where :data:`BLIND` of the values are clipped: their mean does not tell the light.
 
 The noise map is the standard deviation by default. UPI's is the variance, whose values of 1e-5 to 1e-2 move the first
 layer little: after 400 steps at a learning rate of 1e-3 the U-Net of width 8 had taken 12 % off the l1 error with the
