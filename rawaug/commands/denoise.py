@@ -48,6 +48,9 @@ from rawaug.io.raw import develop
 from rawaug.progress import progress
 from rawaug.registry import Spec
 
+UNREADABLE = (".braw", ".crm", ".gpr", ".r3d", ".x3f")
+"""Extensions of RAW that the decoder does not read."""
+
 
 def run(
     source: str,
@@ -116,11 +119,12 @@ class Denoised:
 
 @dataclass
 class DenoisedFolder:
-    """What a run over a folder did: files done, done before, and failed with the reason."""
+    """What a run over a folder did: files done, done before, failed with the reason, and RAW of unknown kinds."""
 
     files: list[Denoised] = field(default_factory=list)
     existing: int = 0
     broken: dict[str, str] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
 
 
 def denoise_file(
@@ -239,7 +243,9 @@ def denoise_folder(
     settings = {**made.settings, "noise": as_json(noise)}
     settings |= {} if strength == 1.0 else {"strength": strength}
     require_same_settings(out / "denoise.json", settings, overwrite)
-    result, read, unknown = DenoisedFolder(), partial(isolated, read_raw), []
+    unread = [file.name for file in sorted(source.rglob("*")) if file.suffix.lower() in UNREADABLE]
+    result = DenoisedFolder(unread=unread)
+    read, unknown = partial(isolated, read_raw), []
     for file, target in progress(targets.items(), label="denoise", unit="file", leave=True):
         if target.exists() and not overwrite:
             result.existing += 1
@@ -296,3 +302,5 @@ def print_denoised(result: DenoisedFolder) -> None:
         print(f"{len(result.files)} denoised, {result.existing} already existed, {len(result.broken)} failed")
     for reason in result.broken.values():
         print(escape(reason))
+    if result.unread:
+        print(escape(f"not read, no decoder for these kinds of RAW: {', '.join(result.unread)}"))
