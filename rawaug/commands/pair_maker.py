@@ -27,7 +27,10 @@ from rawaug.registry import Spec
 def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
     """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
     if path.is_file() and not overwrite:
-        known = json.loads(path.read_text())
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
         for key in known | settings:
             value, asked = known.get(key), settings.get(key)
             if asked != value:
@@ -80,7 +83,11 @@ class PairMaker:
 
     def pairs(self, picture: Path, key: str, numbers: Iterable[int]) -> tuple[Origin, Iterator[tuple[int, RawPair]]]:
         """The origin of a picture's pairs, and an iterator over (number, pair)."""
-        content, srgb = sha256(picture), even_sided(read_picture(picture, self.max_pixels)).contiguous()
+        before, content = picture.stat(), sha256(picture)
+        srgb = even_sided(read_picture(picture, self.max_pixels)).contiguous()
+        after = picture.stat()
+        if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+            raise ValueError(f"{picture}: changed while it was read; run the same command again")
 
         def made() -> Iterator[tuple[int, RawPair]]:
             for number in numbers:

@@ -97,7 +97,7 @@ def test_the_commands_write_and_print_and_refuse(
     assert printed == json.loads(json.dumps(as_json("canon-powershot")))
     assert len(printed["tone_curve"]) == 256 and printed["kind"] == "isp"
     assert main(["info", "rawaug-small", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["name"] == "PMRID"
+    assert json.loads(capsys.readouterr().out)["name"] == "DRUNet"
     assert main(["info", "canon-powershot"]) == 0
     described = capsys.readouterr().out
     assert "tone and gamma, grey code to linear: 16 0.0" in described and "colour atoms" in described
