@@ -16,11 +16,9 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
-from denoisers.network import halved, mended, pad_to_multiple
+from denoisers.network import mended, pad_to_multiple
 from denoisers.networks import DRUNet, NAFNet
 from denoisers.pmrid import PMRID
-from rawaug import bayer
-from rawaug.bayer import CFA
 
 Make = Callable[..., Any]
 
@@ -430,12 +428,6 @@ def test_a_pyramid_takes_out_wide_noise_and_leaves_the_scene(channels: int) -> N
     assert wide[1] < 0.9 * wide[0] and wide[2] < 0.9 * wide[1]
     assert errors[1].square().mean() < 0.95 * errors[0].square().mean()
     assert models[2](noise[..., :2, :3]).shape == (1, channels, 2, 3)
-
-
-def test_packed_raw_is_halved_as_a_mosaic_is_binned() -> None:
-    packed = torch.rand((2, 4, 12, 20), generator=torch.Generator().manual_seed(0))
-    binned = bayer.bin_mosaic(bayer.unpack(packed, CFA.RGGB), CFA.RGGB, 2)
-    torch.testing.assert_close(halved(packed), bayer.pack(binned, CFA.RGGB))
 
 
 @torch.no_grad()
