@@ -13,7 +13,8 @@ import json
 import logging
 import timeit
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,8 +57,7 @@ def write_onnx(
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
     free = {2: torch.export.Dim.DYNAMIC, 3: torch.export.Dim.DYNAMIC}
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of torchvision's absence
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), errors_only("torch.onnx"):  # not the exporter's own, as of torchvision's absence
         warnings.simplefilter("ignore")
         shapes = tuple(free if value.ndim == 4 else None for value in inputs.values())
         program = torch.export.export(model, tuple(inputs.values()), dynamic_shapes=shapes)
@@ -66,6 +66,18 @@ def write_onnx(
         made.model.metadata_props.update(stated or {})
         made.save(str(path), external_data=False)
     return session_of(path)
+
+
+@contextmanager
+def errors_only(name: str) -> Iterator[None]:
+    """A logger and those below it say nothing less than an error."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def difference_from(expected: Tensor, session: Any, inputs: Mapping[str, Tensor], path: Path) -> float:

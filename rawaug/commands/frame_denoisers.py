@@ -158,11 +158,10 @@ def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
         return noise
     stored = load_network(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
     law = stored.get("noise")
-    if isinstance(law, Mapping):
-        with suppress(ValueError):
-            return camera_law(law)
-    file = denoiser if noise == "camera" else noise
-    raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
+    if not isinstance(law, Mapping) or not ("shot_var" in law or law.get("name") == "MeasuredNoise"):
+        file = denoiser if noise == "camera" else noise
+        raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
+    return camera_law(law)
 
 
 def as_json(noise: Noise) -> Any:

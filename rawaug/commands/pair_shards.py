@@ -25,7 +25,7 @@ from torch import Tensor
 
 from rawaug.bayer import CFA
 from rawaug.commands.pair_maker import Origin, PairMaker, Settings, noise_levels, replayed
-from rawaug.files import digest, replacing, write_json
+from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.sampling_config import SamplingConfig
 
@@ -75,7 +75,12 @@ def _record(shard: Path) -> Path:
 def _known(shard: Path) -> dict[str, Any]:
     """The record that marks a shard as complete; empty if there is none."""
     record = _record(shard)
-    return json.loads(record.read_text()) if record.is_file() else {}
+    if not record.is_file():
+        return {}
+    try:
+        return parse_object(record.read_text())
+    except ValueError as error:
+        raise ValueError(f"{record}: {error}; delete it to make the shard again") from None
 
 
 def shard_tasks(

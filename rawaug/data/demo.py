@@ -200,13 +200,19 @@ def demo_pairs(split: str, count: int | None = None) -> list[Pair]:
         split: ``"train"``, ``"validation"`` or ``"test"``.
         count: number of pairs, by default that of :data:`PAIRS`.
 
+    Raises:
+        ValueError: if there is no such split, or ``count`` is not positive.
+
     Example:
         >>> pair = demo_pairs("train", count=1)[0]
         >>> pair.raw.shape, pair.cfa, pair.noisy is not None
         (torch.Size([1, 288, 448]), <CFA.GRBG: 'GRBG'>, True)
     """
     require_split("demo", split, PHOTOGRAPHS)
-    return [_pair(split, k) for k in range(PAIRS[split] if count is None else count)]
+    count = PAIRS[split] if count is None else count
+    if count < 1:
+        raise ValueError(f"demo:{split}: count must be at least 1, got {count}")
+    return [_pair(split, k) for k in range(count)]
 
 
 def demo_pictures(count: int = 32) -> list[Tensor]:
@@ -214,6 +220,8 @@ def demo_pictures(count: int = 32) -> list[Tensor]:
 
     The photographs are those of the training pairs and five others, none of validation or test.
     """
+    if count < 1:
+        raise ValueError(f"demo: count must be at least 1, got {count}")
     photographs = _users_photographs()
     leaves = (_leaves(k) for k in range(count - len(photographs)))
     return [*photographs[:count], *leaves]

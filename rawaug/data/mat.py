@@ -1,4 +1,4 @@
-"""MATLAB files: version 7.3 (HDF5) through h5py, older ones through SciPy.
+"""MATLAB files: version 5 through SciPy, version 7.3 (HDF5) through h5py, distinguished by the header.
 
 A 7.3 file holds a matrix with its axes in reverse, since MATLAB counts down the columns and HDF5 along the rows: read
 naively, a picture comes transposed, and a GRBG mosaic looks like GBRG. Here all axes are MATLAB's. Source: MathWorks,
@@ -19,16 +19,24 @@ from rawaug.errors import extra
 from rawaug.io.isolated import damage_as_os_error, isolated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+_TEXT = b"MATLAB 5.0"
 _UNREADABLE = "cannot be read as a MATLAB file"
 MAX_BYTES = 2**30
 """Larger variables are refused before they are read: those of the published datasets have at most 0.5 GiB."""
 
 
-def _is_hdf5(path: Path) -> bool:
+def mat_version(path: str | Path) -> str:
+    """``"5"`` or ``"7.3"``, by the header."""
+    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such MATLAB file")
     with path.open("rb") as file:
-        return _HDF5 in file.read(512 + len(_HDF5))
+        header = file.read(512 + len(_HDF5))
+    if header.startswith(_HDF5) or header[512:] == _HDF5:
+        return "7.3"
+    if header.startswith(_TEXT) and header[126:128] in (b"IM", b"MI"):
+        return "5"
+    raise ValueError(f"{path}: is not a MATLAB file of version 5 or 7.3; copy it again, or save it with -v7.3")
 
 
 def variables(path: str | Path) -> list[str]:
@@ -62,13 +70,14 @@ def normalised(values: np.ndarray, axes: int, file: Path) -> Tensor:
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
     """The variables by name; HDF5 states their shapes with their values."""
-    if _is_hdf5(path):
-        with damage_as_os_error(path, _UNREADABLE), _hdf5(path) as file:
-            return {name: () for name in file if not name.startswith("#")}
+    version = mat_version(path)
     with damage_as_os_error(path, _UNREADABLE):
-        from scipy.io import whosmat
+        if version == "5":
+            from scipy.io import whosmat
 
-        return {name: shape for name, shape, _ in whosmat(path)}
+            return {name: shape for name, shape, _ in whosmat(path)}
+        with _hdf5(path) as file:
+            return {name: () for name in file if not name.startswith("#")}
 
 
 def _hdf5(path: Path) -> Any:
@@ -79,18 +88,18 @@ def _hdf5(path: Path) -> Any:
 
 
 def _read(path: Path, name: str, plain: bool) -> Any:
-    shapes = _shapes(path)
+    shapes, version = _shapes(path), mat_version(path)
     if name not in shapes:
         raise ValueError(f"{path}: has no variable {name}; its variables are: {', '.join(shapes) or 'none'}")
-    if _is_hdf5(path):
-        with damage_as_os_error(path, _UNREADABLE), _hdf5(path) as file:
+    with damage_as_os_error(path, _UNREADABLE):
+        if version == "5":
+            from scipy.io import loadmat
+
+            _require_size(8 * math.prod(shapes[name]), name)
+            return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
+        with _hdf5(path) as file:
             node = _member(file, name)
             return _plain(node, file) if plain else np.ascontiguousarray(_values(node).T)
-    with damage_as_os_error(path, _UNREADABLE):
-        from scipy.io import loadmat
-
-        _require_size(8 * math.prod(shapes[name]), name)
-        return loadmat(path, variable_names=[name], simplify_cells=plain)[name]
 
 
 def _require_size(size: int, name: str) -> None:

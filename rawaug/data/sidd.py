@@ -205,6 +205,9 @@ def _correlation(a: Tensor, b: Tensor) -> Tensor:
 BLOCKS = 32
 """Blocks of a frame."""
 
+MOST_FRAMES = 1000
+"""Of SIDD+, which has 32."""
+
 _NO_COLOUR = Colour(*UNKNOWN_COLOUR, 0)
 
 
@@ -382,7 +385,10 @@ def _pictures(path: Path, pattern: str, kinds: tuple[str, str], clean: Tensor) -
 def _patterns(file: Path) -> list[CFA]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
-            return [CFA(row[0].strip().upper()) for row in csv.reader(stream) if row]
+            names = [row[0].strip().upper() for row in csv.reader(stream) if row]
+        if len(names) > MOST_FRAMES:
+            raise ValueError(f"{len(names)} rows, at most {MOST_FRAMES} expected")
+        return [CFA(name) for name in names]
     except (ValueError, csv.Error) as error:
         raise ValueError(f"{file}: is not a list of patterns, one for each frame ({error}); copy it again") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 import denoisers
 from rawaug.bayer import CFA, noise_variance
 from rawaug.cli import main
-from rawaug.commands.export import export
+from rawaug.commands.export import errors_only, export
 from rawaug.commands.frame_denoisers import frame_denoiser
 from rawaug.errors import MissingExtra
 from rawaug.evaluation.contestants import session_of
@@ -54,6 +55,15 @@ def test_any_size_gives_pytorch_s_numbers(
         (denoised,) = session.run(None, {"noisy": noisy.numpy(), "variance": variance.numpy()})
         with torch.no_grad():
             assert (torch.from_numpy(denoised) - model(noisy, variance)).abs().max() < 1e-4
+
+
+def test_of_the_exporter_errors_alone_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    below = logging.getLogger("exporter.registration")
+    with errors_only("exporter"):
+        below.warning("torchvision is not installed")
+        below.error("broken")
+    below.warning("heard again")
+    assert caplog.messages == ["broken", "heard again"]
 
 
 def test_what_is_missing_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

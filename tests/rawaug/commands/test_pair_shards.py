@@ -98,6 +98,14 @@ def test_the_pairs_are_those_of_other_formats(pictures: Path, whole: Path, tmp_p
     assert described["shot_var"] == pytest.approx(FIXED[0]) and described["isp"] == "universal"
 
 
+def test_a_sample_is_replayed_only_from_its_picture(pictures: Path, whole: Path, tmp_path: Path) -> None:
+    described = json.loads(samples(whole)["00000004_1"]["json"])
+    (tmp_path / "sub").mkdir()
+    (tmp_path / described["picture"]).write_bytes((pictures / "z.png").read_bytes())
+    with pytest.raises(ValueError, match=r"sub/a\.png: the picture .* has changed since"):
+        replay_sample(described, tmp_path)
+
+
 def test_bursts_of_developed_pictures_are_replayed(pictures: Path, tmp_path: Path) -> None:
     form: dict[str, Any] = {"target": "srgb", "jpeg": (60, 90), "burst": 2}
     synth(pictures / "z.png", tmp_path, "webdataset", noise=FIXED, workers=0, **form)
@@ -148,6 +156,10 @@ def test_what_cannot_go_on_is_refused(pictures: Path, whole: Path, tmp_path: Pat
     for shard in ("0/4", "5/4", "3", "1/0", "a/b", "-1/2", "1/2/3"):
         with pytest.raises(ValueError, match="shard must be K/N with K from 1 to N"):
             part_of(shard)
+    (tmp_path / ".shards").mkdir()
+    (tmp_path / ".shards/shard-000000.json").write_text("{")
+    with pytest.raises(ValueError, match=r"shard-000000\.json: not JSON.*; delete it to make the shard again"):
+        shards(pictures, tmp_path)
 
 
 def test_parts_of_files_are_every_nth_picture(pictures: Path, tmp_path: Path) -> None:

@@ -32,7 +32,12 @@ def test_pictures_are_counted_by_size_and_the_broken_ones_named(
     write_pictures(tmp_path, 5)
     (tmp_path / "3.png").write_bytes(b"broken")
     report = check(tmp_path)
-    assert str(report).splitlines()[1:4] == ["pictures: 5", "  sizes: 6 x 8 (3), 6 x 10 (1)", "  damaged: 1"]
+    assert str(report).splitlines()[:4] == [
+        str(tmp_path),
+        "pictures: 5",
+        "  sizes: 6 x 8 (3), 6 x 10 (1)",
+        "  damaged: 1",
+    ]
     (line,) = report.broken
     assert "3.png: cannot be read as a picture" in line
     assert "pictures: 5, 2 examined" in str(check(tmp_path, first=2))
@@ -58,8 +63,9 @@ def test_raw_files_report_levels_patterns_and_cameras(tmp_path: Path, bayer_dng:
     write_pictures(tmp_path)
     raws, pictures = check(tmp_path).parts
     assert raws.what == "RAW files" and raws.items == 3 and dict(raws.counts["cfas"]) == {"GRBG": 1, "BGGR": 1}
-    assert dict(raws.counts["levels"]) == {"black 64, white 1023": 2}
-    assert dict(raws.counts["cameras"]) == {"Maker Model 1": 2}
+    assert dict(raws.counts["levels"]) == {"black 64, white 1023": 2} and dict(raws.counts["cameras"]) == {
+        "Maker Model 1": 2
+    }
     assert raws.signal == pytest.approx((936 / 959, 936 / 959)) and "c.dng" in raws.broken[0]
     assert pictures.what == "pictures" and pictures.items == 3
 
@@ -93,6 +99,22 @@ def test_blocks_of_a_submission_are_counted(tmp_path: Path, monkeypatch: pytest.
     assert (part.items, part.examined, dict(part.counts["sizes"])) == (6, 5, {"8 x 8": 5})
 
 
+def test_what_crashes_the_helper_is_named_and_the_rest_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_pictures(tmp_path, 4)
+    module = sys.modules["rawaug.data.check"]
+    whole = module.isolated
+
+    def isolated(read: Any, opening: bytes, index: int, name: object) -> Any:
+        if index == 1:
+            raise OSError(f"{name}: crashes the decoder")
+        return whole(read, opening, index, name=name)
+
+    monkeypatch.setattr(module, "isolated", isolated)
+    (part,) = check(tmp_path).parts
+    assert part.counts["sizes"].total() == 3 and part.items == part.examined == 4
+    assert part.broken == [f"{tmp_path / '1.png'}: crashes the decoder"]
+
+
 def test_what_is_unknown_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
         check(tmp_path / "none")
@@ -109,3 +131,5 @@ def test_the_command_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["data", "check", str(tmp_path), "--first", "2"]) == 2
     printed = capsys.readouterr()
     assert "1.png" in printed.out and printed.err.strip().endswith("1 damaged, listed above")
+    assert main(["data", "check", str(tmp_path / "none")]) == 2
+    assert "none: no such file or folder" in capsys.readouterr().err

@@ -207,3 +207,5 @@ def test_open_by_name() -> None:
     assert len(open_pairs("demo:", split="train")) == PAIRS["train"]
     with pytest.raises(ValueError, match="demo: no split holdout; use one of train, validation, test"):
         open_pairs("demo:holdout")
+    with pytest.raises(ValueError, match="count must be at least 1"):
+        demo_pairs("train", 0)

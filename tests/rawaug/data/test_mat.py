@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from rawaug.data.mat import MAX_BYTES, read_array, read_value
+from rawaug.data.mat import MAX_BYTES, mat_version, read_array, read_value
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 ARRAY = np.random.default_rng(0).random((3, 4, 5)).astype(np.float32)
@@ -33,13 +34,18 @@ def written(request: pytest.FixtureRequest, tmp_path: Path, mat73: Writer) -> Ca
     return write
 
 
-def test_what_is_no_matlab_file_is_one_line(tmp_path: Path) -> None:
-    for content in (b"", b"no", bytes(600)):
-        (tmp_path / "a.mat").write_bytes(content)
-        with pytest.raises(OSError, match=r"a\.mat: cannot be read as a MATLAB file"):
-            read_value(tmp_path / "a.mat", "x")
+def test_the_version_is_that_of_the_header(tmp_path: Path, mat73: Writer) -> None:
+    savemat(tmp_path / "old.mat", {"x": 1.0})
+    savemat(tmp_path / "older.mat", {"x": 1.0}, format="4")
+    mat73(tmp_path / "new.mat", {"x": 1.0})
+    assert mat_version(tmp_path / "old.mat") == "5" and mat_version(tmp_path / "new.mat") == "7.3"
+    with pytest.raises(ValueError, match=r"older\.mat: is not a MATLAB file of version 5 or 7\.3"):
+        mat_version(tmp_path / "older.mat")
+    (tmp_path / "empty.mat").touch()
+    with pytest.raises(ValueError, match=r"empty\.mat: is not a MATLAB file"):
+        mat_version(tmp_path / "empty.mat")
     with pytest.raises(FileNotFoundError, match=r"none\.mat: no such MATLAB file"):
-        read_value(tmp_path / "none.mat", "x")
+        mat_version(tmp_path / "none.mat")
 
 
 def test_arrays_keep_matlabs_axes_and_type_through_the_helper(
@@ -79,6 +85,18 @@ def test_a_file_cut_short_is_one_line(written: Callable[[dict[str, Any]], Path],
     with pytest.raises(OSError, match=r"a\.mat: cannot be read as a MATLAB file .*; copy it again") as caught:
         read_array(path, "x")
     assert "\n" not in str(caught.value)
+
+
+def _crash(path: Path, name: str, plain: bool) -> None:
+    ctypes.string_at(0)
+
+
+def test_a_reader_that_crashes_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    savemat(tmp_path / "a.mat", {"x": ARRAY})
+    monkeypatch.setattr("rawaug.data.mat._read", _crash)
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "60")
+    with pytest.raises(OSError, match=r"a\.mat: crashes the decoder \(SIGSEGV"):
+        read_array(tmp_path / "a.mat", "x")
 
 
 def test_variables_beyond_reason_and_in_other_files_are_refused(tmp_path: Path, mat73: Writer) -> None:
