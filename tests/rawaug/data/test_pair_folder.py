@@ -173,7 +173,7 @@ def test_what_is_no_mosaic_or_no_pair_is_refused(tmp_path: Path) -> None:
     assert "a.npz: cannot be read as NPZ" in refused(other)
     (other / "a.npz").unlink()
     (other / "a.mat").write_bytes(b"no")
-    assert "a.mat: cannot be read as a MATLAB file" in refused(other)
+    assert "a.mat: is not a MATLAB file of version 5 or 7.3" in refused(other)
 
 
 def test_a_bare_folder_never_takes_a_noisy_frame_for_a_clean_one(tmp_path: Path, bayer_dng: Dng) -> None:
