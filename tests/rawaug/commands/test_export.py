@@ -24,7 +24,7 @@ from rawaug.io import RawFrame
     ("name", "config", "linear"),
     [
         ("PMRID", {"width": 4, "variance_map": True}, False),
-        ("DRUNet", {"width": 4, "scales": 2, "variance_map": False, "domain": "anscombe", "pyramid": 2}, False),
+        ("DRUNet", {"width": 4, "scales": 1, "variance_map": False, "domain": "anscombe", "pyramid": 2}, False),
         ("JointDRUNet", {"width": 4, "scales": 2}, True),
     ],
 )
