@@ -41,14 +41,19 @@ def build(name: str, **config: Any) -> Denoiser:
         >>> build("DnCNN", width=8, depth=3).config["depth"]
         3
     """
-    spec = {"name": name, "settings": config}
+    outlined(name, config)
+    network: Denoiser = DENOISERS.make({"name": name, "settings": config})
+    return network
+
+
+def outlined(name: str, config: dict[str, Any]) -> Denoiser:
+    """The network of :func:`build` on the meta device, where its weights take no memory."""
+    DENOISERS[name]  # imports the module that has it, which may make tensors, while they are real
     with torch.device("meta"):
-        network: Denoiser = DENOISERS.make(spec)
+        network: Denoiser = DENOISERS.make({"name": name, "settings": config})
     size = sum(weight.numel() for weight in network.parameters())
     if size > MOST_WEIGHTS:
         raise ValueError(f"denoiser {name}: {config} has {size:.3g} weights; choose a smaller one")
-    if torch.get_default_device().type != "meta":
-        network = DENOISERS.make(spec)
     return network
 
 
@@ -97,9 +102,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     try:
         config, info = (parse_object(metadata.get(key, "")) for key in ("config", "info"))
-        # On the meta device the network takes no memory before the file's tensors are known to fit.
-        with torch.device("meta"):
-            model = build(metadata.get("model", ""), **config)
+        model = outlined(metadata.get("model", ""), config)  # before the file's tensors are known to fit
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes

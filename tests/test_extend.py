@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,8 +17,12 @@ from rawaug.cli import main
 from rawaug.registry import Registry
 
 PACKAGE = """
+import torch
+
 from denoisers.network import PACKED, Denoiser, conv
 from rawaug.noise import Compose, RowNoise, ShotReadNoise, noise_levels
+
+TAPS = torch.ones(3).tolist()
 
 
 class Shallow(Denoiser):
@@ -103,6 +109,34 @@ def test_weights_of_its_network_are_saved_and_loaded(tmp_path: Path) -> None:
     model = denoisers.build("Shallow", width=4)
     denoisers.save(model, tmp_path / "x.safetensors", {})
     assert type(denoisers.load(tmp_path / "x.safetensors")[0]) is type(model)
+
+
+def in_a_fresh_process(site: Path, *lines: str) -> None:
+    paths = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_package_is_imported_before_its_network_is_outlined(site: Path, tmp_path: Path) -> None:
+    """Its module makes tensors and imports rawaug.noise, neither of which works on the meta device."""
+    file = str(tmp_path / "x.safetensors")
+    look_up = "import denoisers; from rawaug.commands.info import describe"
+    in_a_fresh_process(site, look_up, f"denoisers.save(denoisers.build('Shallow', width=4), {file!r}, {{}})")
+    in_a_fresh_process(site, look_up, f"describe({file!r})")
+
+
+def test_what_is_imported_on_another_device_is_whole(site: Path) -> None:
+    rooms = "rawaug.noise", "rawaug.isp.cameras", "rawaug.data.development", "rawaug.training.srgb_noise"
+    in_a_fresh_process(
+        site,
+        "import importlib, torch",
+        "with torch.device('meta'):",
+        f"    rooms = [importlib.import_module(name) for name in {rooms!r}]",
+        "held = [x for room in rooms for value in vars(room).values() for x in (value, *(value if type(value) is tuple",
+        "    else ())) if isinstance(x, torch.Tensor)]",
+        "assert len(held) >= 4 and not any(x.is_meta for x in held)",
+    )
 
 
 @pytest.mark.usefixtures("installed")

@@ -25,7 +25,7 @@ from rawaug.data.pairs import Pair
 from rawaug.io import encode_srgb
 from rawaug.io.raw import XYZ_FROM_SRGB
 
-UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3)
+UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3, device="cpu")
 """Gains and matrix where a dataset states none."""
 
 

@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 SRGB_TO_XYZ = torch.tensor(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]],
     dtype=torch.float64,
+    device="cpu",
 )
 """Linear sRGB (IEC 61966-2-1, D65) to CIE XYZ."""
 XYZ_TO_SRGB = torch.linalg.inv(SRGB_TO_XYZ)

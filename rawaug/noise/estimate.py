@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 WORST_FIT = 0.5
 """R^2 below which the points follow no line."""
 BLOCK = 8
-_order = torch.arange(BLOCK)[:, None] + torch.arange(BLOCK)
-_inner = (torch.arange(BLOCK)[:, None] > 0) & (torch.arange(BLOCK) > 0)
+_order = np.add.outer(np.arange(BLOCK), np.arange(BLOCK))
+_inner = np.logical_and.outer(np.arange(BLOCK) > 0, np.arange(BLOCK) > 0)
 _LOW = (_order > 0) & (_order < 5)
 _HIGH = _inner & (_order >= 5)
 _MIDDLE = _HIGH & (_order <= 7)
@@ -145,7 +145,7 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
     planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
     tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
     energy = torch.from_numpy(dctn(tiles.cpu().numpy(), axes=(-2, -1), norm="ortho")).square_()
-    bands = [energy[..., band].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
+    bands = [energy[..., torch.from_numpy(band)].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
     signal = tiles.mean((-2, -1)).flatten()
     channel = torch.arange(4, device=tiles.device).repeat_interleave(tiles.shape[1])
     inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()

@@ -26,7 +26,7 @@ from rawaug.plugin.targets import through_jpeg
 from rawaug.registry import SRGB_NOISE, require_between
 from rawaug.seeding import keyed_generator
 
-_LUMA = torch.tensor([0.299, 0.587, 0.114])
+_LUMA = torch.tensor([0.299, 0.587, 0.114], device="cpu")
 
 
 class SrgbNoise(Protocol):
