@@ -264,7 +264,7 @@ class Denoiser(nn.Module, ABC):
         if not halvings:
             return denoised
         small, seen, share = (halved(pad_to_multiple(x, 4)) for x in (noisy, denoised, clipped))
-        part = bayer.binned_variance(2, together=self.channels != PACKED)
+        part = bayer.binned_variance(2) if self.channels == PACKED else 0.25
         told = None if variance is None else part * halved(pad_to_multiple(variance, 4))
         # Near its own limit of resolution the half picture knows less than the whole one.
         wide, near = (

@@ -159,7 +159,8 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
     of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
     independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
-    With ``together`` the four sites of a new cell are means over the same area, as a pixel of full colour needs them.
+    With ``together`` the four sites of a new cell are means around its one centre, as a pixel of full colour needs
+    them, so that the colours of its truth are in register.
     ValueError if the CFA is not Bayer's, or a side is not a multiple of 2 ``factor``.
 
     Example:
@@ -169,15 +170,15 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     if factor < 1 or any(side % (2 * factor) for side in raw.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} cannot be binned by {factor}; use multiples of 2 factor")
     CFA(cfa)  # whatever the pattern of 2 x 2 sites, each is averaged with its own kind
-    move = 0.0 if together else (factor - 1) / 4
-    rows = [_window_means(raw[..., i::2, :], -2, factor, move * (2 * i - 1)) for i in (0, 1)]
-    sites = [[_window_means(row[..., j::2], -1, factor, move * (2 * j - 1)) for j in (0, 1)] for row in rows]
+    moves = [(2 * i - 1) * (-1 if together else factor - 1) / 4 for i in (0, 1)]
+    rows = [_window_means(raw[..., i::2, :], -2, factor, moves[i]) for i in (0, 1)]
+    sites = [[_window_means(row[..., j::2], -1, factor, moves[j]) for j in (0, 1)] for row in rows]
     return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
 
 
 def binned_variance(factor: int, together: bool = False) -> float:
     """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
-    part = 0.0 if together else (factor - 1) / 4 % 1
+    part = (-1 if together else factor - 1) / 4 % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
 
 

@@ -141,7 +141,7 @@ class Pair:
         Raises:
             ValueError: if a side is shorter than two of the new cell's.
         """
-        if factor == 1:
+        if factor == 1 and not together:
             return self
         height, width = (side // (2 * factor) * 2 * factor for side in self.raw.shape[-2:])
         if not min(height, width):
@@ -346,7 +346,7 @@ class Binned(SomePairs):
         return super().read(index).binned(self.factor, self.together)
 
     def stamp(self, index: int) -> str:
-        return f"{super().stamp(index)} binned by {self.factor}{', together' * self.together}"
+        return f"{super().stamp(index)} binned by {self.factor}{', around one centre' * self.together}"
 
 
 OWN_PICTURES = "pairs"

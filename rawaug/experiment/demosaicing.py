@@ -2,10 +2,11 @@ r"""Joint demosaicing and denoising beside one after the other, on a truth that 
 
 .. math:: x = (R, (G_r + G_b) / 2, B), \qquad y \sim N(M x, \mathrm{shot\_var}\, M x + \mathrm{read\_var})
 
-The full-colour truth x takes each pixel from one 2 x 2 cell of a finer frame, binned by colour site before, so that it
-has real optics and little noise of its own; M keeps one colour a site. A denoiser of RAW is followed by each
-demosaicing: those of :func:`rawaug.bayer.demosaic`, and LibRaw's, which works on white-balanced RAW, as in its own
-pictures. PSNR and SSIM are those of linear camera RGB, and of one fixed development of it.
+The full-colour truth x takes each pixel from one 2 x 2 cell of a finer frame, whose four sites are means around the
+cell's centre (:func:`rawaug.bayer.bin_mosaic`, ``together``), so that it has real optics, colours in register and
+little noise of its own; M keeps one colour a site. A denoiser of RAW is followed by each demosaicing: those of
+:func:`rawaug.bayer.demosaic`, and LibRaw's, which works on white-balanced RAW, as in its own pictures. PSNR and SSIM
+are those of linear camera RGB, and of one fixed development of it.
 """
 
 from __future__ import annotations

@@ -139,9 +139,13 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
 def some(
     pairs: Sequence[Pair], count: int | None, crop: int | None, factor: int = 1, together: bool = False
 ) -> Sequence[Pair]:
-    """The first ``count`` pairs, binned by ``factor``, the middle of each; None for all of them, or whole frames."""
+    """The first ``count`` pairs, binned by ``factor``, the middle of each; None for all of them, or whole frames.
+
+    With ``together``, as for a truth of full colour, the sites of a cell are brought to one centre even if ``factor``
+    is 1.
+    """
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
-    binned = chosen if factor == 1 else Binned(chosen, factor, together)
+    binned = Binned(chosen, factor, together) if factor > 1 or together else chosen
     return binned if crop is None else Middles(binned, crop)
 
 

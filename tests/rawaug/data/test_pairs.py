@@ -159,9 +159,20 @@ def test_binned_sites_lie_where_a_sensor_s_lie(factor: int) -> None:
     side = 1600 // (2 * factor) * 2 * factor
     left = bin_mosaic(noise[..., :side, :side], "GRBG", factor)[..., 4:-4, 4:-4].var().item()
     assert left == pytest.approx(binned_variance(factor), rel=0.03)
-    cells = bin_mosaic(ramp, "GRBG", factor, together=True)[0, 2:4, 2:4]
-    assert cells[1, 1] - cells[0, 0] == pytest.approx(4.0)
     assert binned_variance(factor) == pytest.approx(factor**-2, rel=0.35)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4])
+def test_sites_that_are_binned_together_share_one_centre(factor: int) -> None:
+    """All four read the same value of a ramp, that at the middle of their cell's area."""
+    rows, columns = (torch.arange(24.0 * factor) for _ in range(2))
+    ramp = (3.0 * rows[:, None] + columns)[None]
+    cell = bin_mosaic(ramp, "GRBG", factor, together=True)[0, 2:4, 2:4]
+    assert torch.allclose(cell, torch.tensor(4.0 * (3 * factor - 0.5)), atol=1e-4)
+    side = 1600 // (2 * factor) * 2 * factor
+    noise = torch.randn(1, side, side, generator=torch.Generator().manual_seed(0))
+    left = bin_mosaic(noise, "GRBG", factor, together=True)[..., 4:-4, 4:-4].var().item()
+    assert left == pytest.approx(binned_variance(factor, together=True), rel=0.03)
 
 
 @pytest.mark.parametrize("cfa", ["XTRANS", "RGBW"])

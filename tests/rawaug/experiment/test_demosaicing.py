@@ -9,14 +9,19 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
+from rawaug.data import demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.experiment.demosaicing import JointRecipe, Scene, demosaiced, frozen_mosaic, full_colour, run
 from rawaug.experiment.denoising import run as train_denoiser
+from rawaug.experiment.plan import planned
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
+from rawaug.io.pictures import decode_srgb
+from rawaug.metrics import psnr
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
@@ -42,6 +47,20 @@ def test_a_pixel_of_the_truth_is_a_cell_of_the_frame(cfa: CFA) -> None:
     assert truth[0, :, 10, 15].tolist() == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("factor", [1, 2, 4])
+@pytest.mark.parametrize("cfa", [CFA.RGGB, CFA.GBRG])
+def test_the_truth_of_a_grey_scene_is_grey(cfa: CFA, factor: int) -> None:
+    """The colours of a cell are means around one centre: of a photograph as soft as lenses make them."""
+    light = decode_srgb(demo_pictures(2)[1][:, :320, :448].float() / 255.0).mean(0)[None, None]
+    grey = F.avg_pool2d(F.interpolate(light, size=(642, 898), mode="bicubic"), 3, stride=1)[0]
+    pair = Pair("grey", torch.zeros(3, 640, 896, dtype=torch.uint8), grey, cfa)
+    recipe = small(Path(), data=DataConfig(pairs=None, validation=None, test_crop=None, bin=factor))
+    truth = full_colour(planned(recipe, {"test": [pair]}).test[0])
+    red, green, blue = truth[..., 8:-8, 8:-8].unbind(1)
+    assert red.std() > 0.04
+    assert min(psnr(red[None], blue[None]).item(), psnr(red[None], green[None]).item()) > 50
+
+
 def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
     one, again, other = (frozen_mosaic(a_pair(name=name), NOISE) for name in ("a", "a", "b"))
     assert torch.equal(one.noisy, again.noisy) and not torch.equal(one.noisy, other.noisy)
@@ -61,13 +80,17 @@ def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
 
 def small(folder: Path, **changes: Any) -> JointRecipe:
     return JointRecipe(
-        data=DataConfig(pairs=None, validation_crop=128, test_crop=128, test_count=1),
         camera="universal",
         arms={"joint": ArmConfig(1.0)},
         denoiser=DenoiserConfig("JointDRUNet", {"width": 4, "scales": 2}),
         train=TrainConfig(steps=2, batch=1, crop=32, validate_every=1),
         out=str(folder),
-        **{"rivals": ["Wavelet"], "demosaicing": ["malvar", "DCB"], **changes},
+        **{
+            "data": DataConfig(pairs=None, validation_crop=128, test_crop=128, test_count=1),
+            "rivals": ["Wavelet"],
+            "demosaicing": ["malvar", "DCB"],
+            **changes,
+        },
     )
 
 

@@ -244,5 +244,5 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     small = reference(patches(64, 64))
     assert own_noise([small], 0) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
-    for together, left in ((False, binned_variance(4)), (True, 1 / 16)):
+    for together, left in ((False, binned_variance(4)), (True, binned_variance(4, together=True))):
         assert own_noise(Binned([stated], 4, together), 0) == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
