@@ -356,6 +356,9 @@ class DRUNet(Denoiser):
         blocks: of each scale, going down and going up, at most 1000; 4 is published.
         patch: side of the squares of pixels that enter as channels, 1 to 8. 2, as in FFDNet (Zhang et al., TIP 2018),
             takes a quarter of the time, for pictures that were demosaiced.
+        light: give the network the mean over a cell besides, as blind ones have it: for developed pictures, whose noise
+            depends on light by a curve that a noise map of one level does not tell. A variance of 0 then stands for a
+            level that is not known.
         limits, mend, pyramid, channels, variance_map, deviation, domain, seed: see :class:`denoisers.Denoiser`.
 
     Example:
@@ -381,6 +384,7 @@ class DRUNet(Denoiser):
         seed: int = 0,
         patch: int = 1,
         pyramid: int = 0,
+        light: bool = False,
     ) -> None:
         require_width(width)
         require_between("scales", scales, 1, MOST_SCALES)
@@ -388,14 +392,15 @@ class DRUNet(Denoiser):
         require_bounded(seed, blocks=blocks)
         config = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
         config |= ({} if patch == 1 else {"patch": patch}) | ({"pyramid": pyramid} if pyramid else {})
+        config |= {"light": True} if light else {}
         cell = 2 ** (scales - 1)
         stride = patch * CONTEXT * cell
         super().__init__(channels, variance_map, deviation, stride, config, domain, limits, mend, pyramid)
         self.cell, self.patch = cell, patch
         planes = channels * patch**2
         sizes = [width * 2**k for k in range(scales)]
-        blind = 0 if self.reads_variance else planes
-        self.head = conv(self.inputs * patch**2 + blind, width, bias=False)
+        self.light = light or not self.reads_variance
+        self.head = conv(self.inputs * patch**2 + self.light * planes, width, bias=False)
         self.encoder = nn.ModuleList(_residuals(size, blocks) for size in sizes)
         self.downs = nn.ModuleList(conv(c, 2 * c, 2, bias=False, stride=2, padding=0) for c in sizes[:-1])
         self.ups = nn.ModuleList(conv(2 * c, 4 * c, 1, bias=False) for c in reversed(sizes[:-1]))
@@ -415,8 +420,8 @@ class DRUNet(Denoiser):
         signal, maps = features[:, :planes], features[:, planes:]
         mean = F.avg_pool2d(signal, self.cell)
         light = F.interpolate(mean, signal.shape[-2:], mode="bilinear")
-        maps = maps if self.reads_variance else light
-        x, skips = self.head(torch.cat([signal - light, maps], dim=1)), []
+        seen = [signal - light, maps, light] if self.light else [signal - light, maps]
+        x, skips = self.head(torch.cat(seen, dim=1)), []
         # The mean over a cell has noise of deviation 1 / cell.
         wide = F.interpolate(F.avg_pool2d(mean, CONTEXT), mean.shape[-2:], mode="bilinear")
         coarse = self.coarse(self.cell * (mean - wide))

@@ -272,12 +272,12 @@ def _transform(profile: bytes) -> tuple[str, Any]:
     return mode, ImageCms.buildTransform(source, target, mode, "RGB", intent, flags)
 
 
-def through_jpeg(srgb: Tensor, quality: int) -> Tensor:
-    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again."""
+def through_jpeg(srgb: Tensor, quality: int, chroma: str = "4:2:2") -> Tensor:
+    """sRGB ``(3, H, W)`` uint8, encoded at ``quality`` (1 to 100) and decoded again; ``chroma`` is its subsampling."""
     with extra("raw"):
         from PIL import Image
 
     stored = BytesIO()
     picture = Image.fromarray(srgb.permute(1, 2, 0).contiguous().numpy())
-    picture.save(stored, "JPEG", quality=quality, subsampling="4:2:2")
+    picture.save(stored, "JPEG", quality=quality, subsampling=chroma)
     return torch.from_numpy(np.array(Image.open(stored))).permute(2, 0, 1).contiguous()

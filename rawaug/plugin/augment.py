@@ -30,6 +30,7 @@ from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, of_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
+from rawaug.plugin.finishing import Finish
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.plugin.targets import Burst, Target, Targets, through_jpeg
@@ -73,6 +74,8 @@ class RawAugment(nn.Module):
         motion: of a burst: largest shift in pixels and rotation in degrees, (2, 0.5) by default; see
             :mod:`rawaug.plugin.targets`.
         stops: of a burst: exposure of each frame in stops, for brackets; all alike by default.
+        finish: of ``"srgb"``: finish both pictures as cameras do, by a :class:`rawaug.plugin.finishing.Finish` or, with
+            True, its defaults: noise reduction, sharpening, and JPEG on the noisy one.
         tone: one of the ISP's tone curves by name (``isp.info["tones"]``), in place of mixtures of them.
 
     Raises:
@@ -105,6 +108,7 @@ class RawAugment(nn.Module):
         burst: int | None = None,
         motion: tuple[float, float] | None = None,
         stops: Sequence[float] | None = None,
+        finish: Finish | bool = False,
     ) -> None:
         super().__init__()
         self.pattern = None if cfa is None else pattern(cfa)
@@ -113,7 +117,7 @@ class RawAugment(nn.Module):
             isp.configure(cfa=str(cfa))
         self.isp = frozen(isp)
         self.baked = frozen(BakedISP(isp))
-        self.targets = Targets(target, demosaicing, jpeg, self.cfa)
+        self.targets = Targets(target, demosaicing, jpeg, self.cfa, finish)
         self.forward_pass = frozen(FastForward(isp)) if target == "srgb" else None
         if burst is None and (motion, stops) != (None, None):
             raise ValueError("motion and stops are those of a burst; give burst, or omit them")
@@ -292,8 +296,10 @@ class RawAugment(nn.Module):
         _require_finite(raw)
         mosaics = [bayer.unpack(x, self.isp.cfa) for x in (raw, planes)]
         noisy, clean = self.targets.develop(forward, mosaics, params)
+        if self.targets.finish is not None:
+            noisy, clean = self.targets.finish.apply(noisy, clean, params.extras["finish"])
         if "quality" in params.extras:
-            noisy = through_jpeg(noisy, params.extras["quality"])
+            noisy = through_jpeg(noisy, params.extras["quality"], params.extras.get("chroma_420"))
         return noisy, clean, noisy.new_empty(len(noisy), 0)
 
     def _burst(self, srgb: Tensor, params: AugmentParams, burst: Burst) -> RawPair:

@@ -29,6 +29,7 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import FastForward
 from rawaug.kernels.runtime import one_thread
 from rawaug.noise.models import new_seeds
+from rawaug.plugin.finishing import Finish
 from rawaug.plugin.params import AugmentParams
 
 Target = Literal["raw", "rgb", "srgb"]
@@ -38,12 +39,17 @@ class Targets:
     """The target of a :class:`rawaug.RawAugment`, whose settings these are, and what is drawn for it."""
 
     def __init__(
-        self, target: Target, demosaicing: str | Sequence[str] | None, jpeg: tuple[int, int] | None, pattern: str
+        self,
+        target: Target,
+        demosaicing: str | Sequence[str] | None,
+        jpeg: tuple[int, int] | None,
+        pattern: str,
+        finish: Finish | bool = False,
     ) -> None:
         if target not in get_args(Target):
             raise ValueError(f"target {target!r} is unknown; use one of {', '.join(get_args(Target))}")
-        if target != "srgb" and (demosaicing, jpeg) != (None, None):
-            raise ValueError(f"demosaicing and jpeg are for target 'srgb', not {target!r}; omit them")
+        if target != "srgb" and ((demosaicing, jpeg) != (None, None) or finish):
+            raise ValueError(f"demosaicing, jpeg and finish are for target 'srgb', not {target!r}; omit them")
         if target == "srgb" and pattern not in bayer.CFA.__members__:
             raise ValueError(f"target 'srgb' demosaics Bayer patterns, not {pattern}; use target 'rgb' or 'raw'")
         if jpeg is not None and not (len(jpeg) == 2 and 1 <= jpeg[0] <= jpeg[1] <= 100):
@@ -52,6 +58,9 @@ class Targets:
         self.names = (names,) if isinstance(names, str) else tuple(names)
         for name in self.names:
             bayer.require_method(name)
+        self.finish = Finish() if finish is True else finish or None
+        if self.finish is not None and jpeg is None:
+            jpeg = self.finish.quality
         self.target, self.jpeg = target, jpeg
 
     def sample(self, batch: int, generator: torch.Generator) -> dict[str, Tensor]:
@@ -61,7 +70,7 @@ class Targets:
         drawn = {"demosaicing": torch.randint(len(self.names), (batch,), generator=generator)}
         if self.jpeg is not None:
             drawn["quality"] = torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator)
-        return drawn
+        return drawn if self.finish is None else drawn | self.finish.sample(batch, generator)
 
     def develop(self, forward: FastForward, raws: Sequence[Tensor], params: AugmentParams) -> list[Tensor]:
         """Mosaics of the same pictures, ``(B, 1, H, W)`` each, to sRGB in [0, 1]; a saturated sensor is white."""
@@ -76,12 +85,16 @@ def reaching_white(setting: ISPParams) -> ISPParams:
     return setting._replace(gains=setting.gains / setting.gains.amin(dim=-1, keepdim=True).clamp_max(1.0))
 
 
-def through_jpeg(srgb: Tensor, quality: Tensor) -> Tensor:
-    """sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of these qualities ``(B,)`` show it."""
+def through_jpeg(srgb: Tensor, quality: Tensor, chroma_420: Tensor | None = None) -> Tensor:
+    """sRGB ``(B, 3, H, W)`` in [0, 1] as JPEGs of these qualities ``(B,)`` show it.
+
+    Chroma is 4:2:2, or, where ``chroma_420`` ``(B,)`` is given, 4:2:0 where it says so and 4:4:4 elsewhere.
+    """
     from rawaug.io.pictures import through_jpeg  # OpenImageIO
 
     in_bytes = (srgb * 255.0).round().to("cpu", torch.uint8)
-    shown = [through_jpeg(picture, q) for picture, q in zip(in_bytes, quality.tolist(), strict=True)]
+    halved = ["4:2:2"] * len(srgb) if chroma_420 is None else ["4:2:0" if x else "4:4:4" for x in chroma_420.tolist()]
+    shown = [through_jpeg(*one) for one in zip(in_bytes, quality.tolist(), halved, strict=True)]
     return torch.stack(shown).to(srgb) / 255.0
 
 
