@@ -1,0 +1,117 @@
+"""Finishing: what it does to noise in flat areas, at edges and between channels, and that clean follows noisy."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from rawaug.plugin.augment import RawAugment
+from rawaug.plugin.finishing import Finish, blurred
+
+SIDE = 96
+
+
+def setting(blur: float = 0.0, threshold: float = math.inf, chroma: float = 0.0, mix: float = 0.0) -> Tensor:
+    """``(1, 6)`` parameters without sharpening."""
+    return torch.tensor([[blur, threshold, chroma, mix, 0.0, 1.0]])
+
+
+def step_and_noise(seed: int = 0, deviation: float = 0.02) -> tuple[Tensor, Tensor]:
+    """A grey picture with an edge down its middle, noisy and clean ``(1, 3, SIDE, SIDE)``."""
+    clean = torch.full((1, 3, SIDE, SIDE), 0.3)
+    clean[..., SIDE // 2 :] = 0.7
+    return clean + deviation * torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed)), clean
+
+
+@pytest.mark.parametrize("deviation", [1.0, 2.5])
+def test_blur_divides_the_variance_of_white_noise_by_4_pi_s_squared(deviation: float) -> None:
+    noise = torch.randn(8, 1, 128, 128, generator=torch.Generator().manual_seed(0))
+    inner = blurred(noise, deviation)[..., 16:-16, 16:-16]
+    assert inner.var().item() == pytest.approx(1.0 / (4.0 * math.pi * deviation**2), rel=0.05)
+    assert torch.allclose(blurred(torch.full((1, 2, 20, 20), 0.4), deviation), torch.tensor(0.4))
+
+
+def test_noise_reduction_that_spares_edges_leaves_the_noise_there() -> None:
+    def ratio(threshold: float) -> float:
+        noisy, clean = (x[0] for x in Finish().apply(*step_and_noise(), setting(1.0, threshold)))
+        luma = (noisy - clean).mean(0)
+        middle = SIDE // 2
+        return (luma[:, middle - 1 : middle + 1].var() / luma[:, 8 : middle - 8].var()).item()
+
+    assert ratio(math.inf) == pytest.approx(1.0, abs=0.35)
+    assert ratio(2.0) > 2.5
+
+
+def test_the_clean_picture_is_the_mean_of_many_finished_shots() -> None:
+    finished, cleans = [], []
+    for seed in range(60):
+        noisy, clean = Finish().apply(*step_and_noise(seed), setting(0.8, 2.0, 2.0, 0.9))
+        finished.append(noisy)
+        cleans.append(clean)
+    departure = torch.stack(finished).mean(0) - torch.stack(cleans).mean(0)
+    assert departure.abs().mean().item() < 1.5 * 0.02 / math.sqrt(60)
+    original = step_and_noise()[1]
+    assert (cleans[0] - original)[..., SIDE // 2 - 1 : SIDE // 2 + 1].abs().max().item() < 0.1, "the edge has stayed"
+
+
+def test_chroma_noise_reduction_ties_the_channels_together() -> None:
+    def correlation(mix: float) -> float:
+        noisy, clean = Finish().apply(*step_and_noise(), setting(chroma=3.0, mix=mix))
+        return torch.corrcoef((noisy - clean)[0].flatten(1))[0, 1].item()
+
+    assert abs(correlation(0.0)) < 0.05
+    assert correlation(1.0) > 0.8
+
+
+def test_sharpening_raises_the_noise_and_keeps_flat_areas() -> None:
+    noisy, clean = step_and_noise()
+    sharp = torch.tensor([[0.0, math.inf, 0.0, 0.0, 0.5, 1.0]])
+    after, flat = Finish().apply(noisy, clean, sharp)
+    assert (after - flat)[..., 8:40].var() > 1.5 * (noisy - clean)[..., 8:40].mean(1).var()
+    assert torch.allclose(flat[..., 8:32], clean[..., 8:32], atol=1e-6)
+
+
+def test_pairs_replay_and_do_not_depend_on_their_neighbours() -> None:
+    augment = RawAugment.from_pretrained("universal", noise=(1e-2, 1e-4), target="srgb", finish=True)
+    pictures = torch.rand(3, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    pair = augment(pictures, torch.Generator().manual_seed(2))
+    again = augment.apply(pictures, pair.params)
+    assert torch.equal(pair.noisy, again.noisy) and torch.equal(pair.clean, again.clean)
+    alone = augment.apply(pictures[1], pair.params.map(lambda t: t[1]))
+    assert torch.equal(alone.noisy, pair.noisy[1])
+    assert pair.params.extras["finish"].shape == (3, 6)
+
+
+def test_jpeg_is_on_the_noisy_picture_alone() -> None:
+    pictures = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+    def pair(quality: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        finish = Finish(quality=quality)
+        augment = RawAugment.from_pretrained("universal", noise=(1e-3, 1e-5), target="srgb", finish=finish)
+        made = augment(pictures, torch.Generator().manual_seed(3))
+        return made.noisy, made.clean
+
+    (rough, clean), (fine, same) = pair((20, 20)), pair((95, 95))
+    assert torch.equal(clean, same)
+    assert not torch.equal(rough, fine)
+
+
+def test_shares_are_of_pictures() -> None:
+    drawn = Finish(unfinished=0.25, edges=0.5).sample(2000, torch.Generator().manual_seed(0))["finish"]
+    plain = (drawn == 0.0).all(1)
+    assert plain.float().mean().item() == pytest.approx(0.25, abs=0.03)
+    assert drawn[~plain, 1].isinf().float().mean().item() == pytest.approx(0.5, abs=0.04)
+    noisy, clean = step_and_noise()
+    assert torch.equal(Finish().apply(noisy, clean, torch.zeros(1, 6))[0], noisy)
+
+
+def test_ranges_out_of_order_and_other_targets_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"finish: luma_blur must be \(lowest, highest\)"):
+        Finish(luma_blur=(1.0, 0.5))
+    with pytest.raises(ValueError, match="finish: edges must be a share"):
+        Finish(edges=1.5)
+    with pytest.raises(ValueError, match="finish are for target 'srgb'"):
+        RawAugment.from_pretrained("universal", finish=True)
