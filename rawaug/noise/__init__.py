@@ -23,7 +23,7 @@ from rawaug.noise.estimate import (
     own_noise_share,
     plot_noise,
 )
-from rawaug.noise.levels import EldLevels, FixedLevels, NoiseLevels, PmridLevels, Preset, SiddLevels
+from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, PmridLevels, Preset, SiddLevels
 from rawaug.noise.models import NoiseModel, Params, PoissonGaussianNoise, ShotReadModel, ShotReadNoise
 from rawaug.noise.sensor import (
     BlackOffset,
@@ -41,7 +41,7 @@ from rawaug.noise.sensor import (
 
 __all__ = [
     "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DarkFrames", "DarkNoise",
-    "DefectPixels", "EldLevels", "EldNoise", "FixedLevels", "IsoLevel", "MeasuredLevels", "MeasuredNoise",
+    "DefectPixels", "EldLevels", "EldNoise", "FixedLevels", "Iso", "IsoLevel", "MeasuredLevels", "MeasuredNoise",
     "NoiseEstimate", "NoiseLevels", "NoiseModel", "NoisePoints", "NoiseSpec", "Params", "PmridLevels",
     "PoissonGaussianNoise", "Preset", "Quantisation", "RowNoise", "ScaledLevels", "SensorNoise", "ShotReadModel",
     "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise", "camera_law", "camera_names", "estimate_noise",

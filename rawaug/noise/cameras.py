@@ -37,6 +37,7 @@ over draws of the law and the pictures' m. Conde et al., AAAI 2022, state P = 41
 from __future__ import annotations
 
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
@@ -281,7 +282,17 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         return Preset(spec)
     if not isinstance(spec, Sequence) or len(spec) != 2:
         raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
-    return FixedLevels(*(float(value) for value in spec))
+    shot_var, read_var = (float(value) for value in spec)
+    if 0 < shot_var < read_var:
+        question_order(shot_var, read_var)
+    return FixedLevels(shot_var, read_var)
+
+
+@cache
+def question_order(shot_var: float, read_var: float) -> None:
+    """Once for each pair of levels: no sensor has more read noise than shot noise at white."""
+    said = f"noise ({shot_var:g}, {read_var:g}): read_var is above shot_var, as in no sensor"
+    warnings.warn(f"{said}; the order is (shot_var, read_var)", stacklevel=3)
 
 
 def _of_profile(spec: str, iso: Iso) -> ProfileLevels:

@@ -13,7 +13,7 @@ and the parameters replay the pair bit for bit. :mod:`rawaug.plugin.dataset` put
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy, deepcopy
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, overload
@@ -29,11 +29,11 @@ from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP, FastForward
 from rawaug.isp.model import DictionaryISP, of_cameras
 from rawaug.kernels.runtime import eager
-from rawaug.noise import NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
+from rawaug.noise import Iso, NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.plugin.finishing import Finish
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
-from rawaug.plugin.targets import Burst, Target, Targets, through_jpeg
+from rawaug.plugin.targets import Burst, Target, Targets, reaching_white, through_jpeg
 from rawaug.registry import nearest
 from rawaug.seeding import keyed_generator, rank_key
 
@@ -119,6 +119,7 @@ class RawAugment(nn.Module):
         self.baked = frozen(BakedISP(isp))
         self.targets = Targets(target, demosaicing, jpeg, self.cfa, finish)
         self.forward_pass = frozen(FastForward(isp)) if target == "srgb" else None
+        self.display: FastForward | None = self.forward_pass
         if burst is None and (motion, stops) != (None, None):
             raise ValueError("motion and stops are those of a burst; give burst, or omit them")
         self.burst = None if burst is None else Burst(burst, motion, stops)
@@ -147,6 +148,7 @@ class RawAugment(nn.Module):
             whose = f"with sampling {sampling!r}" if cameras else "of a fitted ISP"
             raise ValueError(f"light and tone are drawn for published cameras, as in universal, not {whose}; omit them")
         self.noise = noise_for(self.isp, noise)
+        self.noise_name = _noise_name(noise)
         if self.pattern is not None and self.noise.by_plane:
             raise ValueError(f"this noise is one of planes R, Gr, Gb, B, which {self.pattern.name} does not have")
         self.sampling, self.strength, self.seed, self.exposure = sampling, strength, seed, exposure
@@ -166,7 +168,12 @@ class RawAugment(nn.Module):
 
     @classmethod
     def from_pretrained(
-        cls, isp: str | Path | DictionaryISP, camera: str | Sequence[str] | None = None, **settings: Any
+        cls,
+        isp: str | Path | DictionaryISP,
+        camera: str | Sequence[str] | None = None,
+        *,
+        iso: Iso = None,
+        **settings: Any,
     ) -> RawAugment:
         """From the name of a shipped ISP, a path, or an ISP.
 
@@ -174,17 +181,28 @@ class RawAugment(nn.Module):
             isp: the name, path or ISP.
             camera: maker and model of a published camera, or several, in place of the ISP's colour atoms; for an ISP of
                 published cameras, such as ``universal``.
+            iso: of the noise, which is that of ``camera`` unless ``noise`` names another: one ISO or limits;
+                ``rawaug info cameras`` lists the measured ranges.
             settings: as in the constructor.
 
         Raises:
             FileNotFoundError: if there is no such ISP.
-            ValueError: if a camera is not listed, or the ISP was fitted to frames.
+            ValueError: if a camera is not listed, the ISP was fitted to frames, or no noise was measured at this ISO.
 
         Example:
             >>> augment = RawAugment.from_pretrained("universal", camera="Nikon D750")
             >>> augment.isp.info["cameras"]
             ['Nikon D750']
+            >>> RawAugment.from_pretrained("universal", camera="Nikon D750", iso=800)
+            RawAugment, camera: Nikon D750, convex, exposure -0.5 to 1 stops
+              noise: Nikon D750, iso 800
+              target: raw, RGGB
         """
+        if iso is not None:
+            named = settings.get("noise", camera)
+            if not isinstance(named, str):
+                raise ValueError("iso is that of one camera's noise: give its name as camera= or noise=")
+            settings["noise"] = {"name": named, "settings": {"iso": iso}}
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
         return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
 
@@ -268,6 +286,57 @@ class RawAugment(nn.Module):
             if self.targets.target == "rgb":
                 clean = self.baked.colours(srgb, params.isp, params.place, white=1.0)
             return RawPair(noisy, clean, variance, params)
+
+    @eager
+    @torch.no_grad()
+    def develop(self, raw: Tensor, params: AugmentParams, demosaicing: str = "malvar") -> Tensor:
+        """RAW of a pair, noisy, clean or denoised, back to sRGB by the camera setting that made it, to look at.
+
+        Args:
+            raw: packed RAW ``(B, 4, h, w)``, or ``(4, h, w)`` of a sample of a Dataset; white = 1.
+            params: of the pair: ``pair.params``.
+            demosaicing: a name of :data:`rawaug.bayer.METHODS`.
+
+        Returns:
+            float32 sRGB ``(B, 3, 2h, 2w)`` or ``(3, 2h, 2w)`` in [0, 1].
+
+        Raises:
+            ValueError: if it is not packed RAW, or ``params`` are for another number of pictures.
+
+        Example:
+            >>> augment = RawAugment(DictionaryISP())
+            >>> pair = augment(torch.rand(2, 3, 64, 64))
+            >>> augment.develop(pair.noisy, pair.params).shape
+            torch.Size([2, 3, 64, 64])
+        """
+        if raw.ndim == 3:
+            return self.develop(raw[None], params.map(lambda t: t[None]), demosaicing)[0]
+        if self.pattern is not None or raw.ndim != 4 or raw.shape[1] != 4 or min(raw.shape[-2:]) < 2:
+            raise ValueError(
+                f"develop takes packed RAW of a Bayer pattern, (B, 4, h, w) or (4, h, w) from 2 x 2 on, "
+                f"got {tuple(raw.shape)} of {self.cfa}"
+            )
+        if len(params.place) != len(raw):
+            raise ValueError(f"the parameters are for {len(params.place)} pictures, but the batch has {len(raw)}")
+        bayer.require_method(demosaicing)
+        if self.display is None:  # tables that only this needs
+            self.display = frozen(FastForward(self.isp))
+        mosaic, methods = bayer.unpack(raw.float(), self.isp.cfa), [demosaicing] * len(raw)
+        with _float32(raw):
+            return self.display.develop([mosaic], methods, reaching_white(params.isp), params.place)[0]
+
+    def __repr__(self) -> str:
+        """What is drawn, in three lines: the camera, the noise, the target."""
+        names = self.isp.info.get("cameras", [])
+        camera = names[0] if len(names) == 1 else f"one of {len(names)} published" if names else "the fitted one"
+        light = "" if self.light is None else f", light {self.light}"
+        exposure = f"exposure {self.exposure[0]:g} to {self.exposure[1]:g} stops"
+        frames = "" if self.burst is None else f", bursts of {self.burst.frames} frames"
+        return (
+            f"RawAugment, camera: {camera}, {self.sampling}{light}, {exposure}\n"
+            f"  noise: {self.noise_name}\n"
+            f"  target: {self.targets.target}, {self.cfa}{frames}"
+        )
 
     def _clean(self, srgb: Tensor, params: AugmentParams) -> Tensor:
         if self.pattern is None:
@@ -417,6 +486,16 @@ def _require_finite(raw: Tensor) -> None:
 def _float32(like: Tensor) -> torch.autocast:
     """RAW is float32, inside mixed precision too."""
     return torch.autocast(like.device.type, enabled=False)
+
+
+def _noise_name(noise: NoiseSpec | NoiseModel) -> str:
+    if isinstance(noise, Mapping):
+        own = {key: value for key, value in noise.items() if key != "name"}
+        said = [f"{key} {value}" for key, value in own.pop("settings", own).items()]
+        return ", ".join([str(noise.get("name", "calibrated")), *said])
+    if isinstance(noise, NoiseModel):
+        return type(noise).__name__
+    return noise if isinstance(noise, str) else str(tuple(noise))
 
 
 def noise_for(isp: DictionaryISP, noise: NoiseSpec | NoiseModel) -> NoiseModel:

@@ -1,9 +1,10 @@
 """Pictures in any common form, converted to one: RGB, channels first, 8 bits or float32 in [0, 1].
 
 A *picture* is a tensor, a NumPy array or a PIL image, HWC or CHW: uint8, uint16 (divided by 65535) or floating point
-in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out. A
-*batch* is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is one of
-these, or a tuple or mapping with one among its fields.
+in [0, 1]. Grey is repeated to three channels. Of RGBA the colours are kept as they are stored and alpha is left out;
+a float tensor of four channels, and an array that has them first, is refused: it is more likely packed RAW. A *batch*
+is ``(B, 3, H, W)`` or ``(B, H, W, 3)``, or a list of pictures. A *sample*, or a loader's batch, is one of these, or a
+tuple or mapping with one among its fields.
 """
 
 from __future__ import annotations
@@ -169,8 +170,12 @@ def _rgb(image: Tensor, original: Any) -> Tensor:
     first, last = (image.shape[axis] in _CHANNELS for axis in (-3, -1))
     if not (first or last):
         raise ValueError(f"a picture must be (3, H, W), (H, W, 3), grey or RGBA, got {_described(original)}")
-    if last and not (first and isinstance(original, Tensor)):
-        image = image.movedim(-1, -3)
+    trailing = last and not (first and isinstance(original, Tensor))
+    image = image.movedim(-1, -3) if trailing else image
+    if image.shape[-3] == 4 and image.is_floating_point() and not (trailing and isinstance(original, np.ndarray)):
+        raise ValueError(
+            f"{_described(original)} has four channels: is this packed RAW? It needs sRGB; of RGBA pass the first three"
+        )
     image = image.expand(*image.shape[:-3], 3, -1, -1) if image.shape[-3] == 1 else image[..., :3, :, :]
     if image.dtype == torch.uint8:
         return image

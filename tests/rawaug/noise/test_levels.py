@@ -299,3 +299,10 @@ def test_recipes_name_it_by_the_figure_alone() -> None:
     assert isinstance(bare, CalibratedNoise) and torch.equal(drawn[0]["shot_var"], drawn[1]["shot_var"])
     with pytest.raises(ValueError, match="signl"):
         noise_model({"pair_psnr": 41.18, "signl": 0.1})
+
+
+def test_levels_in_the_wrong_order_are_questioned_once() -> None:
+    with pytest.warns(UserWarning, match=r"noise \(1e-06, 0\.1\): read_var is above shot_var"):
+        noise_model((1e-6, 0.1))
+    noise_model((1e-6, 0.1))  # a second warning would be an error here
+    noise_model((0.0, 0.1))  # white noise is asked for

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,64 @@ def test_wrong_settings_are_refused(isp: DictionaryISP) -> None:
         RawAugment(isp, sampling="random")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"\(lowest, highest\) in stops"):
         RawAugment(isp, exposure=(1.0, -1.0))
+
+
+def test_raw_is_developed_by_the_setting_that_made_it(isp: DictionaryISP) -> None:
+    """As the target sRGB has it, of a batch and of one sample; and near the picture, which demosaicing alone blurs."""
+    smooth = torch.nn.functional.interpolate(torch.rand(2, 3, 4, 5), (32, 40), mode="bicubic").clamp(0.1, 0.9)
+    augment = RawAugment(isp, noise=(0.0, 0.0))
+    developed = RawAugment(isp, noise=(0.0, 0.0), target="srgb", demosaicing="malvar")
+    pair, draws = augment(smooth, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(1)
+    srgb = augment.develop(pair.clean, pair.params)
+    assert torch.equal(srgb, developed(smooth, draws).clean) and srgb.shape == smooth.shape
+    assert (srgb - smooth).abs().mean() < 0.02
+    sample = RawPairs(list(smooth), augment, crop=16)[1]
+    alone = augment.develop(sample.noisy, sample.params)
+    together = augment.develop(sample.noisy[None], sample.params.map(lambda t: t[None]))
+    assert alone.shape == (3, 16, 16) and torch.equal(alone, together[0])
+    assert not set(augment.state_dict()), "the tables of the development are no weights"
+
+
+def test_what_is_no_packed_raw_is_not_developed(augment: RawAugment, srgb: Tensor) -> None:
+    pair = augment(srgb)
+    with pytest.raises(ValueError, match=r"takes packed RAW .* got \(3, 3, 16, 20\) of RGGB"):
+        augment.develop(srgb / 255.0, pair.params)
+    with pytest.raises(ValueError, match="the parameters are for 3 pictures, but the batch has 2"):
+        augment.develop(pair.noisy[:2], pair.params)
+    with pytest.raises(ValueError, match="of XTRANS"):
+        RawAugment(augment.isp, cfa="XTRANS").develop(pair.noisy, pair.params)
+
+
+def test_printed_it_says_what_is_drawn(isp: DictionaryISP) -> None:
+    assert repr(RawAugment(isp, noise="upi", burst=3)).splitlines() == [
+        "RawAugment, camera: the fitted one, convex, exposure 0 to 0 stops",
+        "  noise: upi",
+        "  target: raw, RGGB, bursts of 3 frames",
+    ]
+    any_of_them = RawAugment.from_pretrained("universal", noise=("upi", "rawir"), light=5500.0, target="srgb")
+    assert re.fullmatch(
+        r"RawAugment, camera: one of \d+ published, convex, light 5500.0, exposure -0.5 to 1 stops\n"
+        r"  noise: \('upi', 'rawir'\)\n  target: srgb, RGGB",
+        repr(any_of_them),
+    )
+
+
+def test_the_iso_is_that_of_the_camera_s_noise(srgb: Tensor) -> None:
+    drawn = {}
+    for iso in (800, 3200):
+        augment = RawAugment.from_pretrained("universal", camera="Sony ILCE-7M3", iso=iso)
+        drawn[iso] = augment(srgb).params.noise["shot_var"]
+        assert drawn[iso].unique().numel() == 1 and f"ILCE-7M3, iso {iso}" in repr(augment)
+    assert 3 < drawn[3200][0] / drawn[800][0] < 5
+    other = RawAugment.from_pretrained("universal", camera="Sony ILCE-7M3", noise="Nikon D750", iso=(100, 200))
+    assert "noise: Nikon D750, iso (100, 200)" in repr(other)
+    for settings, message in (
+        ({"iso": 800}, "give its name as camera= or noise="),
+        ({"camera": "Sony ILCE-7M3", "iso": 10**7}, "outside the measured range of Sony ILCE-7M3"),
+        ({"noise": "upi", "iso": 800}, "does not depend on ISO"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            RawAugment.from_pretrained("universal", **settings)
 
 
 def test_parameters_of_another_batch_are_refused(augment: RawAugment, srgb: Tensor) -> None:

@@ -57,6 +57,15 @@ def test_pil_modes_that_are_not_srgb_are_refused() -> None:
             to_rgb_tensor(Image.new(mode, (4, 4)))
 
 
+def test_packed_raw_is_not_taken_for_rgba() -> None:
+    raw = torch.rand(2, 4, 8, 8)
+    for packed in (raw, raw[0], raw.movedim(1, -1), raw.numpy(), raw[0].numpy(), [raw[0]]):
+        with pytest.raises(ValueError, match="four channels: is this packed RAW"):
+            to_rgb_batch(packed)
+    rgba = np.random.default_rng(0).random((6, 8, 4), dtype=np.float32)  # as matplotlib reads a PNG
+    assert to_rgb_tensor(rgba).shape == (3, 6, 8)
+
+
 def test_grey_is_repeated() -> None:
     for grey in (ARRAY[..., 0], ARRAY[..., :1], RGB[0], RGB[:1], Image.fromarray(ARRAY[..., 0])):
         assert torch.equal(to_rgb_tensor(grey), RGB[:1].expand(3, -1, -1))
