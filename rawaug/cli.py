@@ -32,7 +32,7 @@ COMMANDS = {
     "export": "Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.",
     "fit": "Fit a dictionary ISP to RAW files of a camera.",
     "hdr": "Merge exposures of a scene in RAW, or change the exposure of a single picture.",
-    "info": "Describe a weights file.",
+    "info": "Describe a weights file, or list the known cameras: rawaug info cameras [PART].",
     "preview": "Draw a picture at every stage of an ISP, and as augmented RAW.",
     "run": "Run a recipe: rawaug run RECIPE [--key value ...]; resumable, writes runs/NAME.",
     "submit": "Denoise the noisy blocks of a benchmark, in the form that its server takes.",

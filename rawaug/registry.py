@@ -231,27 +231,3 @@ STAGES = Registry("stage", "rawaug.stages", "rawaug.isp")
 EXPERIMENTS = Registry("experiment", "rawaug.experiments", "rawaug.experiment", "rawaug.paper")
 """``run(settings, overwrite)``, named by a recipe's key ``experiment``; ``settings`` is a dataclass of its keys, whose
 method ``shortest()`` gives the settings with one step of everything."""
-
-
-def spelled(name: str, known: Iterable[str]) -> str:
-    """The camera of ``known``, maker and model, that ``name`` is but for case and spaces; of several the first.
-
-    Raises:
-        ValueError: if there is no such name; similar ones are suggested.
-
-    Example:
-        >>> spelled("nikon  d750", ["Nikon D750", "Nikon D7500"])
-        'Nikon D750'
-    """
-    by_key: dict[str, str] = {}
-    for candidate in known:
-        by_key.setdefault(_key(candidate), candidate)
-    if _key(name) in by_key:
-        return by_key[_key(name)]
-    similar = difflib.get_close_matches(_key(name), by_key, n=3)
-    hint = f"; similar: {', '.join(by_key[key] for key in similar)}" if similar else ""
-    raise ValueError(f"camera {name!r} is not listed{hint}")
-
-
-def _key(name: str) -> str:
-    return " ".join(name.casefold().split())

@@ -15,11 +15,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted(file.relative_to(ROOT) for part in ("rawaug", "denoisers") for file in (ROOT / part).rglob("*.py"))
-BASE = {"bayer", "errors", "files", "metrics", "progress", "registry", "seeding"}
+BASE = {"bayer", "camera_names", "errors", "files", "metrics", "progress", "registry", "seeding"}
 CAMERA = BASE | {"isp", "noise", "kernels", "denoisers"}
 PRODUCT = CAMERA | {"plugin", "data", "io", "evaluation", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "bayer": {"seeding"},
+    "camera_names": set(),
     "errors": set(),
     "files": set(),
     "metrics": set(),
@@ -117,8 +118,17 @@ LOADED: dict[str, set[str]] = {
     "import denoisers": set(),
     "import rawaug.registry": {"registry"},
     "import denoisers; denoisers.SelfEnsemble, denoisers.load, denoisers.BM3D": {"bayer", "files", "registry"},
-    "import rawaug.noise": {"bayer", "seeding", "kernels", "noise", "errors", "registry"},
-    "from rawaug import DictionaryISP": {"bayer", "seeding", "errors", "files", "isp", "kernels", "registry"},
+    "import rawaug.noise": {"bayer", "camera_names", "seeding", "kernels", "noise", "errors", "registry"},
+    "from rawaug import DictionaryISP": {
+        "bayer",
+        "camera_names",
+        "errors",
+        "files",
+        "isp",
+        "kernels",
+        "registry",
+        "seeding",
+    },
 }
 """The rooms that code may load."""
 

@@ -1,7 +1,8 @@
-"""``rawaug info``: a readable description of a weights file."""
+"""``rawaug info``: a readable description of a weights file, and the list of cameras that are known by name."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from json import dumps
 from pathlib import Path
 from typing import Any
@@ -9,18 +10,58 @@ from typing import Any
 import denoisers
 from denoisers.files import FOLDER
 from rawaug import __version__
+from rawaug.camera_names import alike, key_of
 from rawaug.files import find_weights, read_header, sha256
+from rawaug.isp.cameras import published_cameras
 from rawaug.isp.model import DictionaryISP
+from rawaug.noise.cameras import measured_ranges, published_profiles
 
 
-def run(weights: str, /, *, json: bool = False) -> None:
-    """Describe a weights file.
+def run(weights: str, /, *part: str, json: bool = False) -> None:
+    """Describe a weights file, or list the known cameras: rawaug info cameras [PART].
 
     Args:
-        weights: a .safetensors file, or the name of a shipped ISP or denoiser.
-        json: print one JSON object, for programs; of an ISP with its tone curve at 256 codes.
+        weights: a .safetensors file, or the name of a shipped ISP or denoiser; or the word cameras.
+        part: of the names of the cameras to list, such as A7 III.
+        json: print one JSON object, for programs; of an ISP with its tone curve at 256 codes, of cameras with their
+            matrices.
     """
+    if weights == "cameras":
+        found = cameras(" ".join(part))
+        print(dumps({"cameras": found}) if json else _listed(found))
+        return
+    if part:
+        raise ValueError(f"{' '.join(part)}: too many arguments; a part of a name goes with the word cameras")
     print(dumps(as_json(weights)) if json else describe(weights))
+
+
+def cameras(part: str = "") -> list[dict[str, Any]]:
+    """The cameras with ``part`` in their names: ``name``, ``xyz_to_camera`` (3 x 3) and ``iso`` of the noise, or None.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    listed, profiles = published_cameras(), published_profiles()
+    found: dict[str, dict[str, Any]] = {}
+    for name, matrix in zip(listed.names, listed.xyz_to_camera.tolist(), strict=True):
+        found.setdefault(key_of(name), {"name": name, "xyz_to_camera": matrix, "iso": None})
+    limits = dict(zip(profiles.names, profiles.limits().exp().round().tolist(), strict=True))
+    for name, iso in {**limits, **measured_ranges()}.items():
+        found.setdefault(key_of(name), {"name": name, "xyz_to_camera": None, "iso": None})["iso"] = iso
+    named = {camera["name"]: camera for camera in found.values()}
+    wanted = sorted(alike(part, named), key=str.casefold)
+    if not wanted:
+        raise ValueError(f"no camera has {part!r} in its name; rawaug info cameras lists all")
+    return [named[name] for name in wanted]
+
+
+def _listed(found: Sequence[Mapping[str, Any]]) -> str:
+    width = max(len(camera["name"]) for camera in found)
+    lines = [f"{'camera':<{width}}  matrix  noise measured at ISO"]
+    for camera in found:
+        iso = "-" if camera["iso"] is None else "{:g} to {:g}".format(*camera["iso"])
+        lines.append(f"{camera['name']:<{width}}  {'-' if camera['xyz_to_camera'] is None else 'yes':<6}  {iso}")
+    return "\n".join(lines)
 
 
 def as_json(weights: str | Path) -> dict[str, Any]:

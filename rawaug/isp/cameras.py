@@ -30,7 +30,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rawaug.registry import nearest, spelled
+from rawaug.camera_names import spelled
+from rawaug.registry import nearest
 
 Array = NDArray[np.float64]
 """Lights are a few numbers a batch, on the CPU: NumPy's calls cost a fifth of PyTorch's."""

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.camera_names import spelled
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import staged, stages
 from rawaug.isp.cameras import light_range, published_cameras
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
 from rawaug.isp.staged import StagedISP, thumbnail
-from rawaug.registry import spelled
 
 _ADVICE = "fit or copy it again"
 _INFINITE = ("colour.spread",)

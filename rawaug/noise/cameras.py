@@ -48,6 +48,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from rawaug.camera_names import spelled
 from rawaug.noise.levels import (
     EldLevels,
     FixedLevels,
@@ -63,7 +64,7 @@ from rawaug.noise.levels import (
     published,
 )
 from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
-from rawaug.registry import NOISE, Spec, checked_settings, name_and_settings, nearest, spelled
+from rawaug.registry import NOISE, Spec, checked_settings, name_and_settings, nearest
 from rawaug.seeding import keyed_generator
 
 ANY_CAMERA = "any camera"
@@ -246,7 +247,7 @@ NoiseSpec = Spec | Sequence[float] | Sequence[str]
 
 
 @cache
-def _by_iso() -> dict[str, Callable[[Iso], NoiseLevels]]:
+def _by_iso() -> dict[str, Callable[[Iso], SiddLevels | PmridLevels | EldLevels]]:
     data = published()
     sidd = {name: partial(SiddLevels, name) for name in data["sidd_noise_level_function"]["cameras"]}
     return {**sidd, "pmrid": PmridLevels, **{name: partial(EldLevels, name) for name in data["eld"]["cameras"]}}
@@ -255,6 +256,11 @@ def _by_iso() -> dict[str, Callable[[Iso], NoiseLevels]]:
 def camera_names() -> list[str]:
     """The cameras that were measured one by one."""
     return list(_by_iso())
+
+
+def measured_ranges() -> dict[str, tuple[float, float]]:
+    """Lowest and highest ISO of the cameras that were measured one by one."""
+    return {name: levels(None).iso for name, levels in _by_iso().items()}
 
 
 def noise_names() -> list[str]:

@@ -236,7 +236,7 @@ def test_names_reach_the_noise_model() -> None:
     clean = torch.full((4, 4, 8, 8), 0.2)
     assert torch.equal(noise_model("any camera").apply(clean, params), noise_model("Any Camera").apply(clean, params))
     with pytest.raises(ValueError, match="similar: Nikon D750"):
-        noise_model("Nikon D 750")
+        noise_model("Nikon D75O")
     with pytest.raises(ValueError, match=r"ISO 50 is outside the measured range of Sony ILCE-7M3"):
         noise_model("Sony ILCE-7M3", iso=50)
 

@@ -1,0 +1,96 @@
+"""Cameras by the names that people have for them: published tables hold those of the files' EXIF tags.
+
+Two names are alike if they have the same letters and digits after these changes, which leave each camera its own:
+
+- a mark is ``M2`` whether it is written ``Mark II``, ``MkII``, ``II`` or Nikon's ``_2``;
+- Sony's ILCE, ILCA, SLT and DSLR are the line A, so that the A7 III is the ILCE-7M3; DSC, DMC and DC, and the words EOS
+  and Lumix, are left out;
+- what Canon sells under three names is its number: the Rebel T4i and the Kiss X6i are the 650D.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from functools import lru_cache
+
+_CANON = """
+100D Rebel SL1, Kiss X7; 200D Rebel SL2, Kiss X9; 250D 200D II, Rebel SL3, Kiss X10; 300D Rebel, Kiss;
+350D Rebel XT, Kiss N; 400D Rebel XTi, Kiss X; 450D Rebel XSi, Kiss X2; 500D Rebel T1i, Kiss X3;
+550D Rebel T2i, Kiss X4; 600D Rebel T3i, Kiss X5; 650D Rebel T4i, Kiss X6i; 700D Rebel T5i, Kiss X7i;
+750D Rebel T6i, Kiss X8i; 760D Rebel T6s, 8000D; 77D 9000D; 800D Rebel T7i, Kiss X9i; 850D Rebel T8i, Kiss X10i;
+1000D Rebel XS, Kiss F; 1100D Rebel T3, Kiss X50; 1200D Rebel T5, Kiss X70; 1300D Rebel T6, Kiss X80;
+2000D Rebel T7, Kiss X90; 4000D Rebel T100; M50 Kiss M
+"""
+"""EOS cameras, each with its names elsewhere; "Digital" before them is left out. Source: LibRaw's list of cameras."""
+
+_MARKS = {"i": 1, "ii": 2, "iii": 3, "iv": 4, "v": 5, "vi": 6, "vii": 7}
+_ROMAN = r"(i{1,3}|iv|v|vii?)(a?)\b"
+_MARK = re.compile(rf"(?:mark|mk)\s*(?:(\d)\b|{_ROMAN})|_(\d)\b|\b{_ROMAN}|(?:(?<=\d)|(?<=\d[rs]))(iii?|iv)\b")
+_LINES = (
+    (r"[\u03b1\u0251]|\balpha\b", "a"),
+    (r"\b(ilce|ilca|slt|dslr)-a?", "a"),
+    (r"\b(dsc|dmc|dc)-|\b(eos|lumix)\b", ""),
+)
+
+
+@lru_cache(maxsize=8192)
+def key_of(name: str) -> str:
+    """What names of one camera have in common.
+
+    Example:
+        >>> key_of("Sony A7 III") == key_of("Sony ILCE-7M3"), key_of("Canon EOS 5D Mark II"), key_of("Nikon Z 6_2")
+        (True, 'canon5dm2', 'nikonz6m2')
+    """
+    text = " ".join(name.casefold().split())
+    for pattern, instead in _LINES:
+        text = re.sub(pattern, instead, text)
+    text = _MARK.sub(lambda found: "m" + "".join(str(_MARKS.get(part, part or "")) for part in found.groups()), text)
+    key = re.sub(r"[\W_]", "", text)
+    return _elsewhere().get(key.replace("digital", ""), key)
+
+
+@lru_cache(maxsize=1)
+def _elsewhere() -> dict[str, str]:
+    rows = (row.split(maxsplit=1) for row in _CANON.split(";"))
+    return {
+        "canon" + re.sub(r"[\W_]", "", name.casefold().replace(" ii", "m2")): f"canon{own.casefold()}"
+        for own, names in rows
+        for name in names.split(",")
+    }
+
+
+def alike(part: str, known: Iterable[str]) -> list[str]:
+    """The cameras of ``known`` that have ``part`` in their names, or all of its words.
+
+    Example:
+        >>> alike("a7 iii", ["Sony ILCE-7M3", "Sony SLT-A77"]), alike("mark ii canon", ["Canon EOS 5D Mark II"])
+        (['Sony ILCE-7M3'], ['Canon EOS 5D Mark II'])
+    """
+    key, words = key_of(part), part.casefold().split()
+    return [name for name in known if key in key_of(name) or all(word in name.casefold() for word in words)]
+
+
+def spelled(name: str, known: Iterable[str]) -> str:
+    """The camera of ``known``, maker and model, that goes by ``name``; of several the first.
+
+    Raises:
+        ValueError: if there is no such name; similar ones are suggested.
+
+    Example:
+        >>> spelled("nikon  d750", ["Nikon D750", "Nikon D7500"]), spelled("Sony a7 III", ["Sony ILCE-7M3"])
+        ('Nikon D750', 'Sony ILCE-7M3')
+    """
+    known, key = list(dict.fromkeys(known)), key_of(name)
+    exact = " ".join(name.casefold().split())
+    by_key: dict[str, str] = {}
+    for candidate in known:
+        if " ".join(candidate.casefold().split()) == exact:
+            return candidate
+        by_key.setdefault(key_of(candidate), candidate)
+    if key in by_key:
+        return by_key[key]
+    similar = alike(name, known)[:3] or [by_key[near] for near in difflib.get_close_matches(key, by_key, 3, 0.8)]
+    hint = f"; similar: {', '.join(similar)}" if similar else ""
+    raise ValueError(f"camera {name!r} is not listed{hint}; rawaug info cameras lists all")
