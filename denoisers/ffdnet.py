@@ -1,7 +1,7 @@
 """FFDNet: white noise of a level that the network is told, at half the sides, for pictures of one or three channels.
 
-``x - S(f([sigma, S^-1(x)]))`` with the pixel shuffle S, the deviation sigma of each channel as a plane, and twelve 3 x 3
-convolutions f. Source: Zhang, Zuo and Zhang, "FFDNet: Toward a Fast and Flexible Solution for CNN-Based Image
+``x - S(f([sigma, S^-1(x)]))`` with the pixel shuffle S, the deviation sigma of each channel as a plane, and twelve 3 x
+3 convolutions f. Source: Zhang, Zuo and Zhang, "FFDNet: Toward a Fast and Flexible Solution for CNN-Based Image
 Denoising", IEEE TIP 2018.
 """
 
