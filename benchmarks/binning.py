@@ -18,7 +18,8 @@ from benchmarks.sensors import middle
 from rawaug.bayer import CFA, aligned, pack
 from rawaug.data import Binned, open_pairs
 from rawaug.data.pairs import SomePairs
-from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
 from rawaug.metrics import psnr
 from rawaug.noise import noise_model
@@ -42,16 +43,17 @@ def main(command: Sequence[str] | None = None) -> None:
     args = parser.parse_args(command)
     figures = start(args)
     noise, pairs = noise_model(args.noise), SomePairs(open_pairs(args.data), range(1) if args.quick else None)
-    everyone = [Contestant("noisy", lambda noisy, *_: noisy), *map(contestant, args.denoisers)]
+    everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     side = (96 if args.quick else args.crop) // 2
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}
         for pair in progress(Binned(pairs, args.bin, together), label=f"binned by {way}", unit="frame"):
             clean = middle(pack(aligned(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB), side)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))
-            noisy, variance = noise.apply_with_variance(clean, params)
+            levels = params["shot_var"].item(), params["read_var"].item()
+            noisy = Noisy.told(noise.apply(clean, params), levels, CFA.RGGB)
             for one in everyone:
-                found[one.name].append(psnr(one.run(noisy, variance, CFA.RGGB).clamp(0.0, 1.0), clean).item())
+                found[one.name].append(psnr(one(noisy).clamp(0.0, 1.0), clean).item())
         figures[way] = {name: round(fmean(values), 2) for name, values in found.items()}
     rows = [[way, *(f"{figures[way][one.name]:.2f}" for one in everyone)] for way in WAYS]
     print_rows(f"RAW, {args.data} binned by {args.bin}", ["", *(one.name for one in everyone)], rows)

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import denoisers
 from benchmarks.measure import parser
-from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import DemoCamera, open_pairs
 from rawaug.data.demo import FRAME
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import Method, classical_method, network_method, row_of
-from rawaug.evaluation.tables import PANEL, Row, draw
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import Panels, panels_of
+from rawaug.evaluation.tables import PANEL, draw
+from rawaug.evaluation.trials import trial_of
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.seeding import keyed_generator
 
@@ -60,7 +60,7 @@ def page() -> Pair:
     return DemoCamera().capture(picture, keyed_generator(0, "page"), name="page", iso=100)
 
 
-def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str], cfa: CFA) -> Row:
+def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str], cfa: CFA) -> Panels:
     """The panels of one piece, packed by ``cfa``; its margin is denoised with it and cut off by the figure."""
     top, left = place
     height, width = pair.raw.shape[-2:]
@@ -71,11 +71,7 @@ def row(pair: Pair, place: tuple[int, int], noise: NoiseModel, names: list[str],
     columns = slice(left - margin, left + PANEL + margin)
     raw, srgb = pair.raw[:, rows, columns], pair.srgb[:, rows, columns]
     piece = replace(pair, raw=raw, srgb=srgb, noisy=None, shot_var=None, read_var=None)
-    methods: dict[str, Method] = {"NonLocalMeans": classical_method("NonLocalMeans", noise, 0)}
-    for name in names:
-        model, info = denoisers.load(find(name))
-        methods[Path(name).stem] = network_method(model, cfa, CFA(info.get("cfa", "RGGB")))
-    return row_of(methods, piece, noise, cfa, 0)
+    return panels_of([RawDenoiser.of(name) for name in ("NonLocalMeans", *names)], trial_of(piece, noise, cfa))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -95,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for iso in options.iso:
             place = int(top) // 2 * 2, int(left) // 2 * 2
             rows.append(row(pairs[name], place, noise_model(options.camera, iso=iso), options.denoisers, cfa))
-    draw(rows, cfa, options.out)
+    draw(rows, options.out)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ import denoisers
 from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
 from denoisers.files import DEFAULT
 from rawaug import bayer
-from rawaug.commands.denoise import denoise_file
-from rawaug.commands.frame_denoisers import frame_denoiser
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoise.frames import denoise_file
 from rawaug.io import RawFrame, write_dng
 
 
@@ -66,7 +66,7 @@ def command(noisy: Tensor, denoiser: str, device: torch.device, repeats: int) ->
     mosaic, gains = bayer.unpack(noisy[0].cpu(), "RGGB"), (2.0, 1.0, 1.5)
     shot = RawFrame(mosaic, bayer.CFA.RGGB, (512.0,) * 4, 16383.0, gains, gains, torch.eye(3))
     shot = replace(shot, noise_profile=(1e-3, 1e-5))
-    method = frame_denoiser(denoiser, device=str(device))
+    method = RawDenoiser.of(denoiser, device, "auto")
     with tempfile.TemporaryDirectory() as folder:
         source, out = Path(folder, "noisy.dng"), Path(folder, "denoised.dng")
         write_dng(source, shot)

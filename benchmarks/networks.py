@@ -34,18 +34,18 @@ from torch.utils.flop_counter import FlopCounterMode
 import denoisers
 import rawaug
 from benchmarks.measure import arguments, fastest, finish, memory_used, show, start
-from denoisers.files import find
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Cached
-from rawaug.data.pairs import Pair, Sample
-from rawaug.evaluation.contestants import published_pmrid
-from rawaug.evaluation.scores import classical_method, frozen_sample, network_method, score_method
+from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import by_denoiser, score
+from rawaug.evaluation.trials import trial_of
 from rawaug.noise import noise_model
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, TrainingStream
-from rawaug.training.validation import validate, watched
+from rawaug.training.validation import validate
 
 SIZES: dict[str, dict[str, Any]] = {
     "UNet": {"width": 16, "scales": 4},
@@ -189,7 +189,7 @@ def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[s
     augment = rawaug.RawAugment.from_pretrained("universal", noise=noise)
     crops = PictureCrops(rawaug.RawPairs(pictures, augment, args.crop, zoom=2.0))
     cfa = augment.isp.cfa
-    frames = [watched(frozen_sample(pair, noise, cfa, 0), pair, cfa) for pair in middles(args)]
+    frames = [trial_of(pair, noise, cfa) for pair in middles(args)]
     stream = TrainingStream(None, crops, args.batch, 1.0, seed=0)
     config = TrainConfig(batch=args.batch, crop=args.crop, learning_rate=1e-3, weigh="mixed", clip_norm=1.0)
     config.precision = args.precision
@@ -216,22 +216,12 @@ def trained(name: str, size: dict[str, Any], args: argparse.Namespace) -> dict[s
 def references(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """The same scores of NonLocalMeans, of the shipped weights and, where ``args.pmrid`` is a file, of PMRID's."""
     noise, cfa = noise_model(NOISE), CFA.RGGB
-    shipped, info = denoisers.load(find(SHIPPED))
-    methods = {
-        "NonLocalMeans": classical_method("NonLocalMeans", noise, 0),
-        SHIPPED: network_method(shipped, cfa, CFA(info["cfa"])),
-    }
-    if args.pmrid:
-        published = published_pmrid(args.pmrid)
-
-        def pmrid(_: Pair, sample: Sample) -> Tensor:
-            return denoisers.tiled(published, sample.noisy, sample.variance).clamp(0.0, 1.0)
-
-        methods["PMRID, published weights"] = pmrid
+    named = [SHIPPED, *([args.pmrid] if args.pmrid else [])]
+    everyone = [RawDenoiser.of(name) for name in ("NonLocalMeans", *named)]
+    trials = (trial_of(pair, noise, cfa) for pair in middles(args))
     rows = {}
-    for label, method in methods.items():
-        scores = list(score_method(method, middles(args), noise, cfa, 0, label))
-        rows[label] = {key: fmean(getattr(score, key) for score in scores) for key in ("psnr", "psnr_srgb")}
+    for label, scores in by_denoiser(score(everyone, trials, "references")).items():
+        rows[label] = {key: fmean(getattr(row, key) for row in scores) for key in ("psnr", "psnr_srgb")}
     return rows
 
 

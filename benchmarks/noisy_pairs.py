@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.measure import parser
 from rawaug import bayer
 from rawaug.data.folders import RawFolder
-from rawaug.evaluation.scores import frozen_levels, frozen_sample
+from rawaug.evaluation.trials import trial_of
 from rawaug.io import read_raw, write_dng
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.progress import progress
@@ -31,16 +31,15 @@ def write_pair(folder: RawFolder, index: int, noise: NoiseModel, seed: int, out:
         ValueError: if the noise is not of the shot and read kind, or 16 bits cannot hold it.
     """
     pair = folder[index]
-    levels = frozen_levels(pair, noise, seed)
-    if levels is None:
+    trial = trial_of(pair, noise, seed=seed)
+    if trial.levels is None:
         raise ValueError(f"{pair.name}: its pair needs noise with known shot_var and read_var, such as a preset")
-    sample = frozen_sample(pair, noise, pair.cfa, seed)
     frame = replace(read_raw(folder.files[index]), black=(BLACK,) * 4, white=WHITE, noise_profile=None)
-    noisy = replace(frame, mosaic=bayer.unpack(sample.noisy, pair.cfa)[0], noise_profile=levels)
+    noisy = replace(frame, mosaic=bayer.unpack(trial.noisy, pair.cfa)[0], noise_profile=trial.levels)
     name = pair.name.replace("/", "_")  # a path where two files have the same stem
     write_dng(out / f"{name}_noisy.dng", noisy)
     write_dng(out / f"{name}_clean.dng", frame)
-    return levels
+    return trial.levels
 
 
 def main(argv: Sequence[str] | None = None) -> None:

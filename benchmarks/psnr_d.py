@@ -25,8 +25,10 @@ from torch import Tensor
 from benchmarks.measure import parser
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
-from rawaug.evaluation.scores import classical_method, score_method
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import score
 from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.recipe import find_recipe, read_recipe
 from rawaug.files import write_json
 from rawaug.isp.model import DictionaryISP, of_cameras
@@ -97,8 +99,7 @@ def filtered(specs: Sequence[str], factor: int) -> DownstreamScore:
     """The row that needs no training."""
     noise, cfa = noise_model(CONFIG.noise), CFA.RGGB
     frames = [pair.middle(1024) for spec in specs for pair in open_pairs(spec, split="test", bin=factor)]
-    scores = list(score_method(classical_method("NonLocalMeans", noise, 0), frames, noise, cfa, 0, ""))
-    return mean_of(scores)
+    return mean_of(list(score([RawDenoiser.of("NonLocalMeans")], (trial_of(pair, noise, cfa) for pair in frames))))
 
 
 def named(values: Sequence[str]) -> dict[str, list[str]]:

@@ -18,9 +18,10 @@ from torch.nn.functional import max_pool2d
 
 from benchmarks.measure import arguments, finish, start
 from rawaug import bayer
-from rawaug.bayer import CFA, noise_variance
+from rawaug.bayer import CFA
 from rawaug.data import open_pairs
-from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.evaluation.scores import Denoiser, NoisyInput
 from rawaug.evaluation.tables import print_rows
 from rawaug.noise import SensorNoise
 from rawaug.progress import progress
@@ -45,12 +46,14 @@ Shots = Sequence[tuple[str, Tensor]]
 """Names and clean packed RAW ``(1, 4, h, w)``."""
 
 
-def noisy_shots(shots: Shots, levels: tuple[float, float], told: float = 1.0, **sensor: Any) -> Iterator[list[Tensor]]:
-    """Clean RAW, noisy RAW and the variance that a denoiser is told, a frame; keyed by the frame's name."""
+def noisy_shots(
+    shots: Shots, levels: tuple[float, float], told: float = 1.0, **sensor: Any
+) -> Iterator[tuple[Tensor, Noisy]]:
+    """Clean RAW, and noisy RAW with the levels that a denoiser is told, a frame; keyed by the frame's name."""
     noise = SensorNoise(levels, **sensor)
     for name, clean in shots:
         noisy = noise.apply(clean, noise.sample(1, keyed_generator(0, "sensors", name)))
-        yield [clean, noisy, told * noise_variance(noisy, *levels)]
+        yield clean, Noisy.told(noisy, (told * levels[0], told * levels[1]), CFA.RGGB)
 
 
 def decibels(error: Tensor) -> float:
@@ -58,27 +61,27 @@ def decibels(error: Tensor) -> float:
     return round(-10.0 * error.mean().log10().item(), 2)
 
 
-def mean_psnr(one: Contestant, shots: Shots, levels: tuple[float, float], **sensor: Any) -> float:
+def mean_psnr(one: Denoiser, shots: Shots, levels: tuple[float, float], **sensor: Any) -> float:
     """PSNR, the mean over frames."""
     made = noisy_shots(shots, levels, **sensor)
-    scores = [decibels((one.run(y, v, CFA.RGGB).clamp(max=1.0) - x).square()) for x, y, v in made]
+    scores = [decibels((one(y).clamp(max=1.0) - x).square()) for x, y in made]
     return round(sum(scores) / len(scores), 2)
 
 
-def left_in_flat(one: Contestant, levels: tuple[float, float]) -> float:
+def left_in_flat(one: Denoiser, levels: tuple[float, float]) -> float:
     """Share of the noise's variance that is left in four ramps of 96 x 96 cells."""
     light = torch.tensor([0.05, 0.1, 0.2, 0.4])[:, None, None, None] * torch.linspace(0.9, 1.1, 96)
     ramps = [(str(k), light[k : k + 1].expand(1, 4, 96, 96).contiguous()) for k in range(len(light))]
-    pairs = [((one.run(y, v, CFA.RGGB) - x), y - x) for x, y, v in noisy_shots(ramps, levels)]
+    pairs = [(one(y) - x, y.image - x) for x, y in noisy_shots(ramps, levels)]
     left, added = (torch.stack(errors).square().mean() for errors in zip(*pairs, strict=True))
     return round((left / added).item(), 3)
 
 
-def beside_lights(one: Contestant, shots: Shots, levels: tuple[float, float]) -> tuple[float, float]:
+def beside_lights(one: Denoiser, shots: Shots, levels: tuple[float, float]) -> tuple[float, float]:
     """dB in clipped cells, and beside them, of all frames together."""
     inside, beside = [], []
-    for clean, noisy, variance in noisy_shots(shots, levels):
-        error = (one.run(noisy, variance, CFA.RGGB).clamp(max=1.0) - clean).square()
+    for clean, noisy in noisy_shots(shots, levels):
+        error = (one(noisy).clamp(max=1.0) - clean).square()
         cells = (clean[:, 1:3] >= CLIPPED).all(1, keepdim=True)
         near = max_pool2d(cells.float(), 2 * BESIDE + 1, 1, BESIDE).bool() & ~cells
         inside.append(error[cells.expand_as(error)])
@@ -101,7 +104,7 @@ def main() -> None:
     side = (96 if args.quick else args.crop) // 2
     middles = [(name, middle(raw, side)) for name, raw in packed]
     lights = [(name, raw) for name, raw in packed if (raw[:, 1:3] >= CLIPPED).all(1).any()]
-    everyone = [Contestant("noisy", lambda noisy, *_: noisy), *map(contestant, args.denoisers)]
+    everyone: list[Denoiser] = [NoisyInput("noisy"), *map(RawDenoiser.of, args.denoisers)]
     for one in progress(everyone, label="sensors", unit="denoiser"):
         row: dict[str, float] = {}
         for name, sensor in SENSORS.items():

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import rawaug
 from benchmarks.measure import arguments, finish, show, start, write_pictures
-from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
 from rawaug.io import read_picture
+from rawaug.synthesis.folder import synth
 
 ONLINE_CROP = 256
 

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rawaug.bayer import CFA as CFA
+    from rawaug.camera.fit import fit as fit
+    from rawaug.denoise.denoiser import RawDenoiser as RawDenoiser
+    from rawaug.denoise.frames import denoise as denoise
     from rawaug.isp.config import ISPConfig as ISPConfig
     from rawaug.isp.config import ISPParams as ISPParams
     from rawaug.isp.config import ISPResult as ISPResult
@@ -25,12 +28,15 @@ if TYPE_CHECKING:
     from rawaug.plugin.params import RawPair as RawPair
     from rawaug.plugin.params import load_params as load_params
     from rawaug.plugin.params import save_params as save_params
-    from rawaug.training.camera import fit as fit
+    from rawaug.synthesis.folder import synth as synth
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
     "rawaug.bayer": ("CFA",),
+    "rawaug.camera.fit": ("fit",),
+    "rawaug.denoise": ("denoise",),
+    "rawaug.denoise.denoiser": ("RawDenoiser",),
     "rawaug.isp.config": ("ISPConfig", "ISPParams", "ISPResult"),
     "rawaug.isp.model": ("DictionaryISP",),
     "rawaug.plugin.adapters": ("adapters", "isp_model"),
@@ -38,7 +44,7 @@ _PUBLIC = {
     "rawaug.plugin.dataset": ("RawPairStream", "RawPairs"),
     "rawaug.plugin.loader": ("WrappedLoader", "wrap"),
     "rawaug.plugin.params": ("AugmentParams", "RawPair", "load_params", "save_params"),
-    "rawaug.training.camera": ("fit",),
+    "rawaug.synthesis.folder": ("synth",),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 
@@ -49,7 +55,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = import_module(_MODULE_OF[name])
-    value = globals()[name] = module if name == "adapters" else getattr(module, name)
+    value = globals()[name] = module if name in ("adapters", "denoise") else getattr(module, name)
     return value
 
 

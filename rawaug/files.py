@@ -25,6 +25,8 @@ from torch import Tensor
 P = ParamSpec("P")
 R = TypeVar("R")
 
+OF_NO_DATASET = (".DS_Store", "Thumbs.db")
+
 LOCK = "rawaug.lock"
 """Name of the lock file in an output folder."""
 
@@ -237,3 +239,48 @@ def sha256(path: str | Path) -> str:
 def fingerprint(*settings: Any) -> str:
     """A short hash of settings, equal if and only if they are."""
     return digest(json.dumps(settings, sort_keys=True, default=str).encode())[:16]
+
+
+def require_same_settings(path: Path, settings: Mapping[str, object], overwrite: bool = False) -> None:
+    """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
+    if path.is_file() and not overwrite:
+        try:
+            known = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
+        for key in known | dict(settings):
+            value, asked = known.get(key), settings.get(key)
+            if asked != value:
+                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
+        return
+    write_json(dict(settings), path)
+
+
+def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
+    """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
+
+    What macOS and Windows leave beside one's files is no part of a dataset. No folder, no files.
+    """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, (FileNotFoundError, NotADirectoryError)):
+            raise error
+
+    for parent, folders, files in os.walk(folder, onerror=refuse):
+        folders[:] = [name for name in folders if name != "__MACOSX"]
+        for file in files:
+            if file.lower().endswith(extensions) and not file.startswith("._") and file not in OF_NO_DATASET:
+                yield Path(parent, file)
+
+
+def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
+    """:func:`files_below`, sorted, or ``path`` itself where it is a file; one of them at least."""
+    path = Path(path)
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such {what} file or folder")
+    files = sorted(files_below(path, extensions))
+    if not files:
+        raise ValueError(f"{path}: contains no {what} file; supported extensions are {', '.join(extensions)}")
+    return files

@@ -57,6 +57,12 @@ def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
     return given["name"], dict(settings)
 
 
+def label_of(spec: Spec) -> str:
+    """A spec in a line, for tables: its name and settings."""
+    name, settings = name_and_settings(spec)
+    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
+
+
 def checked_settings(
     label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
 ) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.demo import FRAME
 from rawaug.data.folders import RawFolder
-from rawaug.evaluation.contestants import Contestant
-from rawaug.evaluation.scores import frozen_levels, frozen_sample
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import NOISY
+from rawaug.evaluation.trials import trial_of
 from rawaug.io import RawFrame, read_picture, write_dng
 from rawaug.noise import noise_model
 
@@ -86,9 +87,9 @@ def test_a_pair_has_the_frozen_noise_and_states_its_levels(shots: RawFolder, tmp
     out.mkdir()
     levels = write_pair(shots, 0, noise, 0, out)
     (pair,) = open_pairs(f"pairs:{out}")
-    sample = frozen_sample(shots[0], noise, CFA.GRBG, 0)
-    assert levels == frozen_levels(shots[0], noise, 0) == pytest.approx((pair.shot_var, pair.read_var))
-    again = frozen_sample(pair, noise, CFA.GRBG, 1)
+    sample = trial_of(shots[0], noise)
+    assert levels == sample.levels == pytest.approx((pair.shot_var, pair.read_var))
+    again = trial_of(pair, noise, seed=1)
     step = 1 / (65535 - 16384)
     torch.testing.assert_close(again.noisy, sample.noisy, rtol=0, atol=step)
     torch.testing.assert_close(again.clean, sample.clean, rtol=0, atol=step)
@@ -97,8 +98,7 @@ def test_a_pair_has_the_frozen_noise_and_states_its_levels(shots: RawFolder, tmp
 def test_sensors_scores_flat_patches_frames_and_cells_beside_lights() -> None:
     clean = torch.full((1, 4, 40, 40), 0.25)
     clean[..., 10:20, 10:20] = 1.0
-    as_it_is = Contestant("noisy", lambda noisy, *_: noisy)
-    black = Contestant("black", lambda noisy, *_: torch.zeros_like(noisy))
+    as_it_is, black = NOISY, RawDenoiser.of(lambda noisy: torch.zeros_like(noisy))
     assert sensors.left_in_flat(as_it_is, (1e-3, 1e-5)) == 1.0
     expected = -10 * math.log10(1e-3 * 0.25 + 1e-5)
     assert sensors.mean_psnr(as_it_is, [("flat", torch.full((1, 4, 64, 64), 0.25))], (1e-3, 1e-5)) == pytest.approx(

@@ -20,12 +20,13 @@ import denoisers
 from benchmarks import faults
 from rawaug.bayer import CFA
 from rawaug.cli import main
-from rawaug.commands import pair_files, pair_maker
-from rawaug.commands.synth import synth
 from rawaug.data import PictureFolder
 from rawaug.errors import resource_error
 from rawaug.files import LOCK, locked, replacing, write_json, write_tensors
 from rawaug.io import RawFrame, read_picture, write_dng, write_picture
+from rawaug.synthesis import files as pair_files
+from rawaug.synthesis import maker as pair_maker
+from rawaug.synthesis.folder import synth
 from rawaug.training.config import TrainConfig
 from rawaug.training.state import TrainingState
 

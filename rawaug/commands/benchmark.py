@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 from rawaug.commands import YAML
 from rawaug.data import open_pairs
-from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_of, strengths_of, tables
-from rawaug.evaluation.contestants import Contestant, contestant, shipped_of_mosaics
-from rawaug.evaluation.own_noise import own_noise_note
+from rawaug.data.pairs import Binned, SomePairs
+from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_of, strengths_of, tables, trials
+from rawaug.evaluation.own_noise import Measured, own_noise_note
 from rawaug.evaluation.page import Figure, Page, Part, draw_costs
 from rawaug.evaluation.tables import print_rows
 from rawaug.files import require_writable, write_json
-from rawaug.kernels.runtime import find_device
-from rawaug.noise import own_noise
 
 ON_PAGE = 4
 
@@ -53,16 +54,16 @@ def run(
     """
     for path in filter(None, (json, report)):
         require_writable(path)
-    where, strengths = find_device(device), strengths_of(noise, iso)
-    contestants: dict[str, Contestant] = {}
+    strengths = strengths_of(noise, iso)
+    known: dict[str, RawDenoiser] = {}
     for spec in dict.fromkeys(("NonLocalMeans", *shipped_of_mosaics(), *denoisers)):
-        one = contestant(spec, where)
-        name = one.name if one.name not in contestants else spec
-        contestants[name] = one._replace(name=name)
-    pairs = open_pairs(data, split="test", bin=bin)
-    frames = [replace(pairs[k], own_noise=own_noise(pairs, k)) for k in range(min(count, len(pairs)))]
-    everyone = list(contestants.values())
-    result = {"data": data, "bin": bin, "crop": crop, **benchmark(everyone, frames, crop, seed, strengths)}
+        one = named(spec, device).require_mosaic()
+        name = one.name if one.name not in known else spec
+        known[name] = replace(one, name=name)
+    pairs = open_pairs(data, split="test")
+    frames = Binned(Measured(SomePairs(pairs, range(len(pairs))[:count]), count), bin)
+    everyone, found = list(known.values()), trials(frames, crop, seed, strengths)
+    result = {"data": data, "bin": bin, "crop": crop, "seed": seed, **benchmark(everyone, found)}
     for title, head, cells in tables(result):
         print_rows(title, ["denoiser", *head], [[name, *row] for name, row in cells.items()])
     told = {name: row["scores"][TOLD] for name, row in result["rows"].items()}
@@ -79,8 +80,23 @@ def run(
         chart = Figure(draw_costs(costs_of(result)), "PSNR over GMAC", "curve", f"{shown_of(strengths)}, levels told")
         page.parts.append(Part("Quality and cost", figures=[chart]))
         page.parts.append(Part("Pictures", texts=[f"Noise: {shown_of(strengths)}, levels told; PSNR of RAW."]))
-        for row, cfa in crops(everyone, frames[:ON_PAGE], crop, seed, strengths):
-            page.add_frame(row, cfa)
+        for panels in crops(everyone, found, ON_PAGE):
+            page.add_frame(panels)
         settings = {"denoisers": denoisers, "data": data, "bin": bin, "count": count, "crop": crop, "seed": seed}
         settings |= {"noise": noise, "iso": iso}
         print(f"page: {page.write(Path(report), settings)}")
+
+
+def named(spec: str, device: str = "cpu") -> RawDenoiser:
+    """What a word of this command line names, the only place from which ``package.module:function`` is imported."""
+    module, colon, function = spec.partition(":")
+    if not colon or Path(spec).suffix in (".onnx", ".safetensors"):
+        return RawDenoiser.of(spec, device)
+    sys.path.insert(0, str(Path.cwd()))  # as python -m does
+    try:
+        found = getattr(import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{spec}: cannot be imported: {error}") from None
+    finally:
+        sys.path.pop(0)
+    return RawDenoiser.of(found, device, name=spec)

@@ -3,42 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import torch
-
-import denoisers
 from denoisers.files import FOLDER
 from rawaug import __version__
-from rawaug.bayer import CFA
+from rawaug.camera.psnr_r import psnr_r
 from rawaug.commands import OPTIONS, YAML
 from rawaug.data import open_pairs
-from rawaug.data.folders import Readable
+from rawaug.data.folders import Kept, Readable
 from rawaug.data.pair_folder import PairSettings
-from rawaug.data.pairs import Binned, Pair
-from rawaug.evaluation.contestants import require_mosaic
-from rawaug.evaluation.own_noise import own_noise_note, own_variances, with_own_noise
+from rawaug.data.pairs import Binned
+from rawaug.denoise.denoiser import RawDenoiser, require_classical
+from rawaug.evaluation.own_noise import Measured, own_noise_note
 from rawaug.evaluation.page import Page, shown_on_page
-from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.evaluation.scores import (
-    Method,
-    Score,
-    classical_method,
-    label_of,
-    network_method,
-    require_classical,
-    require_numbers,
-    row_of,
-    score_method,
-    summary,
-)
+from rawaug.evaluation.scores import NOISY, Row, by_denoiser, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import print_scores
+from rawaug.evaluation.trials import Trial, trial_of, trials_of
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseSpec, noise_model
 from rawaug.progress import progress
 from rawaug.registry import ESTIMATORS, Spec
@@ -83,13 +69,13 @@ def run(
     for path in filter(None, (json, report)):
         require_writable(path)
     require_classical(classical or ())
-    where, file = find_device(device), find_weights(weights, FOLDER)
+    file = find_weights(weights, FOLDER)
     kind = read_header(file)["kind"]
     if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
         options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
         raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
     frames = open_pairs(data, split="test", **vars(settings or PairSettings()))
-    pairs = Readable(frames if bin == 1 else Binned(frames, bin))
+    pairs = Readable(frames if kind == "isp" else Kept(Binned(Measured(frames), bin)))
     about: dict[str, Any] = {"kind": kind, "data": data, "weights_sha256": sha256(file), "version": __version__}
     about |= {} if bin == 1 else {"bin": bin}
 
@@ -102,10 +88,13 @@ def run(
 
     if kind == "isp":
         isp, images = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
-        result = written(summary(_finite(Score(pair.name, psnr_r(isp, pair))) for pair in images))
+        scores = ((pair.name, _finite(pair.name, psnr_r(isp, pair))) for pair in images)
+        result = written(summary(Row("ISP", name, "", "", "raw", psnr) for name, psnr in scores))
+        scores = ((pair.name, _finite(pair.name, psnr_r(isp, pair))) for pair in images)
+        result = written(summary(Row("ISP", name, "", "", "raw", psnr) for name, psnr in scores))
     else:
-        test = _Test(file, pairs, noise, seed, where, classical or ())
-        result = written(test.result(frames, bin, views or (8 if self_ensemble else 1), written))
+        test = _Test(file, pairs, noise, seed, device, classical or ())
+        result = written(test.result(views or (8 if self_ensemble else 1), written))
         if note := own_noise_note({"the denoiser": result, **result.get("classical", {})}):
             print(note)
         if report:
@@ -119,56 +108,50 @@ class _Test:
     """A denoiser on frames, beside classical filters."""
 
     def __init__(
-        self,
-        weights: Path,
-        pairs: Readable,
-        noise: NoiseSpec | None,
-        seed: int,
-        device: torch.device,
-        classical: Sequence[Spec],
+        self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: str, filters: Sequence[Spec]
     ) -> None:
-        model, info = denoisers.load(weights)
-        require_mosaic(weights, model)
-        self.name, self.pairs, self.seed = weights.stem, pairs, seed
-        self.noise = noise or info.get("noise", "cycleisp_sidd")
-        self.levels, self.cfa = noise_model(self.noise), CFA(info.get("cfa", "RGGB"))
-        at_test = ESTIMATORS.make(info.get("estimator", "supervised")).at_test
-        self.network = partial(network_method, model.to(device), self.cfa, at_test=at_test)
-        self.filters = {label_of(spec): classical_method(spec, self.levels, seed) for spec in classical}
+        found = RawDenoiser.of(weights, device).require_mosaic()
+        around = ESTIMATORS.make(found.info.get("estimator", "supervised")).at_test
+        self.denoiser = replace(found, around=around, checked=False)
+        self.pairs, self.seed = pairs, seed
+        self.noise = noise or found.info.get("noise", "cycleisp_sidd")
+        self.filters = [RawDenoiser.of(spec) for spec in filters]
+        self.trials: Sequence[Trial] = []
 
-    def result(
-        self, frames: Sequence[Pair], factor: int, views: int, first: Callable[[dict[str, Any]], Any]
-    ) -> dict[str, Any]:
+    def result(self, views: int, first: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
         """The scores; of several views, with those of a single one as ``plain``."""
-        found = self.scores(self.network(), "evaluate")
-        own = own_variances(frames, self.pairs.kept(), self.levels, self.seed, factor)
-        plain = with_own_noise(found, own)
-        result = {"self_ensemble": False, "seed": self.seed, **plain}
+        levels, cfa = noise_model(self.noise), self.denoiser.cfa
+        deque(self.pairs, maxlen=0)  # finds those that cannot be read
+        self.trials = trials_of(self.pairs.kept(), lambda pair: trial_of(pair, levels, cfa, self.seed))
+        noisy, plain = by_denoiser(self.scored([NOISY, self.denoiser], "evaluate")).values()
+        result = {"self_ensemble": False, "seed": self.seed, **summary(plain, noisy)}
         if views > 1 or self.filters:
             first(result)
+        ensemble = [replace(self.denoiser, name="views", views=views)] if views > 1 else []
+        others = by_denoiser(self.scored([*ensemble, *self.filters], "evaluate, the rest"))
         if views > 1:
-            found = with_own_noise(self.scores(self.network(views=views), f"evaluate, {views} views"), own)
-            result = {"self_ensemble": True, "seed": self.seed, "views": views, "plain": plain, **found}
-        filters = {name: with_own_noise(self.scores(method, name), own) for name, method in self.filters.items()}
+            found = {"self_ensemble": True, "seed": self.seed, "views": views, "plain": summary(plain, noisy)}
+            result = found | summary(others.pop("views"), noisy)
+        filters = {name: summary(rows, noisy) for name, rows in others.items()}
         return result | ({"classical": filters} if filters else {})
 
-    def scores(self, method: Method, label: str) -> dict[str, Any]:
-        scored = score_method(method, self.pairs, self.levels, self.cfa, self.seed, label)
-        return summary(map(_finite, scored))
+    def scored(self, denoisers: Sequence[Any], label: str) -> Iterator[Row]:
+        for row in score(denoisers, self.trials, label) if denoisers else ():
+            _finite(row.frame, row.psnr)
+            yield row
 
     def page(self, data: str, result: Mapping[str, Any]) -> Page:
         """The scores, and some frames noisy, denoised by each filter and by the denoiser, and clean."""
         runs = {"plain": result.get("plain", result)} | ({"self_ensemble": result} if "plain" in result else {})
-        facts = {"Noise": self.noise, "Seed": str(self.seed)}
-        page = Page.of_scores(f"{self.name} on {data}", {self.name: [runs]}, result.get("classical", {}), facts)
-        methods = {**self.filters, self.name: self.network()}
-        for pair in shown_on_page(self.pairs.kept()):
-            page.add_frame(row_of(methods, pair, self.levels, self.cfa, self.seed), self.cfa)
+        facts, name = {"Noise": self.noise, "Seed": str(self.seed)}, self.denoiser.name
+        page = Page.of_scores(f"{name} on {data}", {name: [runs]}, result.get("classical", {}), facts)
+        for trial in shown_on_page(self.trials):
+            page.add_frame(panels_of([*self.filters, self.denoiser], trial))
         return page
 
 
-def _finite(score: Score) -> Score:
-    """The score, unless what was compared is not finite: weights of which the first frame shows that are of no use."""
-    if math.isnan(score.psnr):
-        raise ValueError(f"{score.name}: the result is not finite; the weights are damaged")
-    return score
+def _finite(frame: str, value: float) -> float:
+    """The score, unless it is NaN, which damaged weights are at their first frame: no other needs to be tried."""
+    if math.isnan(value):
+        raise ValueError(f"{frame}: the result is not finite; the weights are damaged")
+    return value

@@ -6,9 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from rawaug.data.demo import demo_files
-from rawaug.data.folders import PICTURE_EXTENSIONS, files_in
+from rawaug.data.folders import PICTURE_EXTENSIONS
 from rawaug.errors import extra
 from rawaug.explore.page import address, build, listening, server_of
+from rawaug.files import files_in
 
 
 def run(pictures: str | None = None, /, *, host: str = "127.0.0.1", port: int = 7860) -> None:

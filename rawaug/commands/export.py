@@ -24,13 +24,13 @@ from torch import Tensor, nn
 import denoisers
 from denoisers.files import FOLDER, find
 from rawaug import bayer
-from rawaug.bayer import CFA, pack_rgb
+from rawaug.bayer import pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import centre
+from rawaug.denoise.onnx import feeds, session_of
 from rawaug.errors import extra
-from rawaug.evaluation.contestants import feeds, session_of
-from rawaug.evaluation.scores import frozen_sample
+from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing
 from rawaug.io import read_raw
 from rawaug.isp.config import ISPParams
@@ -221,8 +221,9 @@ def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
     """Noisy packed RAW ``(1, 4, h, w)`` and its variance: of the middle of a RAW file, or of a generated one."""
     if frame is None:
         pair = demo_pairs("test", count=1)[0]
-        sample = frozen_sample(pair, noise_model("cycleisp_sidd"), CFA(pair.cfa), seed=0)
-        return sample.noisy, sample.variance
+        trial = trial_of(pair, noise_model("cycleisp_sidd"))
+        assert trial.variance is not None
+        return trial.noisy, trial.variance
     raw = read_raw(frame)
     packed = bayer.pack(centre(raw.mosaic[None], SIDE, SIDE), raw.cfa).contiguous()
     shot_var, read_var = raw.noise_profile or (1e-3, 1e-5)

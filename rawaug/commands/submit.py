@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from rawaug.commands import YAML
-from rawaug.commands.frame_denoisers import FrameDenoiser, frame_denoiser
+from rawaug.commands.denoise import chosen
 from rawaug.data import submissions
 from rawaug.data.sidd import BLOCKS
+from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.files import require_writable
 from rawaug.io import RawFrame
 from rawaug.noise import estimate_noise
@@ -50,24 +51,24 @@ def run(
     if kind not in SUBMISSIONS or not path:
         raise ValueError(f"{benchmark}: no benchmark; use sidd:PATH or dnd:PATH")
     require_writable(Path(out), folder=kind == "dnd")
-    count = SUBMISSIONS[kind](path, out, frame_denoiser(denoiser, classical, self_ensemble, device))
+    count = SUBMISSIONS[kind](path, out, chosen(denoiser, classical, self_ensemble, device).require_mosaic())
     print(f"{count} blocks, checked: {out}")
 
 
-def submit_sidd(path: str, out: str, method: FrameDenoiser) -> int:
+def submit_sidd(path: str, out: str, denoiser: RawDenoiser) -> int:
     """Write and check SIDD's submission; the number of blocks."""
     blocks = submissions.SiddBenchmark(path)
     side = blocks[0].mosaic.shape[-1]
-    submissions.write_submission(out, _sidd_denoised(blocks, method), side)
+    submissions.write_submission(out, _sidd_denoised(blocks, denoiser), side)
     return len(submissions.check_submission(out, side))
 
 
-def _sidd_denoised(benchmark: submissions.SiddBenchmark, method: FrameDenoiser) -> Iterator[Tensor]:
+def _sidd_denoised(benchmark: submissions.SiddBenchmark, denoiser: RawDenoiser) -> Iterator[Tensor]:
     for first in progress(range(0, len(benchmark), BLOCKS), label="benchmark", unit="frame"):
         blocks = benchmark[first : first + BLOCKS]
-        levels = blocks[0].noise_profile or (_estimated(blocks) if method.reads_levels else _UNUSED)
+        levels = blocks[0].noise_profile or (_estimated(blocks) if denoiser.reads_levels else _UNUSED)
         for block in blocks:
-            yield method(block, levels).clamp(0.0, 1.0)
+            yield denoiser.frame(block, levels).clamp(0.0, 1.0)
 
 
 def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
@@ -81,11 +82,11 @@ def _estimated(blocks: list[RawFrame]) -> tuple[float, float]:
     return estimate.shot_var, estimate.read_var
 
 
-def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
+def submit_dnd(path: str, out: str, denoiser: RawDenoiser) -> int:
     """Write and check DND's submission; the number of boxes."""
     boxes = submissions.Dnd(path)
     denoised = (
-        method(box, box.noise_profile or _UNUSED).clamp(0.0, 1.0)
+        denoiser.frame(box, box.noise_profile or _UNUSED).clamp(0.0, 1.0)
         for box in progress(boxes, label="benchmark", unit="box")
     )
     submissions.write_dnd_submission(out, denoised)
@@ -93,4 +94,4 @@ def submit_dnd(path: str, out: str, method: FrameDenoiser) -> int:
     return len(boxes)
 
 
-SUBMISSIONS: dict[str, Callable[[str, str, FrameDenoiser], int]] = {"sidd": submit_sidd, "dnd": submit_dnd}
+SUBMISSIONS: dict[str, Callable[[str, str, RawDenoiser], int]] = {"sidd": submit_sidd, "dnd": submit_dnd}

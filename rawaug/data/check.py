@@ -18,15 +18,17 @@ from typing import Any
 
 from torch import Tensor
 
-from rawaug.data.folders import PICTURE_EXTENSIONS, RAW_EXTENSIONS, PictureFolder, files_below, files_in
+from rawaug.data.folders import PICTURE_EXTENSIONS, PictureFolder
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
 from rawaug.data.sidd import SiddBlocks, SiddFrames, SiddPlusBlocks, is_scene
 from rawaug.data.submissions import Dnd, SiddBenchmark, check_submission
 from rawaug.errors import escape
+from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import isolated
+from rawaug.io.raw import RAW_EXTENSIONS
 
 _SHOWN = 6
 _PAIRS = "pairs:"

@@ -26,15 +26,12 @@ from torch.utils.data import ConcatDataset, Dataset, get_worker_info
 from rawaug.bayer import turn_back
 from rawaug.data.pairs import LazyPairs, Pair, SomePairs, centre
 from rawaug.errors import escape
+from rawaug.files import files_in
 from rawaug.io import read_picture, read_raw, read_raw_and_develop
 from rawaug.io.pictures import MAX_PIXELS, through_jpeg
+from rawaug.io.raw import RAW_EXTENSIONS
 
 PICTURE_EXTENSIONS = (".bmp", ".exr", ".gif", ".jpeg", ".jpg", ".jxl", ".png", ".ppm", ".tif", ".tiff", ".webp")
-RAW_EXTENSIONS = (
-    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
-    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
-)
-_OF_NO_DATASET = (".DS_Store", "Thumbs.db")
 _JPEG_SUFFIXES = (".jpg", ".JPG", ".jpeg", ".JPEG")
 _JPEG_MARGIN = 0.03
 """Cameras cut a few lines off their JPEGs that LibRaw keeps, or the other way round."""
@@ -42,36 +39,6 @@ _SLOTS = 64
 _NAMED = 20
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
-
-
-def files_below(folder: str | Path, extensions: tuple[str, ...] = ("",)) -> Iterator[Path]:
-    """The files of a folder and its subfolders, unordered, links to folders not followed; ``extensions`` in lower case.
-
-    What macOS and Windows leave beside one's files is no part of a dataset. No folder, no files.
-    """
-
-    def refuse(error: OSError) -> None:
-        if not isinstance(error, (FileNotFoundError, NotADirectoryError)):
-            raise error
-
-    for parent, folders, files in os.walk(folder, onerror=refuse):
-        folders[:] = [name for name in folders if name != "__MACOSX"]
-        for file in files:
-            if file.lower().endswith(extensions) and not file.startswith("._") and file not in _OF_NO_DATASET:
-                yield Path(parent, file)
-
-
-def files_in(path: str | Path, what: str, extensions: tuple[str, ...] = ("",)) -> list[Path]:
-    """:func:`files_below`, sorted, or ``path`` itself where it is a file; one of them at least."""
-    path = Path(path)
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: no such {what} file or folder")
-    files = sorted(files_below(path, extensions))
-    if not files:
-        raise ValueError(f"{path}: contains no {what} file; supported extensions are {', '.join(extensions)}")
-    return files
 
 
 class PictureFolder(Dataset[Tensor]):
@@ -193,23 +160,36 @@ def reports(pictures: Any) -> list[str]:
     return [report for each in inside if each is not None for report in reports(each)]
 
 
-class Cached(Dataset[Tensor]):
-    """A dataset of pictures that keeps up to ``megabytes`` of them decoded, in each worker its own."""
+class Cached(Dataset[T]):
+    """A dataset that keeps up to ``megabytes`` of its pictures, or of what holds some, in each worker its own."""
 
-    def __init__(self, pictures: Sequence[Tensor] | Any, megabytes: int) -> None:
+    def __init__(self, pictures: Sequence[T] | Any, megabytes: int) -> None:
         self.pictures, self._left = pictures, megabytes * 2**20
-        self._kept: dict[int, Tensor] = {}
+        self._kept: dict[int, T] = {}
 
     def __len__(self) -> int:
         return len(self.pictures)
 
-    def __getitem__(self, index: int) -> Tensor:
+    def __getitem__(self, index: int) -> T:
         if index not in self._kept:
-            picture: Tensor = self.pictures[index]
-            if picture.nbytes > self._left:
-                return picture
-            self._left -= picture.nbytes
-            self._kept[index] = picture
+            item: T = self.pictures[index]
+            parts = [item] if isinstance(item, Tensor) else vars(item).values()
+            size = sum(part.nbytes for part in parts if isinstance(part, Tensor))
+            if size > self._left:
+                return item
+            self._left -= size
+            self._kept[index] = item
+        return self._kept[index]
+
+
+class Kept(SomePairs):
+    """Pairs that are read once: up to ``megabytes`` of them stay in memory."""
+
+    def __init__(self, pairs: Sequence[Pair], megabytes: int = 1024) -> None:
+        super().__init__(pairs)
+        self._kept: Cached[Pair] = Cached(self.pairs, megabytes)
+
+    def read(self, index: int) -> Pair:
         return self._kept[index]
 
 

@@ -32,13 +32,13 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.folders import RAW_EXTENSIONS
 from rawaug.data.mat import MAX_BYTES, read_array, read_value, variables
 from rawaug.errors import extra
 from rawaug.files import replacing
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import MAX_PIXELS, read_plane
+from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.io.tiff import opened_tiff
 
 # -- metadata ---------------------------------------------------------------------------------------------------------

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rawaug.data.development import UNKNOWN_COLOUR, developed_pair
-from rawaug.data.folders import RawFolder, files_below
+from rawaug.data.folders import RawFolder
 from rawaug.data.formats import READABLE, TWO_IN_ONE, parsed, read_mosaic
 from rawaug.data.pairs import LazyPairs, Pair
+from rawaug.files import files_below
 from rawaug.registry import DATASETS
 
 NOISY, CLEAN = "*_noisy.*", "*_clean.*"

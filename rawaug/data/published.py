@@ -27,12 +27,14 @@ from torch import Tensor
 
 from rawaug.bayer import CFA, unpack
 from rawaug.data.development import develop_mosaic, developed_pair
-from rawaug.data.folders import RAW_EXTENSIONS, RawFolder, files_below, files_in
+from rawaug.data.folders import RawFolder
 from rawaug.data.formats import read_npz
 from rawaug.data.pairs import LazyPairs, Pair, require_split
+from rawaug.files import files_below, files_in
 from rawaug.io import read_picture, read_raw
 from rawaug.io.isolated import damage_as_os_error
 from rawaug.io.pictures import read_plane
+from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.registry import DATASETS
 
 _SPLITS: dict[str, Any] = json.loads(Path(__file__).with_name("fivek.json").read_text(encoding="utf-8"))

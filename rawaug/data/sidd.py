@@ -28,9 +28,9 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
 from rawaug.data.development import UNKNOWN_COLOUR, color_matrix, developed_pair, white_balance
-from rawaug.data.folders import files_below
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
+from rawaug.files import files_below
 from rawaug.io import read_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.registry import DATASETS

@@ -5,30 +5,27 @@ r"""Denoisers side by side: the same frozen noise on the same clean references, 
 Each denoiser is told the levels as they are, and once more as they are estimated from the noisy frame, which is what a
 photographer has. A second table has sensors as they are: hot pixels, banding, black levels and colours that are a
 little off, rounding to 12 bits. A reference is the middle of a frame, binned by colour site if it has noise of its own.
-A denoiser is what :func:`rawaug.evaluation.contestants.contestant` finds. The hash of all noisy inputs says whether the
+The hash of all noisy inputs says whether the
 figures of two people can be compared.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import chain, product
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from statistics import fmean
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from rawaug import bayer
-from rawaug.bayer import CFA, noise_variance
-from rawaug.data.pairs import Pair, Sample, centre
-from rawaug.evaluation.contestants import Contestant
-from rawaug.evaluation.scores import compared
-from rawaug.evaluation.tables import METRICS, Row, both
+from rawaug.data.pairs import Pair, centre
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.evaluation.scores import METRICS, NOISY, Panels, by_denoiser, panels_of, score, summary
+from rawaug.evaluation.tables import both
+from rawaug.evaluation.trials import Trial, raw_trial
 from rawaug.files import digest
-from rawaug.metrics import psnr
 from rawaug.noise import FixedLevels, NoiseLevels, SensorNoise, ShotReadNoise, estimate_noise, noise_levels
 from rawaug.progress import progress
 from rawaug.seeding import keyed_generator
@@ -50,7 +47,7 @@ SENSOR: dict[str, Any] = {
 }
 """What sensors do besides, at the strengths of :data:`OF_SENSORS`, or at the caller's."""
 OF_SENSORS = ("phone", "strong")
-TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
+CONDITIONS = TOLD, ESTIMATED, REAL = "levels told", "levels estimated", "sensors as they are"
 
 
 def strengths_of(
@@ -66,115 +63,88 @@ def strengths_of(
     return {f"ISO {iso:g}": noise_levels(noise, iso=iso) for iso in isos}
 
 
-Columns = dict[tuple[str, str], list[Sample | None]]
-"""By condition and strength the noisy inputs, a sample a frame; None where its levels cannot be estimated."""
-
-
-def columns_of(
-    frames: Sequence[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
-) -> Columns:
+def trials(
+    frames: Iterable[Pair], crop: int, seed: int = 0, strengths: Mapping[str, NoiseLevels] | None = None
+) -> list[Trial]:
     """The middles of all frames under every condition and strength; the same bits for the same frames and seed.
 
-    Noise is put on whole frames, from which the levels are estimated.
+    Noise is put on whole frames, from which the levels are estimated; where they cannot be there is no trial.
     """
     strengths = strengths or strengths_of()
     of_sensors = [name for name in strengths if name in OF_SENSORS] or strengths
-    columns: Columns = {pair: [] for pair in [*product((TOLD, ESTIMATED), strengths), *product((REAL,), of_sensors)]}
+    found: list[Trial] = []
     for frame in progress(frames, label="noise", unit="frame"):
+        middle = frame.middle(crop)
         for name, levels in strengths.items():
-            told, real = (noisy_sample(frame, name, levels, seed, real) for real in (False, True))
-            for condition, sample in ((TOLD, told), (ESTIMATED, _estimated(told, frame.cfa)), (REAL, real)):
-                if (condition, name) in columns:
-                    columns[condition, name].append(sample and middle_of(sample, crop))
-    return columns
+            told = noisy_frame(frame, name, levels, seed)
+            found.append(_middle(told, middle, crop, TOLD, name))
+            with suppress(ValueError):  # too little of the frame is flat
+                estimate = estimate_noise(bayer.unpack(told.image, frame.cfa)[0], frame.cfa)
+                known = Noisy.told(told.image, (estimate.shot_var, estimate.read_var), frame.cfa)
+                found.append(_middle(known, middle, crop, ESTIMATED, name))
+            if name in of_sensors:
+                real = noisy_frame(frame, name, levels, seed, real=True)
+                found.append(_middle(real, middle, crop, REAL, name))
+    return found
 
 
-def noisy_sample(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Sample:
+def noisy_frame(frame: Pair, strength: str, levels: NoiseLevels, seed: int, real: bool = False) -> Noisy:
     """A whole frame with noise of a strength, ``(1, 4, h, w)``; that of the caller's levels is that of ``evaluate``."""
     noise = SensorNoise(levels, **SENSOR) if real else ShotReadNoise(levels)
-    clean = bayer.pack(frame.raw[None], frame.cfa)
     key = ("benchmark", strength) if strength in STRENGTHS else ("test noise",)
     params = noise.sample(1, keyed_generator(seed, *key, frame.name))
-    noisy = noise.apply(clean, params)
-    return Sample(noisy, clean, noise_variance(noisy, params["shot_var"].item(), params["read_var"].item()))
+    noisy = noise.apply(bayer.pack(frame.raw[None], frame.cfa), params)
+    return Noisy.told(noisy, (params["shot_var"].item(), params["read_var"].item()), frame.cfa)
 
 
-def _estimated(sample: Sample, cfa: CFA) -> Sample | None:
-    try:
-        found = estimate_noise(bayer.unpack(sample.noisy, cfa)[0], cfa)
-    except ValueError:  # too little of the frame is flat
-        return None
-    return Sample(sample.noisy, sample.clean, noise_variance(sample.noisy, found.shot_var, found.read_var))
+def _middle(given: Noisy, frame: Pair, crop: int, condition: str, strength: str) -> Trial:
+    """The middle of a noisy frame beside that of the clean one, ``crop`` pixels of the mosaic."""
+    assert given.variance is not None
+    noisy, variance = (centre(image, crop // 2, crop // 2, step=1) for image in (given.image, given.variance))
+    clean, about = bayer.pack(frame.raw[None], frame.cfa), {"condition": condition, "strength": strength}
+    return raw_trial(frame, noisy, clean, variance, given.levels, frame.cfa, **about)
 
 
-def middle_of(sample: Sample, crop: int) -> Sample:
-    """The middle of packed RAW as :meth:`rawaug.data.Pair.middle` takes it, ``crop`` pixels of the mosaic."""
-    return Sample(*(centre(image, crop // 2, crop // 2, step=1) for image in sample))
-
-
-def hash_of(columns: Columns) -> str:
+def hash_of(trials: Iterable[Trial]) -> str:
     """Eight digits of the SHA-256 of all noisy inputs, in steps of 2^-12, which processors do not round differently."""
-    samples = filter(None, chain.from_iterable(columns.values()))
-    return digest(*((sample.noisy * 4096).round().to(torch.int32).numpy().tobytes() for sample in samples))[:8]
+    found = list(trials)
+    strengths = list(dict.fromkeys(trial.strength for trial in found))
+    found.sort(key=lambda trial: (CONDITIONS.index(trial.condition), strengths.index(trial.strength)))
+    return digest(*((trial.noisy * 4096).round().to(torch.int32).numpy().tobytes() for trial in found))[:8]
 
 
-def benchmark(
-    contestants: Sequence[Contestant],
-    frames: Sequence[Pair],
-    crop: int,
-    seed: int = 0,
-    strengths: Mapping[str, NoiseLevels] | None = None,
-) -> dict[str, Any]:
-    """Scores of every denoiser, by its name, on the middles of the references, beside those of the noisy input.
+def benchmark(denoisers: Sequence[RawDenoiser], found: Sequence[Trial]) -> dict[str, Any]:
+    """Scores of every denoiser, by its name, on these :func:`trials`, beside those of the noisy input.
 
     Returns:
         ``frames``, ``hash``, and ``rows`` by name: ``gmac`` and ``seconds`` a mosaic megapixel, and ``scores`` by
-        condition and strength, means of :data:`rawaug.evaluation.tables.METRICS`.
+        condition and strength, means of :data:`rawaug.evaluation.scores.METRICS`.
     """
-    columns = columns_of(frames, crop, seed, strengths)
-    frames = [frame.middle(crop) for frame in frames]
-    inputs = Contestant("noisy input", lambda noisy, variance, cfa: noisy)
-    rows = {one.name: _row(one, frames, columns) for one in (inputs, *contestants)}
-    rows["noisy input"] |= {"gmac": None, "seconds": None}
-    return {"frames": [frame.name for frame in frames], "seed": seed, "hash": hash_of(columns), "rows": rows}
+    gmacs = {one.name: _gmac(one, found[0]) for one in denoisers}
+    scored = by_denoiser(score([NOISY, *denoisers], found, "benchmark"))
+    places = list(dict.fromkeys((condition, trial.strength) for condition in CONDITIONS for trial in found))
+    rows: dict[str, dict[str, Any]] = {}
+    for name, of_one in scored.items():
+        scores: dict[str, dict[str, Any]] = {}
+        for condition, strength in places:
+            at = [row for row in of_one if (row.condition, row.strength) == (condition, strength)]
+            if at or condition != REAL:
+                means = summary(at)
+                scores.setdefault(condition, {})[strength] = {
+                    **{key: means[key] for key in (*METRICS, "own_noise") if key in means},
+                    "frames": len(at),
+                }
+        seconds = round(fmean(row.seconds for row in of_one), 3)
+        rows[name] = {"gmac": gmacs.get(name), "seconds": seconds if name in gmacs else None, "scores": scores}
+    names = list(dict.fromkeys(trial.frame for trial in found))
+    return {"frames": names, "hash": hash_of(found), "rows": rows}
 
 
-def _row(one: Contestant, frames: Sequence[Pair], columns: Columns) -> dict[str, Any]:
-    first = next(filter(None, chain.from_iterable(columns.values())))
-    megapixels = first.noisy.numel() / 1e6
-    with FlopCounterMode(display=False) as counter:  # of what PyTorch computes; it warms up, too
-        denoised_by(one, first, frames[0].cfa)
-    gmac = counter.get_total_flops() / 2e9 / megapixels
-    scores: dict[str, dict[str, dict[str, float]]] = {}
-    seconds: list[float] = []
-    for (condition, strength), samples in progress(columns.items(), label=one.name, unit="column"):
-        found, own, errors = [], [], []
-        for frame, sample in zip(frames, samples, strict=True):
-            if sample is None:
-                continue
-            start = time.perf_counter()
-            denoised = denoised_by(one, sample, frame.cfa)
-            seconds.append((time.perf_counter() - start) / (sample.noisy.numel() / 1e6))
-            found.append(compared(denoised, sample.clean, frame.cfa, frame))
-            if frame.own_noise is not None:
-                own.append(noise_variance(sample.clean, *frame.own_noise).mean().item())
-                errors.append(10 ** (-found[-1][0] / 10))
-        means: dict[str, float] = dict(zip(METRICS, map(fmean, zip(*found, strict=True)), strict=True)) if found else {}
-        share = {"own_noise": sum(own) / sum(errors)} if own else {}
-        scores.setdefault(condition, {})[strength] = means | {"frames": len(found)} | share
-    return {"gmac": round(gmac, 2) or None, "seconds": round(fmean(seconds), 3), "scores": scores}
-
-
-def denoised_by(one: Contestant, sample: Sample, cfa: CFA) -> Tensor:
-    try:
-        with torch.inference_mode():
-            denoised = one.run(sample.noisy.clone(), sample.variance.clone(), cfa)
-    except Exception as error:  # anybody's function
-        raise ValueError(f"{one.name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
-    if denoised.shape != sample.noisy.shape or not denoised.isfinite().all():
-        shape = f"{tuple(denoised.shape)} for {tuple(sample.noisy.shape)}"
-        raise ValueError(f"{one.name}: the result is not finite, or of another shape: {shape}")
-    return denoised.float()
+def _gmac(denoiser: RawDenoiser, trial: Trial) -> float | None:
+    """Multiplications of what PyTorch computes, 10^9 a megapixel; it warms up, too."""
+    with FlopCounterMode(display=False) as counter:
+        denoiser(trial.given)
+    return round(counter.get_total_flops() / 2e3 / trial.noisy.numel(), 2) or None
 
 
 def tables(result: Mapping[str, Any]) -> Iterator[tuple[str, list[str], dict[str, list[str]]]]:
@@ -212,21 +182,8 @@ def shown_of(strengths: Collection[str]) -> str:
     return "strong" if "strong" in strengths else last
 
 
-def crops(
-    contestants: Sequence[Contestant],
-    frames: Sequence[Pair],
-    crop: int,
-    seed: int,
-    strengths: Mapping[str, NoiseLevels],
-) -> Iterator[tuple[Row, CFA]]:
-    """Pictures for the page: each frame with noise of :func:`shown_of`, by every denoiser, and clean."""
-    shown = shown_of(strengths)
-    for frame in frames:
-        sample = middle_of(noisy_sample(frame, shown, strengths[shown], seed), crop)
-        row = Row(frame.middle(crop), {"noisy": sample.noisy}, {})
-        for one in contestants:
-            row.panels[one.name] = denoised_by(one, sample, frame.cfa)
-        for name, panel in row.panels.items():
-            row.captions[name] = f"{psnr(panel, sample.clean).item():.2f} dB"
-        row.panels["clean"] = sample.clean
-        yield row, frame.cfa
+def crops(denoisers: Sequence[RawDenoiser], found: Iterable[Trial], most: int) -> Iterator[Panels]:
+    """Pictures for the page: the first frames with noise of :func:`shown_of`, levels told, by every denoiser."""
+    told = [trial for trial in found if trial.condition == TOLD]
+    shown = shown_of(dict.fromkeys(trial.strength for trial in told))
+    return (panels_of(denoisers, trial) for trial in [t for t in told if t.strength == shown][:most])

@@ -8,15 +8,14 @@ colour site (:func:`rawaug.bayer.bin_mosaic`) the references have about 1 / K^2 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
-from rawaug.bayer import noise_variance
-from rawaug.data.pairs import Binned, Pair
-from rawaug.evaluation.scores import frozen_sample
-from rawaug.noise import NoiseModel, own_noise
-from rawaug.progress import progress
+from rawaug.data.pairs import Pair, SomePairs
+from rawaug.evaluation.trials import Trial
+from rawaug.noise import own_noise
 
 MUCH = 0.1
 """Share of an error above which a line says so."""
@@ -26,36 +25,21 @@ SHOWN = 4
 ADVICE = "bin the references (bin 4), or add the noise of a higher ISO"
 
 
-class OwnNoise(NamedTuple):
-    """Mean variances over a reference: of its own noise, and of the noise that was added to it."""
+class Measured(SomePairs):
+    """Whole references whose own noise is measured as they are read, where they do not state it: of ``most`` of them,
+    evenly spaced, since each takes seconds.
+    """
 
-    own: float
-    added: float
+    def __init__(self, pairs: Sequence[Pair], most: int = MOST_MEASURED) -> None:
+        super().__init__(pairs)
+        count = min(most, len(pairs))
+        self.measured = {k * len(pairs) // count for k in range(count)}
 
-
-def own_variances(
-    whole: Sequence[Pair], scored: Sequence[Pair], noise: NoiseModel, seed: int = 0, factor: int = 1
-) -> dict[str, OwnNoise]:
-    """The own noise of references, by name, where it is stated or can be measured (:func:`rawaug.noise.own_noise`)."""
-    found, binned = {}, Binned(whole, factor)
-    count = min(MOST_MEASURED, len(scored))
-    chosen = [scored[k * len(scored) // count] for k in range(count)]
-    for pair in progress(chosen, label="own noise of the references", unit="frame"):
-        if (levels := own_noise(binned, binned.names.index(pair.name))) is not None:
-            own = noise_variance(pair.raw, *levels).mean().item()
-            found[pair.name] = OwnNoise(own, frozen_sample(pair, noise, pair.cfa, seed).variance.mean().item())
-    return found
-
-
-def with_own_noise(summary: dict[str, Any], found: Mapping[str, OwnNoise]) -> dict[str, Any]:
-    """A summary with ``own_noise``, the references' share of the squared error, of measured images and of all."""
-    errors, own = [], []
-    for image in summary["images"]:
-        if image["name"] in found and "psnr" in image:
-            errors.append(10.0 ** (-image["psnr"] / 10.0))
-            own.append(found[image["name"]].own)
-            image["own_noise"] = own[-1] / errors[-1]
-    return summary | ({"own_noise": sum(own) / sum(errors)} if own else {})
+    def read(self, index: int) -> Pair:
+        pair = super().read(index)
+        if pair.own_noise is not None or index not in self.measured:
+            return pair
+        return replace(pair, own_noise=own_noise(pair.raw, pair.cfa))
 
 
 def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
@@ -67,11 +51,12 @@ def own_noise_note(summaries: Mapping[str, Mapping[str, Any]]) -> str:
     return f"own noise of the references as a share of the squared error: {named}{kept}; {ADVICE}" if much else ""
 
 
-def added_noise_note(found: Mapping[str, OwnNoise]) -> str:
+def added_noise_note(trials: Iterable[Trial]) -> str:
     """A line on a test whose noise is hardly stronger than that of its references; empty if it is much stronger."""
-    if not found:
-        return ""
-    own, added = (fmean(values) for values in zip(*found.values(), strict=True))
+    known = [
+        (one.own, one.variance.mean().item()) for one in trials if one.own is not None and one.variance is not None
+    ]
+    own, added = (fmean(values) for values in zip(*known, strict=True)) if known else (0.0, 1.0)
     if own <= MUCH * added:
         return ""
     return (

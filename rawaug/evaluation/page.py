@@ -21,16 +21,14 @@ from typing import Any, NamedTuple
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA
-from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pairs import Pair
+from denoisers.network import PACKED
 from rawaug.errors import extra
 from rawaug.evaluation.own_noise import own_noise_note
+from rawaug.evaluation.scores import Panels
 from rawaug.evaluation.tables import (
     ENSEMBLE,
     PLAIN,
     QUARTERS,
-    Row,
     Runs,
     both,
     figures_of,
@@ -38,6 +36,7 @@ from rawaug.evaluation.tables import (
     levels_note,
     verdict,
 )
+from rawaug.evaluation.trials import Trial
 from rawaug.io.pictures import encode_png
 
 WINDOW = 64
@@ -107,7 +106,7 @@ class Page:
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
         about = {name: text for name, text in about.items() if text}
         page = cls(title, [Part(terms=about), Part("Methods", terms=arms or {})][: 2 if arms else 1])
-        _, page.lead = verdict(results, classical)
+        page.lead = verdict(results, classical)
         note = levels_note(first)
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
             table = figures_of(results, classical, columns)
@@ -122,23 +121,23 @@ class Page:
     def add_curves(self, pngs: Mapping[str, bytes], heading: str = "Training") -> None:
         self.parts.append(Part(heading, figures=[Figure(png, title, "curve") for title, png in pngs.items()]))
 
-    def add_frame(self, row: Row, cfa: CFA) -> None:
+    def add_frame(self, row: Panels) -> None:
+        """One frame: its most detailed window in every image, and the whole of the clean one."""
         first = not any(part.heading == "Pictures" for part in self.parts)
-        clean = list(row.panels.values())[-1]
-        exposure = exposure_of(clean, row.pair)
-        top, left = most_detailed(clean)
-        whole = develop_packed(clean, cfa, row.pair, exposure)
+        clean = row.trial.clean
+        side = WINDOW if clean.shape[1] == PACKED else 2 * WINDOW
+        top, left = most_detailed(clean, side)
+        whole, pixels = row.shown(clean), 2 * WINDOW // side
         figures = []
-        for name, packed in row.panels.items():
-            window = packed[..., top : top + WINDOW, left : left + WINDOW]
-            png = encode_png(develop_packed(window, cfa, row.pair, exposure))
+        for name, image in row.images.items():
+            png = encode_png(row.shown(image[..., top : top + side, left : left + side]))
             figures.append(Figure(png, name, "window", ", ".join(filter(None, [name, row.captions.get(name)]))))
         scale = min(1.0, WHOLE / whole.shape[-1])
         if scale < 1.0:
             whole = F.interpolate(whole[None], scale_factor=scale, mode="area")[0]
-        caption = f"whole frame, clean; window at row {2 * top}, column {2 * left}"
+        caption = f"whole frame, clean; window at row {pixels * top}, column {pixels * left}"
         figures.append(Figure(encode_png(whole), "whole frame", caption=caption))
-        self.parts.append(Part("Pictures" if first else "", row.pair.name, figures=figures))
+        self.parts.append(Part("Pictures" if first else "", row.trial.frame, figures=figures))
 
     def write(self, path: Path, settings: Mapping[str, Any]) -> Path:
         import yaml
@@ -167,17 +166,17 @@ def levels_range(summary: Mapping[str, Any]) -> str:
     return ", ".join(said)
 
 
-def shown_on_page(pairs: Sequence[Pair]) -> Iterator[Pair]:
+def shown_on_page(trials: Sequence[Trial]) -> Iterator[Trial]:
     """At most :data:`ON_PAGE` of the frames, evenly spaced."""
-    count = min(ON_PAGE, len(pairs))
-    return (pairs[k * len(pairs) // count] for k in range(count))
+    count = min(ON_PAGE, len(trials))
+    return (trials[k * len(trials) // count] for k in range(count))
 
 
-def most_detailed(packed: Tensor) -> tuple[int, int]:
-    """Top and left, in packed pixels, of the window of a clean frame ``(1, 4, h, w)`` with the steepest green."""
-    green = packed[:, 1:3].mean(1, keepdim=True).clamp_min(0.0).sqrt()
+def most_detailed(image: Tensor, side: int = WINDOW) -> tuple[int, int]:
+    """Top and left of the window of ``side`` with the steepest green, of packed RAW or of a picture."""
+    green = image[:, 1:-1].mean(1, keepdim=True).clamp_min(0.0).sqrt()
     steep = (green[..., 1:, :-1] - green[..., :-1, :-1]).abs() + (green[..., :-1, 1:] - green[..., :-1, :-1]).abs()
-    size = [min(WINDOW, side) for side in steep.shape[-2:]]
+    size = [min(side, length) for length in steep.shape[-2:]]
     scores = F.avg_pool2d(steep, size, stride=4)
     place = int(scores.argmax())
     return 4 * (place // scores.shape[-1]), 4 * (place % scores.shape[-1])

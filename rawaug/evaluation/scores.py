@@ -1,239 +1,222 @@
-"""PSNR and SSIM of an ISP or a denoiser, image by image.
+"""PSNR and SSIM of denoisers on trials, as flat rows, and their means as the JSON that others read.
 
-An ISP's PSNR_r is the mean over non-overlapping 256 x 256 mosaic patches of reconstruction against RAW. A denoiser's
-PSNR_d and SSIM are taken on the whole mosaic, on frozen noise: the captured one, or one keyed by (seed, name); and once
-more on sRGB, after one fixed development (:func:`rawaug.data.development.develop_packed`) of result and clean frame.
+On the whole mosaic, and once more on sRGB, after one fixed development of result and clean frame; what is developed
+already is compared as it is, cut to [0, 1].
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
-import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-import denoisers
-from denoisers.classical import Stabilised
-from denoisers.network import PACKED, Denoiser
 from rawaug import bayer
-from rawaug.bayer import CFA, aligned
-from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pairs import Pair, Sample
-from rawaug.evaluation.tables import METRICS, Row
+from rawaug.denoise.denoiser import Noisy
+from rawaug.evaluation.trials import Trial
 from rawaug.metrics import psnr, ssim, worst_and_best_quarter
-from rawaug.noise import NoiseModel, anscombe
 from rawaug.progress import progress
-from rawaug.registry import FILTERS, Spec, name_and_settings
-from rawaug.seeding import keyed_generator
 
-Run = Callable[..., Tensor]
-"""``run(noisy, variance) -> denoised``, packed RAW."""
+METRICS = ("psnr", "ssim", "psnr_srgb", "ssim_srgb")
 SHOWN_FAULTS = 5
 
-Method = Callable[[Pair, Sample], Tensor]
-"""Denoises the packed RAW of a sample; of the pair it may use the noise levels only."""
+
+class Denoiser(Protocol):
+    """What can be scored: :class:`rawaug.RawDenoiser`, and whatever denoises developed pictures."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def takes(self) -> str:
+        """``"raw"`` or ``"srgb"``, or ``""`` for any image."""
+        ...
+
+    def __call__(self, given: Noisy) -> Tensor: ...
 
 
 @dataclass(frozen=True)
-class Score:
-    """Of one image, on the mosaic and developed to sRGB; ``noisy`` ones are those of the input.
+class NoisyInput:
+    """The input itself, as a denoiser that changes nothing."""
 
-    ``shot_var`` and ``read_var`` are the noise levels that the denoiser was given, if it was given any;
-    ``levels_from_clean`` is True where they had been measured against the clean frame, else None.
+    name: str = "noisy input"
+    takes: str = ""
+
+    def __call__(self, given: Noisy) -> Tensor:
+        return given.image
+
+
+NOISY = NoisyInput()
+
+
+class Row(NamedTuple):
+    """One denoiser on one trial.
+
+    Attributes:
+        denoiser: its name, with the way that follows it if there is one.
+        frame, condition, strength, domain: of the trial.
+        psnr, ssim: in the trial's domain.
+        psnr_srgb, ssim_srgb: after development; None for what is developed already.
+        own_noise: the reference's own noise as a share of the squared error, where it is known.
+        levels: (shot_var, read_var) that it was told, if any.
+        levels_from_clean: whether these were measured against the clean frame.
+        seconds: that it took for each megapixel of its input.
     """
 
-    name: str
+    denoiser: str
+    frame: str
+    condition: str
+    strength: str
+    domain: str
     psnr: float
     ssim: float | None = None
     psnr_srgb: float | None = None
     ssim_srgb: float | None = None
-    psnr_noisy: float | None = None
-    ssim_noisy: float | None = None
-    psnr_srgb_noisy: float | None = None
-    ssim_srgb_noisy: float | None = None
-    shot_var: float | None = None
-    read_var: float | None = None
-    levels_from_clean: bool | None = None
+    own_noise: float | None = None
+    levels: tuple[float, float] | None = None
+    levels_from_clean: bool = False
+    seconds: float = 0.0
 
 
-def frozen_sample(pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Sample:
-    """The frame as a test case ``(1, 4, h, w)``: its own captured noise, or noise keyed by (seed, name)."""
-    pair = pair.with_levels()
-    clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
-    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        noisy = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa)
-        return Sample(noisy, clean, bayer.noise_variance(noisy, pair.shot_var, pair.read_var))
-    params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
-    noisy = noise.apply(clean, params)
-    return Sample(noisy, clean, noise.variance(noisy, params))
-
-
-@torch.inference_mode()
-def denoise(
-    model: Denoiser,
-    sample: Sample,
-    cfa: CFA,
-    views: int = 1,
-    own: CFA | None = None,
-    at_test: Callable[[Run], Run] | None = None,
-) -> Tensor:
-    """Packed RAW ``(1, 4, h, w)`` denoised where the model is, in tiles if it is large; linear RGB if it demosaics.
+def score(denoisers: Sequence[Denoiser], trials: Iterable[Trial], label: str = "") -> Iterator[Row]:
+    """Every denoiser on every trial, one trial in memory at a time.
 
     Args:
-        cfa: of the sample's mosaic.
-        views: 1, or 4 or 8 of a self-ensemble.
-        own: the pattern that the model was trained for, if another: the mosaic is continued by a mirrored line on the
-            sides where the patterns differ, and the result cropped.
-        at_test: what the estimator of the training puts around the network.
+        denoisers: what is compared, see :meth:`rawaug.RawDenoiser.of`; :data:`NOISY` is the input itself.
+        trials: see :func:`rawaug.evaluation.trials.trial_of`.
+        label: of the progress.
+
+    Example:
+        >>> from rawaug import RawDenoiser
+        >>> from rawaug.data import demo_pairs
+        >>> from rawaug.evaluation.trials import trial_of
+        >>> from rawaug.noise import noise_model
+        >>> trial = trial_of(demo_pairs("test", count=1)[0].middle(64), noise_model("cycleisp_sidd"))
+        >>> noisy, denoised = score([NOISY, RawDenoiser.of("NonLocalMeans")], [trial])
+        >>> denoised.psnr > noisy.psnr
+        True
     """
-    if own is not None and own != cfa:
-        rows, columns = cfa.shift_to(own)
-        mosaics = (bayer.unpack(x, cfa) for x in (sample.noisy, sample.variance))
-        noisy, variance = (bayer.pack(F.pad(x, (columns, columns, rows, rows), mode="reflect"), own) for x in mosaics)
-        denoised = denoise(model, Sample(noisy, noisy, variance), own, views, at_test=at_test)
-        packed = denoised.shape[1] == PACKED
-        image = aligned(bayer.unpack(denoised, own) if packed else denoised, own, cfa)
-        return bayer.pack(image, cfa) if packed else image
-    run: Run = partial(denoisers.tiled, model, each=counted("tile"))
-    if at_test is not None:
-        run = at_test(run)
-    if views > 1:
-        run = denoisers.SelfEnsemble(run, cfa, views=views, each=counted("view group"))
-    device = next(model.parameters(), sample.noisy).device
-    result: Tensor = run(sample.noisy.to(device), sample.variance.to(device))
-    return result.cpu()
+    for trial in progress(trials, label=label, unit="image") if label else trials:
+        for denoiser in denoisers:
+            yield from _rows(denoiser, trial)
 
 
-def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """Goes through the parts of a frame, where there are several with progress: its tiles, or views of one shape."""
-    return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
+def _rows(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
+    given = trial.given_to(denoiser)
+    start = time.perf_counter()
+    found = denoiser(given)
+    seconds = (time.perf_counter() - start) / (given.image.numel() / 1e6)
+    for name, image in results(denoiser.name, found, trial):
+        values = compared(image, trial)
+        error = 10.0 ** (-values[0] / 10.0)
+        share = None if trial.own is None or not error > 0 else trial.own / error
+        about = (trial.condition, trial.strength, trial.domain)
+        yield Row(name, trial.frame, *about, *values, share, given.levels, trial.levels_from_clean, seconds)
 
 
-def tested(method: Method, pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> tuple[Score, Sample, Tensor]:
-    """The scores of a frame, its test case and the method's result."""
-    pair = pair.with_levels()
-    sample = frozen_sample(pair, noise, cfa, seed)
-    denoised = method(pair, sample)
-    values = (*compared(denoised, sample.clean, cfa, pair), *compared(sample.noisy, sample.clean, cfa, pair))
-    shot_var, read_var = frozen_levels(pair, noise, seed) or (None, None)
-    return Score(pair.name, *values, shot_var, read_var, pair.levels_from_clean or None), sample, denoised
+def results(name: str, found: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:
+    """What a denoiser found, in the trial's domain, by name: RAW goes every one of the trial's ways there."""
+    if found.shape[1] == trial.clean.shape[1]:
+        yield name, found
+        return
+    for way, follow in trial.ways.items():
+        yield f"{name}, {way}", follow(found)
 
 
-def score_method(
-    method: Method, pairs: Sequence[Pair], noise: NoiseModel, cfa: CFA, seed: int, label: str
-) -> Iterator[Score]:
-    """The scores of every frame, one in memory at a time."""
-    for pair in progress(pairs, label=label, unit="image"):
-        yield tested(method, pair, noise, cfa, seed)[0]
+def compared(image: Tensor, trial: Trial) -> tuple[float, float, float | None, float | None]:
+    """PSNR and SSIM of an image against the clean one, in the trial's domain and after development."""
+    own = [_as_compared(x, trial) for x in (image, trial.clean)]
+    first = psnr(*own).item(), ssim(*own).item()
+    if trial.develop is None or trial.domain == "srgb":
+        return *first, None, None
+    shown = [trial.develop(x)[None] for x in (image, trial.clean)]
+    return *first, psnr(*shown).item(), ssim(*shown).item()
 
 
-def network_method(
-    model: Denoiser, cfa: CFA, own: CFA | None = None, views: int = 1, at_test: Callable[[Run], Run] | None = None
-) -> Method:
-    """A network as something to score; arguments as in :func:`denoise`."""
-    return lambda _, sample: denoise(model, sample, cfa, views, own, at_test)
+def _as_compared(image: Tensor, trial: Trial) -> Tensor:
+    if trial.domain == "raw":
+        return bayer.unpack(image, trial.cfa)
+    return image.clamp(0.0, 1.0) if trial.domain == "srgb" else image
 
 
-def row_of(methods: Mapping[str, Method], pair: Pair, noise: NoiseModel, cfa: CFA, seed: int) -> Row:
-    """Panels of a frame: noisy, denoised by each method, clean."""
-    row = Row(pair, {}, {})
-    for name, method in methods.items():
-        score, sample, denoised = tested(method, pair, noise, cfa, seed)
-        row.panels |= {} if "noisy" in row.panels else {"noisy": sample.noisy}
-        row.panels[name] = denoised
-        row.captions |= {"noisy": f"{score.psnr_noisy:.2f} dB", name: f"{score.psnr:.2f} dB"}
-    row.panels["clean"] = sample.clean
-    row.captions["clean"] = pair.name
-    return row
+@dataclass
+class Panels:
+    """One trial in pictures: images like its noisy or clean one by title, the clean one last, with captions."""
+
+    trial: Trial
+    images: dict[str, Tensor] = field(default_factory=dict)
+    captions: dict[str, str] = field(default_factory=dict)
+
+    def shown(self, image: Tensor) -> Tensor:
+        """An image, or a part of one, as sRGB ``(3, H, W)`` in [0, 1]."""
+        return image[0].clamp(0.0, 1.0) if self.trial.develop is None else self.trial.develop(image)
 
 
-def compared(packed: Tensor, clean: Tensor, cfa: CFA, pair: Pair) -> tuple[float, float, float, float]:
-    """PSNR and SSIM on the mosaic and on sRGB of packed RAW ``(1, 4, h, w)`` against the clean one."""
-    exposure = exposure_of(clean, pair)
-    raw = [bayer.unpack(x, cfa) for x in (packed, clean)]
-    srgb = [develop_packed(x, cfa, pair, exposure)[None] for x in (packed, clean)]
-    return psnr(*raw).item(), ssim(*raw).item(), psnr(*srgb).item(), ssim(*srgb).item()
+def panels_of(denoisers: Sequence[Denoiser], trial: Trial) -> Panels:
+    """Noisy, denoised by each, clean; captions say the PSNR."""
+    panels = Panels(trial)
+    for title, denoiser in {"noisy": NOISY, **{one.name: one for one in denoisers}}.items():
+        for name, image in results(title, denoiser(trial.given_to(denoiser)), trial):
+            panels.images[name] = image
+            panels.captions[name] = f"{psnr(*(_as_compared(x, trial) for x in (image, trial.clean))).item():.2f} dB"
+    panels.images["clean"] = trial.clean
+    panels.captions["clean"] = trial.frame
+    return panels
 
 
-def require_classical(specs: Sequence[Spec]) -> None:
-    """Check names, settings and libraries of classical denoisers."""
-    for spec in specs:
-        reason = FILTERS.make(spec).missing()
-        if reason is not None:
-            raise ValueError(f"classical: {name_and_settings(spec)[0]}: {reason}")
+def by_denoiser(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Rows by the name of their denoiser, in their order."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row.denoiser, []).append(row)
+    return found
 
 
-def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
-    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if
-    ``shown``.
+def summary(rows: Iterable[Row], noisy: Iterable[Row] = ()) -> dict[str, Any]:
+    """Of one denoiser, per image, mean, worst and best 25%; what does not apply is left out.
+
+    ``noisy`` are the rows of the input on the same trials, in the same order. ``levels_from_clean`` counts the images
+    whose noise levels were measured against the clean frame; ``no_numbers`` says which scores are infinite or NaN, such
+    as the PSNR of two equal frames.
     """
-    bm3d = {"BM3D": FILTERS["BM3D"].missing()}
-    kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
-    if shown and len(kept) < len(specs):
-        print(f"classical: BM3D is left out: {bm3d['BM3D']}")
-    require_classical(kept)
-    return kept
-
-
-def classical_method(spec: Spec, noise: NoiseModel, seed: int) -> Method:
-    """A classical denoiser as something to score; shot noise is stabilised before and after."""
-    denoiser = FILTERS.make(spec)
-
-    def method(pair: Pair, sample: Sample) -> Tensor:
-        levels = frozen_levels(pair, noise, seed)
-        if levels is None:
-            denoised: Tensor = denoiser(sample.noisy, sample.variance)
-            return denoised
-        return Stabilised(denoiser, anscombe)(sample.noisy, shot_var=levels[0], read_var=levels[1])
-
-    return method
-
-
-def frozen_levels(pair: Pair, noise: NoiseModel, seed: int) -> tuple[float, float] | None:
-    """(shot_var, read_var) of what :func:`frozen_sample` gives; None if the noise is of another kind."""
-    pair = pair.with_levels()
-    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        return pair.shot_var, pair.read_var
-    params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
-    return (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
-
-
-def label_of(spec: Spec) -> str:
-    """A classical denoiser's name in tables."""
-    name, settings = name_and_settings(spec)
-    return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
-
-
-def summary(scores: Iterable[Score]) -> dict[str, Any]:
-    """Per image, mean, worst and best 25%; what does not apply is left out.
-
-    ``levels_from_clean`` counts the images whose noise levels were measured against the clean frame; ``no_numbers``
-    names scores that are none, such as the PSNR of two equal frames.
-    """
-    scores, stated = list(scores), ("name", "shot_var", "read_var", "levels_from_clean")
-    images = [{key: value for key in stated if (value := getattr(score, key)) is not None} for score in scores]
+    rows, noisy = list(rows), list(noisy)
+    images = [_stated(row) for row in rows]
     result: dict[str, Any] = {"images": images}
-    if flagged := sum(bool(score.levels_from_clean) for score in scores):
+    if flagged := sum(row.levels_from_clean for row in rows):
         result["levels_from_clean"] = flagged
     wrong: list[str] = []
-    for key in (*METRICS, *(f"{metric}_noisy" for metric in METRICS)):
+    for key, scored in ((f"{metric}{end}", of) for end, of in (("", rows), ("_noisy", noisy)) for metric in METRICS):
         known = []
-        for image, score in zip(images, scores, strict=True):
-            value = getattr(score, key)
+        for image, row in zip(images, scored, strict=False):
+            value = getattr(row, key.removesuffix("_noisy"))
             if value is not None and math.isfinite(value):
                 image[key] = value
                 known.append(value)
             elif value is not None:
-                wrong.append(f"{score.name}: {key} is {value}")
+                wrong.append(f"{row.frame}: {key} is {value}")
         if known:
             result[key] = sum(known) / len(known)
             result[f"{key}_worst25"], result[f"{key}_best25"] = worst_and_best_quarter(known)
-    return result | ({"no_numbers": wrong} if wrong else {})
+    return result | _own_noise(rows, images) | ({"no_numbers": wrong} if wrong else {})
+
+
+def _stated(row: Row) -> dict[str, Any]:
+    levels = {} if row.levels is None else dict(zip(("shot_var", "read_var"), row.levels, strict=True))
+    return {"name": row.frame, **levels, **({"levels_from_clean": True} if row.levels_from_clean else {})}
+
+
+def _own_noise(rows: Sequence[Row], images: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """The references' own noise as a share of the squared error: of each image, in place, and of all together."""
+    errors, own = [], []
+    for row, image in zip(rows, images, strict=True):
+        if row.own_noise is not None and "psnr" in image:
+            errors.append(10.0 ** (-row.psnr / 10.0))
+            own.append(row.own_noise * errors[-1])
+            image["own_noise"] = row.own_noise
+    return {"own_noise": sum(own) / sum(errors)} if own else {}
 
 
 def require_numbers(summaries: Iterable[Mapping[str, Any]]) -> None:

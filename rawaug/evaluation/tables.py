@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch import Tensor
-
-from rawaug.bayer import CFA
-from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pairs import Pair, centre
+from denoisers.network import PACKED
+from rawaug.data.pairs import centre
 from rawaug.errors import escape, extra
+from rawaug.evaluation.scores import METRICS, Panels
 
 PANEL = 256
 """Largest side of a panel in mosaic pixels: larger frames are shown as a crop of the centre."""
@@ -38,7 +35,6 @@ FIGURES = {
     "own_noise": "own noise",
 }
 """Of an image, on the mosaic and developed; the last one is the references' share of the squared error."""
-METRICS = tuple(FIGURES)[:4]
 
 Runs = Mapping[str, Sequence[Mapping[str, Any]]]
 """By arm, one entry a seed: summaries by kind."""
@@ -57,30 +53,21 @@ PRINTED: Columns = {
 }
 
 
-@dataclass
-class Row:
-    """One frame of the picture: packed panels by title, the clean one last, with their captions."""
-
-    pair: Pair
-    panels: dict[str, Tensor]
-    captions: dict[str, str]
-
-
-def draw(rows: Sequence[Row], cfa: CFA, path: Path) -> Path:
+def draw(rows: Sequence[Panels], path: Path) -> Path:
     """Write the figure: the panels of each row, at most :data:`ACROSS` side by side."""
     with extra("train"):
         from matplotlib.figure import Figure
 
-    columns = min(ACROSS, max(len(row.panels) for row in rows))
-    lines = [-(-len(row.panels) // columns) for row in rows]
+    columns = min(ACROSS, max(len(row.images) for row in rows))
+    lines = [-(-len(row.images) // columns) for row in rows]
     figure = Figure(figsize=(2.1 * columns, 2.5 * sum(lines)), layout="constrained")
     axes = figure.subplots(sum(lines), columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
     for row, first in zip(rows, accumulate(lines, initial=0), strict=False):
-        exposure = exposure_of(list(row.panels.values())[-1], row.pair)
-        for axis, (title, packed) in zip(axes[first:].flat, row.panels.items(), strict=False):
-            panel = develop_packed(centre(packed, PANEL // 2, PANEL // 2, step=1), cfa, row.pair, exposure)
+        for axis, (title, image) in zip(axes[first:].flat, row.images.items(), strict=False):
+            side = PANEL // 2 if image.shape[1] == PACKED else PANEL
+            panel = row.shown(centre(image, side, side, step=1))
             axis.imshow(panel.permute(1, 2, 0).numpy(), interpolation="nearest")
             caption = f"{escape(title)}\n{escape(row.captions.get(title, ''))}"
             axis.set_title(caption, fontsize=9, parse_math=False)
@@ -154,23 +141,16 @@ def _cell(key: str, values: Sequence[float]) -> str:
     return formatted(key, statistics.fmean(values) if values else None)
 
 
-NOISY = "the noisy input"
-
-
-def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
-    """The method to use, an arm, one of the others or :data:`NOISY`, and why in a line.
-
-    The arm of the highest mean PSNR is compared with the best of the others, or with the noisy input. Both are empty
-    where nothing has a PSNR.
-    """
+def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which method to use: the arm of the highest mean PSNR against the best of the others, or of the noisy input."""
     means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
     if not means:
-        return "", ""
+        return ""
     arm = max(means, key=means.__getitem__)
     runs = [run["plain"] for run in results[arm]]
     noisy = {key.removesuffix("_noisy"): value for key, value in runs[0].items() if key.endswith("_noisy")}
     noisy["images"] = [{"psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]
-    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {NOISY: noisy}
+    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {"the noisy input": noisy}
     other = max(scored, key=lambda name: scored[name]["psnr"])
     gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
     gain = statistics.fmean(gains)
@@ -187,8 +167,7 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str
     if "psnr_srgb" in scored[other] and all("psnr_srgb" in run for run in runs):
         developed = statistics.fmean(run["psnr_srgb"] for run in runs) - scored[other]["psnr_srgb"]
         said += [f"{developed:+.2f} dB after development"]
-    chosen = arm if better else other
-    return chosen, f"Use {chosen}: {', '.join(said)}."
+    return f"Use {arm if better else other}: {', '.join(said)}."
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:

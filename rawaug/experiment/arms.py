@@ -11,19 +11,18 @@ from typing import Any
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.page import read_log
-from rawaug.evaluation.scores import frozen_sample, label_of
+from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.experiment.recipe import ArmConfig, Recipe
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, SRGB_NOISE
+from rawaug.registry import ESTIMATORS, SRGB_NOISE, label_of
 from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.srgb_noise import NoisyPictures
 from rawaug.training.stream import PictureCrops, RealCrops, Source, TrainingStream
-from rawaug.training.validation import Watched, watched
 
 WATCHED = 16
 """Samples made from pictures on which a training without validation pairs is watched."""
@@ -93,17 +92,17 @@ def training_stream(
 
 def validation_samples(
     recipe: Recipe, frames: Sequence[Any], pictures: Any, isp: DictionaryISP, noise: NoiseModel
-) -> list[Watched]:
+) -> list[Trial]:
     """The frozen samples by which weights are chosen, the same in every arm and run."""
     augment = RawAugment(isp, noise, target=recipe.target)
     if recipe.self_supervised:
         frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
-        return [Watched(*sample) for sample in held_out(frozen, isp.cfa)]
+        return [Trial(*sample) for sample in held_out(frozen, isp.cfa)]
     if frames:
-        return [watched(frozen_sample(pair, noise, isp.cfa, seed=0), pair, isp.cfa) for pair in frames]
+        return [trial_of(pair, noise, isp.cfa) for pair in frames]
     crops = PictureCrops(RawPairs(pictures, augment, recipe.train.crop))
     drawn = (crops.draw(keyed_generator("validation", k)) for k in range(WATCHED))
-    return [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
+    return [Trial(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
 
 
 def chosen(candidates: Mapping[str, str], folders: Sequence[Path], best: bool) -> dict[str, dict[str, float]]:

@@ -11,11 +11,12 @@ are those of linear camera RGB, and of one fixed development of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -25,24 +26,21 @@ from denoisers.network import PACKED, Denoiser
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.development import exposure_of, rendered
-from rawaug.data.pairs import Pair, Sample
+from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.errors import extra
-from rawaug.evaluation.contestants import Contestant, contestant
-from rawaug.evaluation.scores import Score, network_method, require_numbers, summary
+from rawaug.evaluation.scores import NOISY, require_numbers, summary
 from rawaug.evaluation.tables import print_table
+from rawaug.evaluation.trials import Trial
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe
-from rawaug.files import write_json
+from rawaug.files import fingerprint, write_json
 from rawaug.io import RawFrame, write_dng
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import find_device
-from rawaug.metrics import psnr, ssim
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.targets import Target
-from rawaug.progress import progress
 from rawaug.registry import EXPERIMENTS
 from rawaug.seeding import keyed_generator
-from rawaug.training.validation import Watched
 
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
 """LibRaw's demosaicings by its names."""
@@ -56,7 +54,7 @@ class JointRecipe(Recipe):
 
     Args:
         test_noise: of validation and test frames, in place of ``noise``.
-        rivals: denoisers of RAW to compare with, as ``rawaug benchmark`` names them, in place of ``classical`` and
+        rivals: denoisers of RAW to compare with, by name or file, in place of ``classical`` and
             ``untouched``.
         demosaicing: what each of them is followed by: bilinear, malvar, or LibRaw's VNG, PPG, AHD, DCB, DHT or AAHD.
     """
@@ -90,13 +88,34 @@ def full_colour(pair: Pair) -> Tensor:
     return rgb[..., :height, :width].contiguous()
 
 
-def frozen_mosaic(pair: Pair, noise: NoiseModel, seed: int = 0) -> Sample:
-    """A frame as a test case: noisy packed RGGB RAW, full-colour truth, variance; noise keyed by (seed, name)."""
+def rgb_trial(pair: Pair, noise: NoiseModel, ways: Sequence[str] = (), seed: int = 0) -> Trial:
+    """A frame as a test case in the domain ``rgb``: noisy packed RGGB RAW against its truth of full colour.
+
+    Args:
+        noise: drawn on the mosaic of the truth, keyed by (seed, name).
+        ways: the demosaicings by which a denoiser of RAW is followed.
+    """
     rgb = full_colour(pair)
     clean = bayer.pack_rgb(rgb, CFA.RGGB)
     params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
     noisy = noise.apply(clean, params)
-    return Sample(noisy, rgb, noise.variance(noisy, params))
+    levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+    return Trial(
+        noisy,
+        rgb,
+        noise.variance(noisy, params),
+        pair.name,
+        "rgb",
+        levels=levels,
+        develop=partial(developed, pair=pair, exposure=exposure_of(clean, pair)),
+        ways={method: partial(demosaiced, pair=pair, method=method) for method in ways},
+    )
+
+
+def developed(image: Tensor, pair: Pair, exposure: float) -> Tensor:
+    """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, as sRGB ``(3, H, W)`` in the frame's colours."""
+    rgb = image[0, [0, 1, 3]] if image.shape[1] == PACKED else image[0]
+    return rendered(rgb, pair.white_balance, pair.color_matrix, exposure, least=None)
 
 
 def demosaiced(packed: Tensor, pair: Pair, method: str) -> Tensor:
@@ -124,74 +143,45 @@ def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
     return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None]
 
 
-class Scene:
-    """A test case and how it is developed."""
+class Demosaiced:
+    """The noisy input, demosaiced by Malvar, He and Cutler's interpolation."""
 
-    def __init__(self, pair: Pair, noise: NoiseModel) -> None:
-        self.pair, self.sample = pair, frozen_mosaic(pair, noise)
-        self.exposure = exposure_of(bayer.pack_rgb(self.sample.clean, CFA.RGGB), pair)
+    name, takes = NOISY.name, "raw"
 
-    def develop(self, image: Tensor) -> Tensor:
-        """Linear RGB ``(1, 3, H, W)``, or packed RAW at its own size, as sRGB ``(3, H, W)``."""
-        rgb = image[0, [0, 1, 3]] if image.shape[1] == PACKED else image[0]
-        return rendered(rgb, self.pair.white_balance, self.pair.color_matrix, self.exposure, least=None)
-
-    def score(self, rgb: Tensor) -> Score:
-        """Of a result, beside that of the noisy RAW demosaiced as it is."""
-        noisy = demosaiced(self.sample.noisy, self.pair, "malvar")
-        return Score(self.pair.name, *self._compared(rgb), *self._compared(noisy))
-
-    def _compared(self, rgb: Tensor) -> tuple[float, float, float, float]:
-        clean = self.sample.clean
-        shown = [self.develop(image)[None] for image in (rgb, clean)]
-        return psnr(rgb, clean).item(), ssim(rgb, clean).item(), psnr(*shown).item(), ssim(*shown).item()
+    def __call__(self, given: Noisy) -> Tensor:
+        return bayer.demosaic(bayer.unpack(given.image, given.cfa), given.cfa, "malvar")
 
 
 class JointRun(TrainingRun):
     """A run whose arms give full colour."""
 
     recipe: JointRecipe
+    input = Demosaiced()
 
     def __init__(self, recipe: JointRecipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
         self.test_noise = noise_model(recipe.test_noise)
-        self.rivals = [contestant(name, find_device(recipe.device)) for name in recipe.rivals]
+        self.rivals = [RawDenoiser.of(name, recipe.device).require_mosaic() for name in recipe.rivals]
         super().__init__(recipe, overwrite, given)
 
     def pattern(self, arm: str, isp: DictionaryISP) -> CFA:
         return CFA.RGGB
 
-    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Watched]:
-        scenes = [Scene(pair, self.test_noise) for pair in self.frames["validation"]]
-        return [Watched(*scene.sample, scene.develop) for scene in scenes] or super().watched(isp, noise)
+    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
+        found = [rgb_trial(pair, self.test_noise) for pair in self.frames["validation"]]
+        return found or super().watched(isp, noise)
 
-    def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
-        model, result = model.to(find_device(self.recipe.device)), {}
-        for kind, views in {"plain": 1, "self_ensemble": self.recipe.views}.items():
-            if kind == "plain" or self.recipe.self_ensemble:
-                method = network_method(model, CFA.RGGB, views=views)
-                scores = [scene.score(method(scene.pair, scene.sample)) for scene in self.scenes(f"{arm}, {kind}")]
-                result[kind] = summary(scores)
-        return result
+    def trial(self, pair: Pair, noise: NoiseModel, isp: DictionaryISP) -> Trial:
+        return rgb_trial(pair, self.test_noise, self.recipe.demosaicing)
 
-    def scenes(self, label: str) -> Iterator[Scene]:
-        """The test cases, one in memory at a time."""
-        for pair in progress(self.test, label=f"evaluate {label}", unit="image"):
-            yield Scene(pair, self.test_noise)
+    def scores_key(self, digest: str) -> str:
+        return fingerprint(super().scores_key(digest), self.recipe.test_noise)
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
-        others = {name: scores for rival in self.rivals for name, scores in self.followed(rival).items()}
+        found, noisy = self.compared(self.rivals, noise, isp), self.noisy_rows(noise, isp)
+        others = {name: summary(rows, noisy) for name, rows in found.items()}
         file = self.folder / "results.json"
         write_json({"recipe": asdict(self.recipe), "results": results, "rivals": others}, file)
         title = f"{self.recipe.name} tested on {self.data.test}: linear camera RGB"
         print_table(results, title, others)
         print(f"table: {file}")
         require_numbers([*(run[kind] for runs in results.values() for run in runs for kind in run), *others.values()])
-
-    def followed(self, rival: Contestant) -> dict[str, Any]:
-        """Summaries of a denoiser of RAW, by the demosaicing that follows."""
-        scores: dict[str, list[Score]] = {f"{rival.name}, {method}": [] for method in self.recipe.demosaicing}
-        for scene in self.scenes(rival.name):
-            denoised = rival.run(scene.sample.noisy, scene.sample.variance, CFA.RGGB)
-            for method in self.recipe.demosaicing:
-                scores[f"{rival.name}, {method}"].append(scene.score(demosaiced(denoised, scene.pair, method)))
-        return {name: summary(found) for name, found in scores.items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,23 +17,16 @@ import denoisers
 from denoisers.files import find
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
+from rawaug.camera.fit import fit
 from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
+from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
-from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise_note, own_variances, with_own_noise
+from rawaug.evaluation.own_noise import added_noise_note, own_noise_note
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
-from rawaug.evaluation.scores import (
-    Method,
-    classical_method,
-    installed_classical,
-    label_of,
-    network_method,
-    require_numbers,
-    row_of,
-    score_method,
-    summary,
-)
-from rawaug.evaluation.tables import Row, draw, first_runs, print_table, verdict
+from rawaug.evaluation.scores import NOISY, Panels, Row, by_denoiser, panels_of, require_numbers, score, summary
+from rawaug.evaluation.tables import draw, first_runs, print_table
+from rawaug.evaluation.trials import Trial, trial_of, trials_of
 from rawaug.experiment.arms import (
     chosen,
     frames_of,
@@ -48,17 +40,14 @@ from rawaug.experiment.recipe import Recipe
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write_json
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import find_device
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
 from rawaug.progress import timed
-from rawaug.registry import ESTIMATORS, EXPERIMENTS
-from rawaug.training.camera import fit
+from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, label_of, name_and_settings
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
-from rawaug.training.noisy_frames import faintness_note, noisy_only
+from rawaug.training.noisy_frames import noisy_only
 from rawaug.training.state import first_network, start_of
-from rawaug.training.validation import Watched
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -97,8 +86,12 @@ def run(
 class TrainingRun:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted.
 
-    A kind of experiment with another target overrides :meth:`watched`, :meth:`evaluated` and :meth:`reported`.
+    A kind of experiment with another target overrides :meth:`watched`, :meth:`trial`, :meth:`evaluated` or
+    :meth:`reported`.
     """
+
+    input: Any = NOISY
+    """What stands for the noisy input in tables."""
 
     def __init__(self, recipe: Recipe, overwrite: bool, given: Mapping[str, Sequence[Pair]]) -> None:
         recipe = with_given_pairs(recipe, given)
@@ -117,18 +110,18 @@ class TrainingRun:
                 raise ValueError(f"denoiser: {named} gives {gives}; take another network")
         self.estimators = {label: ESTIMATORS.make(arm.estimator) for label, arm in recipe.arms.items()}
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
-        self.untouched = {Path(name).stem: denoisers.load(find(name)) for name in recipe.untouched}
+        self.untouched = [RawDenoiser.of(find(name), recipe.device, name=Path(name).stem) for name in recipe.untouched]
         plan = planned(recipe, given)
         _say(*plan.lines(recipe))
         plan, self.unreadable = plan.read()
         _say(*self.unreadable)
         self.pairs, self.validation, self.test = list(plan.pairs), plan.validation, plan.test
-        self.references = plan.references
         if recipe.self_supervised:  # from here on nothing knows a clean frame but the test
             self.pairs, self.validation = ([noisy_only(p) for p in part] for part in (self.pairs, self.validation))
         self.pictures = PairPictures(self.pairs) if self.data.pictures == OWN_PICTURES else plan.pictures
         self.frames: dict[str, Sequence[Any]] = {}
-        self.own: dict[str, OwnNoise] = {}
+        self._trials: tuple[NoiseModel, Sequence[Trial]] | None = None
+        self._noisy: list[Row] | None = None
         self.seconds: dict[str, float] = {}
         require_usable(recipe, self.pairs, self.validation)
 
@@ -141,14 +134,13 @@ class TrainingRun:
         models: dict[str, Denoiser] = {}
         for seed in self.seeds:
             isp = self.fitted_isp(seed)
-            noise = noise_for(isp, recipe.noise)
+            if not models or recipe.noise == "camera":  # another fit may have measured another law
+                noise = noise_for(isp, recipe.noise)
             if _leads() and not models:
-                self.own = own_variances(self.references, self.test, noise, 0, self.data.bin)
-                _say(added_noise_note(self.own))
-            if not self.frames or recipe.noise == "camera":  # another fit may have measured another law
+                _say(added_noise_note(self.trials(noise, isp)))
+            if not self.frames or recipe.noise == "camera":
                 parts = {"pairs": self.pairs, "validation": self.validation}
                 self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
-                _say(faintness_note(self.frames["pairs"]) if recipe.self_supervised else "")
             for arm in recipe.arms:
                 models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
                 if _leads():
@@ -228,7 +220,7 @@ class TrainingRun:
         (place / "last.pt").unlink(missing_ok=True)
         return model
 
-    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Watched]:
+    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
         """The frozen samples by which the weights of every arm are chosen."""
         return validation_samples(self.recipe, self.frames["validation"], self.pictures, isp, noise)
 
@@ -246,37 +238,63 @@ class TrainingRun:
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         path = self.place(arm, seed) / "evaluation.json"
-        digest = sha256(path.with_name("denoiser.safetensors"))
-        frames = self.data.test, self.data.test_crop, self.data.bin, stamps(self.test)
-        key = fingerprint(digest, *frames, self.recipe.views)
         known = json.loads(path.read_text()) if path.is_file() else {}
+        key = self.scores_key(sha256(path.with_name("denoiser.safetensors")))
         result: dict[str, Any] = known if known.get("key") == key else {"key": key}
         missing = [kind for kind in KINDS[: 1 + self.recipe.self_ensemble] if kind not in result]
         if not missing:
             print(f"already evaluated: {path}")
         for kind in missing:
-            method = self.method(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
-            scored = score_method(method, self.test, noise, isp.cfa, 0, f"evaluate {arm}, {kind}")
-            result[kind] = with_own_noise(summary(scored), self.own)
+            one = self.denoiser(arm, model, isp, self.recipe.views if kind == "self_ensemble" else 1)
+            (rows,) = self.scored([one], noise, isp, f"evaluate {arm}, {kind}").values()
+            result[kind] = summary(rows, self.noisy_rows(noise, isp))
             write_json(result, path)
             print(f"evaluated {arm}, seed {seed}, {kind}: {result[kind].get('psnr', math.nan):.2f} dB: {path}")
         return {kind: result[kind] for kind in KINDS if kind in result}
 
-    def method(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> Method:
-        at_test, where = self.estimators[arm].at_test, find_device(self.recipe.device)
-        return network_method(model.to(where), isp.cfa, self.pattern(arm, isp), views, at_test)
+    def scores_key(self, digest: str) -> str:
+        """What the scores of an arm depend on, besides the noise and the arm's own settings."""
+        frames = self.data.test, self.data.test_crop, self.data.bin, stamps(self.test)
+        return fingerprint(digest, *frames, self.recipe.views)
 
-    def untrained(self, noise: NoiseModel, cfa: CFA) -> dict[str, Method]:
+    def trials(self, noise: NoiseModel, isp: DictionaryISP) -> Sequence[Trial]:
+        """The test cases, made once; another seed's fit may have measured another noise."""
+        if self._trials is None or self._trials[0] is not noise:
+            self._trials = noise, trials_of(self.test, lambda pair: self.trial(pair, noise, isp))
+            self._noisy = None
+        return self._trials[1]
+
+    def trial(self, pair: Pair, noise: NoiseModel, isp: DictionaryISP) -> Trial:
+        """A test case of a frame."""
+        return trial_of(pair, noise, isp.cfa)
+
+    def scored(
+        self, denoisers: Sequence[Any], noise: NoiseModel, isp: DictionaryISP, label: str
+    ) -> dict[str, list[Row]]:
+        """The rows of every denoiser, by name; all see a test case before the next one is made."""
+        return by_denoiser(score(denoisers, self.trials(noise, isp), label))
+
+    def noisy_rows(self, noise: NoiseModel, isp: DictionaryISP) -> list[Row]:
+        """The scores of the input itself."""
+        trials = self.trials(noise, isp)
+        if self._noisy is None:
+            self._noisy = next(iter(by_denoiser(score([self.input], trials)).values()))
+        return self._noisy
+
+    def denoiser(self, arm: str, model: Denoiser, isp: DictionaryISP, views: int = 1) -> RawDenoiser:
+        """An arm's network as it is tested; one whose training diverged is scored as it is."""
+        around, cfa = self.estimators[arm].at_test, self.pattern(arm, isp)
+        made = {"name": arm, "cfa": cfa, "views": views, "around": around, "checked": False}
+        return RawDenoiser.of(model, self.recipe.device, **made)
+
+    def untrained(self) -> list[RawDenoiser]:
         """What the arms are compared with: classical denoisers, and trained ones as they are."""
-        methods = {label_of(spec): classical_method(spec, noise, seed=0) for spec in self.classical}
-        for name, (model, info) in self.untouched.items():
-            methods[name] = network_method(model.to(find_device(self.recipe.device)), cfa, CFA(info.get("cfa", "RGGB")))
-        return methods
+        return [*map(RawDenoiser.of, self.classical), *self.untouched]
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, the picture, and the page with all of it."""
-        recipe, cfa = self.recipe, isp.cfa
-        others = self.untrained(noise, cfa)
+        recipe = self.recipe
+        others = self.untrained()
         candidates = {label: arm.candidate_of for label, arm in recipe.arms.items() if arm.candidate_of is not None}
         searches = chosen(candidates, [self.folder / f"seed{s}" for s in self.seeds], bool(self.validation))
         classical: dict[str, Any] = {}
@@ -284,16 +302,17 @@ class TrainingRun:
         everything |= {"chosen": searches} if searches else {}
         everything |= {"unreadable": self.unreadable} if self.unreadable else {}
         write_json(everything, self.folder / "results.json")
-        for name, method in others.items():
-            classical[name] = self.scored(name, method, noise, cfa)
-            write_json(everything, self.folder / "results.json")
+        for name, rows in self.compared(others, noise, isp).items():
+            classical[name] = summary(rows, self.noisy_rows(noise, isp))
+        write_json(everything, self.folder / "results.json")
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
-        methods = others | {arm: self.method(arm, model, isp) for arm, model in models.items()}
-        facts = {"Noise": recipe.noise, "To use it": self.usage(results, classical)[-1].partition(": ")[2]}
-        about = {name: text for name, text in methods_of(recipe).items() if name in methods}
+        everyone = [*others, *(self.denoiser(arm, model, isp) for arm, model in models.items())]
+        facts = {"Noise": recipe.noise, "To use the best run": self.usage(results)[-1].partition(": ")[2]}
+        named = {one.name for one in everyone}
+        about = {name: text for name, text in methods_of(recipe).items() if name in named}
         page = Page.of_scores(title, results, classical, facts, about)
-        picture = self.pictured(page, methods, noise, cfa)
+        picture = self.pictured(page, everyone, self.trials(noise, isp))
         print_table(results, title, classical)
         _say(page.lead, own_noise_note(first_runs(results, classical)))
         print(f"table: {self.folder / 'results.json'}\npicture: {picture}\npage: {self.folder / 'report.html'}")
@@ -302,45 +321,37 @@ class TrainingRun:
             for arm, found in searches.items()
         ]
         spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results, classical))
+        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
     @timed("other denoisers")
-    def scored(self, name: str, method: Method, noise: NoiseModel, cfa: CFA) -> dict[str, Any]:
-        return with_own_noise(summary(score_method(method, self.test, noise, cfa, 0, name)), self.own)
+    def compared(self, others: Sequence[RawDenoiser], noise: NoiseModel, isp: DictionaryISP) -> dict[str, list[Row]]:
+        """The rows of what the arms are compared with."""
+        return self.scored(others, noise, isp, "other denoisers") if others else {}
 
     @timed("report")
-    def pictured(self, page: Page, methods: Mapping[str, Method], noise: NoiseModel, cfa: CFA) -> Path:
+    def pictured(self, page: Page, denoisers: Sequence[RawDenoiser], trials: Sequence[Trial]) -> Path:
         """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
         logs = {arm: [self.place(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
         page.add_curves(draw_curves(logs))
         hidden = [label_of(spec) for spec in self.classical[1:]]
-        shown = {name: method for name, method in methods.items() if name not in hidden}
-        rows: list[Row] = []
-        for pair in shown_on_page(self.test):
-            row = row_of(shown, pair, noise, cfa, seed=0)
-            page.add_frame(row, cfa)
+        shown = [one for one in denoisers if one.name not in hidden]
+        rows: list[Panels] = []
+        for trial in shown_on_page(trials):
+            row = panels_of(shown, trial)
+            page.add_frame(row)
             rows += [row] if len(rows) < SHOWN else []
         page.write(self.folder / "report.html", asdict(self.recipe))
-        return draw(rows, cfa, self.folder / "picture.png")
+        return draw(rows, self.folder / "picture.png")
 
-    def usage(self, results: Results, others: Mapping[str, Mapping[str, Any]]) -> list[str]:
-        """The files of weights, and the command that uses what the verdict names; of an arm the best seed's."""
+    def usage(self, results: Results) -> list[str]:
+        """The files of weights, and the command that uses those of the arm with the highest PSNR."""
         files = {(arm, s): self.place(arm, s) / "denoiser.safetensors" for arm in results for s in self.seeds}
+        runs = [run["plain"].get("psnr", 0.0) for found in results.values() for run in found]
+        best = list(files.values())[runs.index(max(runs))]
         lines = [f"denoiser, {arm}: {file}" for (arm, _), file in files.items()]
-        chosen, _ = verdict(results, others)
-        if chosen in results:
-            runs = [run["plain"].get("psnr", 0.0) for run in results[chosen]]
-            what = f"--denoiser {files[chosen, self.seeds[runs.index(max(runs))]]}"
-        elif chosen in self.untouched:
-            what = f"--denoiser {next(name for name in self.recipe.untouched if Path(name).stem == chosen)}"
-        elif chosen in others:
-            spec = next(spec for spec in self.classical if label_of(spec) == chosen)
-            what = f"--classical {spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))}"
-        else:
-            return [*lines, "to use: nothing, the frames are best as they are"]
-        return [*lines, f"to use {chosen}: rawaug denoise IN.dng OUT.dng {what}"]
+        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {best}"]
 
 
 def _say(*lines: str) -> None:
@@ -355,3 +366,15 @@ def _leads() -> bool:
         from lightning_fabric.utilities.rank_zero import rank_zero_only
 
     return getattr(rank_zero_only, "rank", 0) == 0
+
+
+def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]:
+    """The classical denoisers of a recipe, without BM3D where its wheel is missing, which is then printed if
+    ``shown``.
+    """
+    bm3d = {"BM3D": FILTERS["BM3D"].missing()}
+    kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
+    if shown and len(kept) < len(specs):
+        print(f"classical: BM3D is left out: {bm3d['BM3D']}")
+    require_classical(kept)
+    return kept

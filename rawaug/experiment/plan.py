@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, get_type_hints
 
 from rawaug.data import open_pairs, open_pictures
-from rawaug.data.folders import Cached, Readable, left_out
+from rawaug.data.folders import Cached, Kept, Readable, left_out
 from rawaug.data.pairs import (
     OWN_PICTURES,
     Binned,
@@ -23,6 +23,7 @@ from rawaug.data.pairs import (
     selected,
     shared_frame,
 )
+from rawaug.evaluation.own_noise import Measured
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.experiment.run_folder import require_free
 from rawaug.files import find_weights
@@ -41,14 +42,13 @@ _NAMED = 6
 class Plan:
     """The data of a run: what is fitted and trained on, what chooses the weights, what the result is scored on.
 
-    ``references`` are the test frames before they are binned and cropped, ``available`` the number of frames that
+    ``available`` is the number of frames that
     ``pairs``, ``validation`` and ``test`` were taken from; with ``held_out``, ``validation`` is a part of ``pairs``.
     """
 
     pairs: Sequence[Pair]
     validation: Sequence[Pair]
     test: Sequence[Pair]
-    references: Sequence[Pair]
     pictures: Any
     available: tuple[int, int, int]
     held_out: bool
@@ -128,8 +128,7 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     return Plan(
         pairs=chosen,
         validation=some(validation, data.validation_count, data.validation_crop, data.bin, together),
-        test=some(test, data.test_count, data.test_crop, data.bin, together),
-        references=test,
+        test=some(test, data.test_count, data.test_crop, data.bin, together, measure=True),
         pictures=Cached(pictures, data.memory_mb) if data.memory_mb else pictures,
         available=(len(pairs), len(pairs) if held_out else len(validation), len(test)),
         held_out=held_out,
@@ -137,16 +136,22 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
 
 
 def some(
-    pairs: Sequence[Pair], count: int | None, crop: int | None, factor: int = 1, together: bool = False
+    pairs: Sequence[Pair],
+    count: int | None,
+    crop: int | None,
+    factor: int = 1,
+    together: bool = False,
+    measure: bool = False,
 ) -> Sequence[Pair]:
-    """The first ``count`` pairs, binned by ``factor``, the middle of each; None for all of them, or whole frames.
+    """The first ``count`` pairs, binned by ``factor``, the middle of each, read once; None for all, or whole frames.
 
     With ``together``, as for a truth of full colour, the sites of a cell are brought to one centre even if ``factor``
-    is 1.
+    is 1. With ``measure`` the frames' own noise is measured before they are binned.
     """
     chosen = pairs if count is None else SomePairs(pairs, range(len(pairs))[:count])
-    binned = Binned(chosen, factor, together) if factor > 1 or together else chosen
-    return binned if crop is None else Middles(binned, crop)
+    measured = Measured(chosen) if measure else chosen
+    binned = Binned(measured, factor, together) if factor > 1 or together else measured
+    return Kept(binned if crop is None else Middles(binned, crop))
 
 
 def _opened(data: DataConfig, spec: str | Sequence[Pair] | None, split: str, clean: bool) -> Sequence[Pair]:
@@ -194,8 +199,6 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     folder = require_free(settings, overwrite)
     if isinstance(settings, Recipe):
         print("\n".join(planned(settings, {}).lines(settings)))
-    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as said:
+    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()):
         EXPERIMENTS[kind](replace(settings.shortest(), out=elsewhere))
-    notes = [line for line in said.getvalue().splitlines() if line.startswith("note: ")]
-    found = "it runs, but see the note above" if notes else "no problems found"
-    print("\n".join([*notes, f"Dry run: {found}, nothing written to {folder}"]))
+    print(f"Dry run: no problems found, nothing written to {folder}")

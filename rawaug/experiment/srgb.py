@@ -10,40 +10,39 @@ for each level, and trained RAW denoisers, which are given the levels and develo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-import denoisers
 from denoisers.files import DEFAULT
 from denoisers.network import Denoiser
 from rawaug import bayer
-from rawaug.data.pairs import Pair, Sample
-from rawaug.evaluation.contestants import Contestant, contestant
+from rawaug.bayer import noise_variance
+from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import Levels, Noisy, RawDenoiser
+from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.page import Figure, Page, Part, draw_curves, most_detailed
-from rawaug.evaluation.scores import label_of
+from rawaug.evaluation.scores import NoisyInput, Panels, Row, panels_of, score
 from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.trials import Trial
 from rawaug.experiment.denoising import Results, TrainingRun
 from rawaug.experiment.recipe import Recipe
 from rawaug.files import write_json
 from rawaug.io import RawFrame, develop, write_dng
 from rawaug.io.pictures import encode_png, write_picture
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import find_device
-from rawaug.metrics import psnr, ssim
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, FILTERS, name_and_settings
+from rawaug.registry import EXPERIMENTS, FILTERS, Spec, label_of, name_and_settings
 from rawaug.seeding import keyed_generator
-from rawaug.training.validation import Watched
 
 BLACK, WHITE = 8192.0, 65535.0
 """Of the DNG: room for noise below black."""
@@ -53,7 +52,6 @@ PANEL = 192
 """Side of the crops of the picture."""
 _WITHOUT_PLANES = ("NonLocalMeans", "TotalVariation", "Wavelet")
 
-Levels = tuple[float, float]
 Scores = dict[str, dict[str, float]]
 """By level, ``psnr`` and ``ssim`` on sRGB."""
 
@@ -65,7 +63,7 @@ class SrgbRecipe(Recipe):
     Of the keys ``noise`` is that of training; ``views`` and ``self_ensemble``, which are for RAW, change nothing.
 
     Args:
-        rivals: denoisers of RAW to compare with, as ``rawaug benchmark`` names them, in place of ``untouched``.
+        rivals: denoisers of RAW to compare with, by name or file, in place of ``untouched``.
         levels: (shot_var, read_var) of the RAW noise of validation and test, a row of the table each.
     """
 
@@ -95,20 +93,6 @@ def run(recipe: SrgbRecipe, overwrite: bool = False) -> Results:
     return SrgbRun(recipe, overwrite, {}).all_stages()
 
 
-class Shot(NamedTuple):
-    """A frame at one level: packed RAW as a :class:`Sample`, and both as LibRaw develops them, ``(1, 3, H, W)``."""
-
-    pair: Pair
-    levels: Levels
-    raw: Sample
-    noisy: Tensor
-    clean: Tensor
-
-
-Method = Callable[[Shot], Tensor]
-"""The denoised sRGB ``(1, 3, H, W)`` of a shot, whose clean parts it does not look at."""
-
-
 class SrgbRun(TrainingRun):
     """The stages of a training, with tests on sRGB."""
 
@@ -116,65 +100,65 @@ class SrgbRun(TrainingRun):
 
     def __init__(self, recipe: SrgbRecipe, overwrite: bool, given: Mapping[str, Any]) -> None:
         super().__init__(recipe, overwrite, given)
-        self.rivals = [contestant(name, find_device(recipe.device)) for name in recipe.rivals]
+        self.rivals = [RawDenoiser.of(name, recipe.device).require_mosaic() for name in recipe.rivals]
 
     @cached_property
-    def test_shots(self) -> dict[Levels, list[Shot]]:
-        """The test frames by level."""
-        return shots_of(self.test, self.recipe.levels, "develop test")
+    def tests(self) -> list[Trial]:
+        """The test frames at every level."""
+        return srgb_trials(self.test, self.recipe.levels, "develop test")
 
     @cached_property
-    def validation_shots(self) -> dict[Levels, list[Shot]]:
-        """The validation frames by level."""
-        return shots_of(self.validation, self.recipe.levels, "develop validation")
+    def validations(self) -> list[Trial]:
+        """The validation frames at every level."""
+        return srgb_trials(self.validation, self.recipe.levels, "develop validation")
 
-    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Watched]:
-        shots = [shot for found in self.validation_shots.values() for shot in found]
-        told = [torch.full_like(shot.noisy, sum(shot.levels)) for shot in shots]  # their order alone counts
-        return [Watched(shot.noisy, shot.clean, level) for shot, level in zip(shots, told, strict=True)]
+    def trials(self, noise: NoiseModel, isp: DictionaryISP) -> Sequence[Trial]:
+        return self.tests
+
+    def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
+        return self.validations
 
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
-        scores = scored(self.applied(model), self.test_shots, f"seed {seed}, {arm}")
+        scores = means(score([self.applied(arm, model)], self.tests, f"seed {seed}, {arm}"))[arm]
         write_json(scores, self.place(arm, seed) / "evaluation.json")
         return scores
 
-    def applied(self, model: Denoiser) -> Method:
-        """A network of sRGB as a method."""
-        device = find_device(self.recipe.device)
-        model = model.to(device)
-        return lambda shot: denoisers.tiled(model, shot.noisy.to(device)).cpu()
+    def applied(self, arm: str, model: Denoiser) -> PictureDenoiser:
+        """A network of sRGB as it is tested."""
+        return PictureDenoiser.of_network(arm, model, self.recipe.device)
 
-    def others(self) -> dict[str, dict[Levels, Method]]:
+    @cached_property
+    def others(self) -> dict[str, list[Any]]:
         """What the arms are compared with, by level: the noisy picture, filters on sRGB, RAW denoisers."""
-        found: dict[str, dict[Levels, Method]] = {"noisy": dict.fromkeys(self.recipe.levels, lambda shot: shot.noisy)}
-        for spec in self.recipe.classical:
-            chosen = {level: best_filter(spec, shots) for level, shots in self.validation_shots.items()}
-            found[label_of(spec)] = chosen
-        for rival in self.rivals:
-            found[f"{rival.name}, then LibRaw"] = dict.fromkeys(self.recipe.levels, raw_way(rival))
-        return found
+        chosen = {
+            level: [best_filter(spec, at_level(self.validations, level)) for spec in self.recipe.classical]
+            for level in map(key_of, self.recipe.levels)
+        }
+        return {level: [NoisyInput("noisy"), *filters, *self.rivals] for level, filters in chosen.items()}
 
     def reported(self, results: Results, models: dict[str, Denoiser], noise: NoiseModel, isp: DictionaryISP) -> None:
         """``results.json``, the table, crops at 100 % and the page."""
-        others, test = self.others(), self.test_shots
-        scores = {name: scored(by_level, test, name) for name, by_level in others.items()}
-        own = {name: one.own for name, one in self.own.items()}
+        rows = [row for level, some in self.others.items() for row in score(some, at_level(self.tests, level), level)]
+        scores = means(rows)
+        known = [(p.name, noise_variance(p.raw, *p.own_noise)) for p in self.test if p.own_noise is not None]
+        own = {name: variance.mean().item() for name, variance in known}
         content = {"recipe": asdict(self.recipe), "results": results, "others": scores, "own_noise": own}
         write_json(content, self.folder / "results.json")
-        arms = {arm: dict.fromkeys(test, self.applied(model)) for arm, model in models.items()}
-        picture = crops({**others, **arms}, test)
+        arms = [self.applied(arm, model) for arm, model in models.items()]
+        firsts = [panels_of([*some[1:], *arms], at_level(self.tests, level)[0]) for level, some in self.others.items()]
+        picture = crops(firsts)
         write_picture(self.folder / "picture.png", picture)
-        means = {**{name: [one] for name, one in scores.items()}, **results}
-        rows = [[name, *(_cell(runs, key_of(level)) for level in test)] for name, runs in means.items()]
-        head = ["sRGB PSNR / SSIM", *(key_of(level) for level in test)]
+        cells = {name: [one] for name, one in scores.items()} | results
+        table = {name: [_cell(runs, level) for level in self.others] for name, runs in cells.items()}
+        head = ["sRGB PSNR / SSIM", *self.others]
         title = f"{self.recipe.name} on {self.data.test}, steps: {self.recipe.train.steps}, seeds: {len(self.seeds)}"
         page = Page(title)
         page.add_curves(draw_curves({arm: [self.place(arm, s) / "log.csv" for s in self.seeds] for arm in models}))
-        page.parts.append(Part("Scores", head=head, rows={name: cells for name, *cells in rows}))
-        caption = f"crops at 100 %, a level in each row: {', '.join([*others, *arms, 'clean'])}"
+        page.parts.append(Part("Scores", head=head, rows=table))
+        caption = f"crops at 100 %, a level in each row: {', '.join(firsts[0].images)}"
         page.parts.append(Part("Pictures", figures=[Figure(encode_png(picture), "crops", caption=caption)]))
         page.write(self.folder / "report.html", asdict(self.recipe))
-        print_rows(title, head, rows)
+        print_rows(title, head, [[name, *row] for name, row in table.items()])
         print(f"table: {self.folder / 'results.json'}\npicture: {self.folder / 'picture.png'}")
 
 
@@ -183,22 +167,45 @@ def key_of(levels: Levels) -> str:
     return f"{levels[0]:g}, {levels[1]:g}"
 
 
+def at_level(trials: Sequence[Trial], level: str) -> list[Trial]:
+    return [trial for trial in trials if trial.strength == level]
+
+
+def means(rows: Iterable[Row]) -> dict[str, Scores]:
+    """Mean PSNR and SSIM by denoiser and level."""
+    found: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
+        found.setdefault(row.denoiser, {}).setdefault(row.strength, []).append(row)
+    return {
+        name: {
+            level: {key: fmean(getattr(row, key) for row in some) for key in ("psnr", "ssim")}
+            for level, some in by_level.items()
+        }
+        for name, by_level in found.items()
+    }
+
+
 def _cell(runs: Sequence[Scores], level: str) -> str:
     return f"{fmean(run[level]['psnr'] for run in runs):.2f} / {fmean(run[level]['ssim'] for run in runs):.3f}"
 
 
-def shots_of(pairs: Sequence[Pair], levels: Sequence[Levels], label: str) -> dict[Levels, list[Shot]]:
-    """Every frame at every level, by level."""
-    found: dict[Levels, list[Shot]] = {level: [] for level in levels}
+def srgb_trials(pairs: Sequence[Pair], levels: Sequence[Levels], label: str) -> list[Trial]:
+    """Every frame at every level as LibRaw develops it, in the domain ``srgb``, with the RAW before."""
+    found: list[Trial] = []
     for pair in progress(pairs, label=label, unit="frame"):
         packed, clean = bayer.pack(pair.raw[None], pair.cfa), developed(pair.raw, pair)
+        ways = {"then LibRaw": partial(_unpacked_and_developed, pair=pair)}
         for level in levels:
             noise = noise_model(level)
             params = noise.sample(1, keyed_generator("developed noise", pair.name, *map(str, level)))
             noisy, told = noise.apply_with_variance(packed, params)
-            shown = developed(bayer.unpack(noisy, pair.cfa)[0], pair)
-            found[level].append(Shot(pair, level, Sample(noisy, packed, told), shown, clean))
+            shown, raw = ways["then LibRaw"](noisy), Noisy(noisy, told, level, pair.cfa)
+            found.append(Trial(shown, clean, None, pair.name, "srgb", strength=key_of(level), raw=raw, ways=ways))
     return found
+
+
+def _unpacked_and_developed(packed: Tensor, pair: Pair) -> Tensor:
+    return developed(bayer.unpack(packed, pair.cfa)[0], pair)
 
 
 def developed(mosaic: Tensor, pair: Pair) -> Tensor:
@@ -211,53 +218,28 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
         return develop(path)[None] / 255.0
 
 
-def raw_way(rival: Contestant) -> Method:
-    """A denoiser of RAW before the development, told the levels."""
-
-    def method(shot: Shot) -> Tensor:
-        denoised = rival.run(shot.raw.noisy, shot.raw.variance, shot.pair.cfa)
-        return developed(bayer.unpack(denoised, shot.pair.cfa)[0], shot.pair)
-
-    return method
-
-
-def filtered(spec: Any, deviation: float) -> Method:
+def filtered(spec: Spec, deviation: float) -> PictureDenoiser:
     """A classical filter of white noise of this deviation, on the three colours."""
     denoiser = FILTERS.make(spec)
 
-    def method(shot: Shot) -> Tensor:
-        planes = (shot.noisy[0] / deviation).permute(1, 2, 0).contiguous().numpy()
+    def run(srgb: Tensor) -> Tensor:
+        planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
         return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
 
-    return method
+    return PictureDenoiser(label_of(spec), run)
 
 
-def best_filter(spec: Any, shots: Sequence[Shot]) -> Method:
-    """The filter of the deviation with the highest mean PSNR on these shots."""
-    methods = [filtered(spec, deviation) for deviation in DEVIATIONS]
-    return max(methods, key=lambda method: fmean(_psnr(method(shot), shot) for shot in shots))
+def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
+    """The filter of the deviation with the highest mean PSNR on these trials."""
+    filters = [filtered(spec, deviation) for deviation in DEVIATIONS]
+    return max(filters, key=lambda one: fmean(row.psnr for row in score([one], trials)))
 
 
-def _psnr(denoised: Tensor, shot: Shot) -> float:
-    return psnr(denoised.clamp(0.0, 1.0), shot.clean).item()
-
-
-def scored(method: Method | Mapping[Levels, Method], shots: Mapping[Levels, Sequence[Shot]], label: str) -> Scores:
-    """Mean PSNR and SSIM by level."""
-    scores: Scores = {}
-    for level, found in progress(list(shots.items()), label=label, unit="level"):
-        one = method[level] if isinstance(method, Mapping) else method
-        pictures = [one(shot).clamp(0.0, 1.0) for shot in found]
-        both = [[m(x, s.clean).item() for m in (psnr, ssim)] for x, s in zip(pictures, found, strict=True)]
-        scores[key_of(level)] = dict(zip(("psnr", "ssim"), map(fmean, zip(*both, strict=True)), strict=True))
-    return scores
-
-
-def crops(methods: Mapping[str, Mapping[Levels, Method]], shots: Mapping[Levels, Sequence[Shot]]) -> Tensor:
-    """Of the first frame at each level a row of crops, every method's and the clean one; sRGB ``(3, h, w)``."""
-    rows = []
-    for level, (shot, *_) in shots.items():
-        top, left = (2 * place for place in most_detailed(shot.raw.clean))
-        pictures = [*(by_level[level](shot) for by_level in methods.values()), shot.clean]
-        rows.append(torch.cat([x[0, :, top : top + PANEL, left : left + PANEL] for x in pictures], dim=-1))
-    return torch.cat(rows, dim=-2).clamp(0.0, 1.0)
+def crops(rows: Sequence[Panels]) -> Tensor:
+    """A row of crops of each frame, every image's where the clean one has most detail; sRGB ``(3, h, w)``."""
+    found = []
+    for row in rows:
+        top, left = most_detailed(row.trial.clean, PANEL)
+        parts = [row.shown(image[..., top : top + PANEL, left : left + PANEL]) for image in row.images.values()]
+        found.append(torch.cat(parts, dim=-1))
+    return torch.cat(found, dim=-2)

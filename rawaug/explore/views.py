@@ -19,11 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from denoisers.files import DEFAULT, find, load
-from denoisers.network import PACKED, Denoiser
+from denoisers.files import DEFAULT
+from denoisers.network import PACKED
 from rawaug.bayer import CFA, pattern
-from rawaug.data.pairs import Sample
-from rawaug.evaluation.scores import denoise
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.explore import figures
 from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
@@ -144,8 +143,7 @@ def denoised(look: Look) -> list[Panel]:
         raise ValueError(f"{DEFAULT} denoises Bayer RAW, not {made.augment.cfa}; choose a Bayer CFA")
     cfa = CFA(made.augment.cfa)
     noisy, clean, variance = (_crop(x)[None] for x in (made.pair.noisy, made.pair.clean, made.pair.variance))
-    model, own = _network()
-    result = denoise(model, Sample(noisy, clean, variance), cfa, own=own).clamp(max=1.0)
+    result = _network()(Noisy(noisy, variance, cfa=cfa)).clamp(max=1.0)
     before, after = (psnr(x, clean).item() for x in (noisy, result))
     shown = [_developed(made, x[0]) for x in (noisy, result)]
     return [Panel(f"noisy, {before:.1f} dB", shown[0]), Panel(f"denoised by {DEFAULT}, {after:.1f} dB", shown[1])]
@@ -191,9 +189,8 @@ def seen_in(tab: str, look: Look) -> Look:
 
 
 @lru_cache(maxsize=1)
-def _network() -> tuple[Denoiser, CFA]:
-    model, info = load(find(DEFAULT))
-    return model, CFA(info.get("cfa", "RGGB"))
+def _network() -> RawDenoiser:
+    return RawDenoiser.of(DEFAULT)
 
 
 def _half(made: Drawn) -> Tensor:

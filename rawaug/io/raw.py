@@ -34,6 +34,11 @@ from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.pictures import require_utf8
 from rawaug.io.tiff import MAKE, MODEL, TiffTags, read_tiff_tags
 
+RAW_EXTENSIONS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+)
+
 _SENSE = 1e6
 
 

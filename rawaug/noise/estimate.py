@@ -28,14 +28,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA, binned_variance, pack
+from rawaug.bayer import CFA, pack
 from rawaug.errors import escape, extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from rawaug.data.pairs import Pair
-
 
 WORST_FIT = 0.5
 """R^2 below which the points follow no line."""
@@ -245,27 +242,21 @@ def _line(x: Tensor, y: Tensor, weight: Tensor, known_read_var: float | None) ->
     return (wxy - read * wx) / wxx, read
 
 
-def own_noise(pairs: Sequence[Pair], index: int) -> tuple[float, float] | None:
-    """(shot_var, read_var) of a reference's own noise, or of what its binning left; None if not measurable.
+def own_noise(raw: Tensor, cfa: CFA | str) -> tuple[float, float] | None:
+    """Measure the noise that a reference has itself, on the whole frame as its camera gave it.
 
-    Example:
-        >>> from rawaug.data import open_pairs
-        >>> own_noise(open_pairs("real:test", bin=2), 0)  # doctest: +ELLIPSIS
-        (1.0...e-06, 5.6...e-09)
+    Args:
+        raw: the mosaic ``(1, H, W)``, not binned.
+        cfa: its pattern.
+
+    Returns:
+        (shot_var, read_var), or None where too little of the frame is flat or its points follow no line.
     """
-    from rawaug.data.pairs import Binned  # late: measuring noise needs no datasets
-
-    pair = pairs[index]
-    if pair.own_noise is not None:
-        return pair.own_noise
-    whole, left = pair, 1.0
-    if isinstance(pairs, Binned):
-        whole, left = pairs.pairs[index], binned_variance(pairs.factor, pairs.together)
     try:
-        estimate = estimate_noise(whole.raw, whole.cfa)
+        estimate = estimate_noise(raw, cfa)
     except ValueError:
         return None
-    return None if estimate.r2 < WORST_FIT else (estimate.shot_var * left, estimate.read_var * left)
+    return None if estimate.r2 < WORST_FIT else (estimate.shot_var, estimate.read_var)
 
 
 def own_noise_share(levels: tuple[float, float], reference: Tensor, squared_error: float) -> float:

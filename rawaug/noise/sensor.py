@@ -371,11 +371,12 @@ class DarkFrames(PoissonGaussianNoise):
     by_plane = True
 
     def __init__(self, path: str, shot_var: Range | None = None) -> None:
-        from rawaug.data.folders import RawFolder
+        from rawaug.files import files_in
         from rawaug.io import read_raw
+        from rawaug.io.raw import RAW_EXTENSIONS
 
         _require_not_negative(shot_var=0.0 if shot_var is None else shot_var)
-        frames = [read_raw(file) for file in RawFolder(path).files]
+        frames = [read_raw(file) for file in files_in(path, "RAW", RAW_EXTENSIONS)]
         untagged = [frame.name for frame in frames if shot_var is None and frame.noise_profile is None]
         if untagged:
             raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")

@@ -24,12 +24,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rawaug import bayer
+from rawaug.camera.psnr_r import psnr_r
 from rawaug.data import DemoCamera, PictureFolder, open_pairs, open_pictures
 from rawaug.data.demo import FRAME
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Pair
 from rawaug.errors import extra
-from rawaug.evaluation.psnr_r import psnr_r
 from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free
 from rawaug.files import fingerprint, write_json

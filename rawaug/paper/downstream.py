@@ -21,7 +21,9 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs
 from rawaug.data.folders import skip_broken
 from rawaug.data.pairs import Sample, SomePairs
-from rawaug.evaluation.scores import Score, network_method, score_method
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import Row, score
+from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import as_float
 from rawaug.noise import NoiseModel, noise_model
@@ -32,7 +34,6 @@ from rawaug.seeding import derived_seed, keyed_generator
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream
-from rawaug.training.validation import Watched
 
 WATCHED = 16
 """Samples made from the pictures on which training is watched."""
@@ -79,7 +80,7 @@ class DownstreamScore(NamedTuple):
     psnr_srgb: float
 
 
-def mean_of(scores: Sequence[Score]) -> DownstreamScore:
+def mean_of(scores: Sequence[Row]) -> DownstreamScore:
     """The mean over frames; sRGB over those that can be developed."""
     developed = [score.psnr_srgb for score in scores if score.psnr_srgb is not None]
     return DownstreamScore(fmean(score.psnr for score in scores), fmean(developed))
@@ -95,7 +96,7 @@ def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) 
     """A denoiser trained on these samples."""
     stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
     drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
-    watched = [Watched(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
+    watched = [Trial(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
     folder = place / f"seed{seed}"
     return train(stream, watched, config.denoiser, config.train, folder, seed, label=f"{place.name} {seed}")
 
@@ -105,9 +106,9 @@ def score_on(net: Denoiser, config: DownstreamConfig, cfa: CFA) -> DownstreamSco
     opened = ((open_pairs(spec, split="test", bin=config.bin), spec) for spec in config.test)
     chosen = ((SomePairs(found, range(len(found))[: config.test_count]), spec) for found, spec in opened)
     pairs = (pair for frames, spec in chosen for pair in skip_broken(frames, spec))
+    noise, denoiser = noise_model(config.noise), RawDenoiser.of(net, cfa=cfa)
     frames = [pair.middle(config.test_crop) if config.test_crop else pair for pair in pairs]
-    method = network_method(net, cfa)
-    return mean_of(list(score_method(method, frames, noise_model(config.noise), cfa, 0, "PSNR_d")))
+    return mean_of(list(score([denoiser], (trial_of(pair, noise, cfa) for pair in frames), "PSNR_d")))
 
 
 def _crops(model: Method, pictures: Sequence[Tensor], noise: NoiseModel, config: DownstreamConfig) -> Source:

@@ -24,8 +24,8 @@ from rawaug.bayer import CFA
 from rawaug.data import open_pairs, open_pictures
 from rawaug.data.folders import Readable, skip_broken
 from rawaug.data.pairs import Pair, SomePairs, names_of, selected, shared_frame
-from rawaug.evaluation.scores import frozen_sample
 from rawaug.evaluation.tables import mean_and_spread, print_rows
+from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.run_folder import claim, require_free, run_folder
 from rawaug.files import fingerprint, write_json
 from rawaug.io import decode_srgb, encode_srgb
@@ -333,7 +333,7 @@ def _fitted_frames(settings: Comparison, found: Sequence[Pair]) -> list[Pair]:
     if settings.noise is None:
         return pairs
     noise = noise_model(settings.noise)  # frozen: keyed by the frame's name, as a noisy capture
-    drawn = [frozen_sample(pair, noise, CFA(pair.cfa), 0).noisy for pair in pairs]
+    drawn = [trial_of(pair, noise).noisy for pair in pairs]
     return [replace(pair, noisy=bayer.unpack(noisy, pair.cfa)[0]) for pair, noisy in zip(pairs, drawn, strict=True)]
 
 

@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 
 from denoisers.network import Denoiser
 from rawaug.errors import extra
+from rawaug.evaluation.trials import Trial
 from rawaug.files import replacing
 from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
@@ -30,7 +31,7 @@ from rawaug.training.criteria import Criterion, weighed
 from rawaug.training.estimators import Supervised
 from rawaug.training.state import TrainingState, first_network
 from rawaug.training.stream import StepSampler, TrainingStream
-from rawaug.training.validation import Watched, panels, validate
+from rawaug.training.validation import panels, validate
 
 SHOWN, SHOWINGS = 3, 20
 """Validation frames of which TensorBoard shows crops, and how often at most."""
@@ -70,7 +71,7 @@ class Journal:
         for name, value in values.items():
             self.writer.add_scalar(name, value, step)
 
-    def show(self, step: int, steps: int, net: nn.Module, frames: Sequence[Watched]) -> None:
+    def show(self, step: int, steps: int, net: nn.Module, frames: Sequence[Trial]) -> None:
         """Noisy, denoised and clean crops in TensorBoard, at most :data:`SHOWINGS` times in ``steps``."""
         if self.next_shown <= step:
             self.next_shown = step + steps // SHOWINGS
@@ -83,7 +84,7 @@ class Journal:
 
 def train(
     stream: TrainingStream,
-    validation: Sequence[Watched],
+    validation: Sequence[Trial],
     network: DenoiserConfig,
     config: TrainConfig,
     folder: Path,

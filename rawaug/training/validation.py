@@ -5,19 +5,15 @@ The frames are sorted by their mean noise variance and split in thirds: *low*, *
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from statistics import fmean
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 import denoisers
-from rawaug.bayer import CFA
-from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.pairs import Pair, Sample
+from rawaug.evaluation.trials import Trial
 from rawaug.metrics import psnr
 
 PARTS = ("low", "middle", "high")
@@ -25,23 +21,8 @@ PANEL = 96
 """Largest side, in packed pixels, of the crops that are shown."""
 
 
-class Watched(NamedTuple):
-    """A frozen frame."""
-
-    noisy: Tensor
-    clean: Tensor
-    variance: Tensor
-    develop: Callable[[Tensor], Tensor] | None = None
-
-
-def watched(sample: Sample, pair: Pair, cfa: CFA) -> Watched:
-    """A sample of a frame, to be developed as that frame is."""
-    exposure = exposure_of(sample.clean, pair)
-    return Watched(*sample, partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure))
-
-
 @torch.no_grad()
-def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) -> dict[str, float]:
+def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> dict[str, float]:
     """Mean PSNR in dB, large frames in tiles.
 
     Returns ``psnr`` over all frames; of three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
@@ -50,30 +31,35 @@ def validate(net: nn.Module, frames: Sequence[Watched], device: torch.device) ->
     net.eval()
     raw, srgb = [], []
     for frame in frames:
-        denoised = denoisers.tiled(net, frame.noisy.to(device), frame.variance.to(device)).cpu()
+        variance = None if frame.variance is None else frame.variance.to(device)
+        denoised = denoisers.tiled(net, frame.noisy.to(device), variance).cpu()
         raw.append(psnr(denoised, frame.clean).mean().item())
-        if frame.develop is not None:
+        if frame.develop is not None and frame.domain != "srgb":
             srgb.append(psnr(*(frame.develop(x)[None] for x in (denoised, frame.clean))).item())
     net.train()
-    noise = [frame.variance.mean().item() for frame in frames]
+    noise = [frame.amount for frame in frames]
     scores = _by_part("psnr", raw, noise)
     return scores | (_by_part("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
 
 
 @torch.no_grad()
-def panels(net: nn.Module, frame: Watched) -> Tensor:
+def panels(net: nn.Module, frame: Trial) -> Tensor:
     """The middle of a frame noisy, denoised and clean, beside each other: sRGB ``(3, h, 3 w)`` in [0, 1].
 
     Where the camera is not known the mean of the greens is shown, through the power 1/2.2; full colour as it is.
     """
     height, width = (min(side, PANEL) for side in frame.noisy.shape[-2:])
     top, left = ((side - size) // 2 for side, size in zip(frame.noisy.shape[-2:], (height, width), strict=True))
-    noisy, variance = (x[..., top : top + height, left : left + width] for x in (frame.noisy, frame.variance))
+    noisy, variance = (
+        x if x is None else x[..., top : top + height, left : left + width] for x in (frame.noisy, frame.variance)
+    )
+    assert noisy is not None
     scale = frame.clean.shape[-1] // frame.noisy.shape[-1]  # 2 where packed RAW becomes full colour
     clean = frame.clean[..., scale * top : scale * (top + height), scale * left : scale * (left + width)]
     device = next((weights.device for weights in net.parameters()), noisy.device)
     net.eval()
-    denoised = net(noisy.to(device), variance.to(device)).cpu().nan_to_num()  # black where the training has diverged
+    told = None if variance is None else variance.to(device)
+    denoised = net(noisy.to(device), told).cpu().nan_to_num()  # black where the training has diverged
     net.train()
     shown = [(frame.develop or _shown)(image) for image in (noisy, denoised, clean)]
     return torch.cat([F.interpolate(image[None], shown[-1].shape[-2:])[0] for image in shown], dim=-1)

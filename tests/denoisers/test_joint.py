@@ -15,8 +15,7 @@ from denoisers import DRUNet, JointDRUNet, SelfEnsemble, tiled
 from denoisers.domains import DOMAINS, levels_of
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.data.pairs import Sample
-from rawaug.evaluation.scores import denoise
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.training.config import DenoiserConfig
 from rawaug.training.state import first_network
 
@@ -91,7 +90,7 @@ def test_views_are_turned_back() -> None:
 @pytest.mark.parametrize("cfa", list(CFA))
 def test_any_pattern_is_full_colour_where_it_stands(cfa: CFA) -> None:
     noisy, variance = noisy_raw(12, 16)
-    rgb = denoise(JointDRUNet(**SMALL).eval(), Sample(noisy, noisy, variance), cfa, own=CFA.RGGB)
+    rgb = RawDenoiser.of(JointDRUNet(**SMALL))(Noisy(noisy, variance, cfa=cfa))
     expected = malvar(noisy, variance, cfa)
     inner = (..., slice(4, -4), slice(4, -4))
     torch.testing.assert_close(rgb[inner], expected[inner], rtol=0, atol=2e-3)

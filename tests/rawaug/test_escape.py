@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from rawaug.commands.synth import print_synthesis, synth
+from rawaug.commands.synth import print_synthesis
 from rawaug.data import PictureFolder, check
 from rawaug.errors import escape
 from rawaug.evaluation.tables import print_rows
 from rawaug.io import write_picture
+from rawaug.synthesis.folder import synth
 
 NAMES = [
     "a space", "new\nline", "\"double\" and 'single'", "<script>alert(1)</script>".replace("/", "\u2215"), "-rf",

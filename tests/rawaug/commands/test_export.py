@@ -14,9 +14,9 @@ import denoisers
 from rawaug.bayer import CFA, noise_variance
 from rawaug.cli import main
 from rawaug.commands.export import errors_only, export
-from rawaug.commands.frame_denoisers import frame_denoiser
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoise.onnx import session_of
 from rawaug.errors import MissingExtra
-from rawaug.evaluation.contestants import session_of
 from rawaug.io import RawFrame
 
 
@@ -36,7 +36,6 @@ def test_any_size_gives_pytorch_s_numbers(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("rawaug.commands.frame_denoisers.fast_in_bfloat16", lambda device: False)
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library, reason="pip install rawaug[export]")
     model, weights, out = denoisers.build(name, **config), tmp_path / "small.safetensors", tmp_path / "small.onnx"
@@ -45,7 +44,7 @@ def test_any_size_gives_pytorch_s_numbers(
     assert main(["export", str(weights), str(out)]) == 0
     assert "largest difference from PyTorch" in capsys.readouterr().out
     frame = RawFrame(torch.rand(1, 130, 94, generator=torch.Generator().manual_seed(1)), CFA.GBRG)
-    both = [frame_denoiser(file, self_ensemble=True, linear=linear)(frame, (1e-3, 1e-5)) for file in (weights, out)]
+    both = [RawDenoiser.of(file, views=8).frame(frame, (1e-3, 1e-5)) for file in (weights, out)]
     assert both[0].shape == (3 if linear else 1, 130, 94) and (both[0] - frame.mosaic).abs().max() > 1e-3
     assert (both[0] - both[1]).abs().max() < 1e-4
     session = session_of(out)

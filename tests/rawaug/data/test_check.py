@@ -12,8 +12,8 @@ from scipy.io import savemat
 
 from rawaug.cli import main
 from rawaug.data import PictureFolder, RawFolder, check
-from rawaug.data.folders import files_below
 from rawaug.data.sidd import HELD_BACK
+from rawaug.files import files_below
 from rawaug.io import write_picture
 
 Writer = Callable[[Path, dict[str, Any]], Path]

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from rawaug.bayer import CFA
-from rawaug.commands.frame_denoisers import FrameDenoiser
 from rawaug.commands.submit import submit_dnd
 from rawaug.data import Dnd, check_dnd_submission, open_pairs, write_dnd_submission
 from rawaug.data.mat import read_value
+from rawaug.denoise.denoiser import RawDenoiser
 
 Writer = Callable[[Path, dict[str, Any]], Path]
 CFAS = ("RGGB", "GBRG", "GRBG", "BGGR")
@@ -76,11 +76,13 @@ def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:
 def test_the_command_denoises_every_box_by_its_frames_levels_and_clips(folder: Path, tmp_path: Path) -> None:
     seen: list[tuple[float, float]] = []
 
-    def halved(packed: torch.Tensor, levels: tuple[float, float], _: CFA) -> torch.Tensor:
+    def halved(levels: tuple[float, float] | None) -> Callable[..., torch.Tensor]:
+        assert levels is not None
         seen.append(levels)
-        return packed * 0.5 - 0.01
+        return lambda noisy, variance: noisy * 0.5 - 0.01
 
-    assert submit_dnd(str(folder), str(tmp_path / "out"), FrameDenoiser(halved, {})) == 1000
+    denoiser = RawDenoiser(name="halved", model=halved, tiles=None)
+    assert submit_dnd(str(folder), str(tmp_path / "out"), denoiser) == 1000
     assert seen[0] == (1e-3, 1e-6) and seen[21 * 20] == (0.022, 1e-6)
     box = read_value(tmp_path / "out" / "0022.mat", "Idenoised")[7]
     expected = (Dnd(folder)[21 * 20 + 7].mosaic[0].numpy() * 0.5 - 0.01).clip(0.0)

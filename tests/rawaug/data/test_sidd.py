@@ -14,9 +14,9 @@ from scipy.io import savemat
 from torch import Tensor
 
 from rawaug.bayer import CFA, mosaic, pack, turn
+from rawaug.camera.psnr_r import psnr_r
 from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
-from rawaug.commands.frame_denoisers import FrameDenoiser
 from rawaug.commands.submit import submit_sidd
 from rawaug.data import (
     SiddBenchmark,
@@ -28,8 +28,8 @@ from rawaug.data import (
 )
 from rawaug.data.mat import read_array
 from rawaug.data.sidd import HELD_BACK, PHONES, SiddBlocks, SiddFrames, SiddPlusBlocks, phone_of
-from rawaug.evaluation.psnr_r import psnr_r
-from rawaug.io import write_picture
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.io import RawFrame, write_picture
 from rawaug.io.pictures import view_of_orientation
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -233,11 +233,14 @@ def test_the_command_takes_published_levels_or_asks_for_them(blocks: Path, tmp_p
     write_levels(tmp_path, [f"{name}, {k}, 1e-4, {k}, 1e-4, {k}, 1e-4" for k, name in enumerate(HELD_BACK)])
     seen: list[tuple[float, float]] = []
 
-    def noted(packed: torch.Tensor, levels: tuple[float, float], cfa: CFA) -> torch.Tensor:
-        seen.append(levels)
-        return packed + (0.1 if cfa == CFA.GRBG else -2.0)
+    class Noted(RawDenoiser):
+        def frame(self, frame: RawFrame, levels: tuple[float, float] | None) -> torch.Tensor:
+            assert levels is not None
+            seen.append(levels)
+            return frame.mosaic + (0.1 if frame.cfa == CFA.GRBG else -2.0)
 
-    method, out = FrameDenoiser(noted, {}), str(tmp_path / "SubmitRaw.mat")
+    method = Noted(name="noted", model=lambda levels: lambda noisy, variance: noisy)
+    out = str(tmp_path / "SubmitRaw.mat")
     assert submit_sidd(str(tmp_path), out, method) == 1280
     assert [seen[32 * k] for k in (0, 7, 39)] == [(0.0, 1e-4), (7.0, 1e-4), (39.0, 1e-4)]
     written = check_submission(out, SIDE)

@@ -11,8 +11,10 @@ import torch.nn.functional as F
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
-from rawaug.evaluation.own_noise import OwnNoise, added_noise_note, own_noise_note, own_variances, with_own_noise
-from rawaug.evaluation.scores import score_method, summary
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.own_noise import Measured, added_noise_note, own_noise_note
+from rawaug.evaluation.scores import Row, score, summary
+from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
 
 SHOT, READ = 1e-4, 2e-6
@@ -35,34 +37,33 @@ def reference() -> Pair:
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_a_perfect_denoiser_is_left_with_the_references_own_noise(reference: Pair, factor: int) -> None:
     noise = noise_model((1e-2, 1e-4))
-    scored = Middles(Binned([reference], factor), 256)
-    found = own_variances([reference], scored, noise, factor=factor)
+    trial = trial_of(Middles(Binned(Measured([reference]), factor), 256)[0], noise)
     middle = Middles(Binned([replace(reference, raw=scene())], factor), 256)[0]
     truth = bayer.pack(middle.raw[None], CFA.GRBG)
-    scores = score_method(lambda *_: truth, scored, noise, CFA.GRBG, 0, "perfect")
-    result = with_own_noise(summary(scores), found)
+    result = summary(score([RawDenoiser.of(lambda noisy: truth)], [trial]))
     assert result["own_noise"] == result["images"][0]["own_noise"] == pytest.approx(1.0, rel=0.1)
     assert own_noise_note({"perfect": result}).startswith("own noise of the references as a share of")
     added = bayer.noise_variance(middle.raw, 1e-2, 1e-4).mean().item()
-    assert found["reference"].added == pytest.approx(added, rel=0.1)
+    assert trial.amount == pytest.approx(added, rel=0.1)
 
 
 def test_shares_are_of_the_squared_error() -> None:
-    images = [{"name": "a", "psnr": 40.0}, {"name": "b", "psnr": 30.0}, {"name": "unmeasured", "psnr": 10.0}]
-    found = {"a": OwnNoise(5e-5, 1e-2), "b": OwnNoise(1e-4, 1e-2)}
-    result = with_own_noise({"images": images}, found)
+    known = {"a": (40.0, 0.5), "b": (30.0, 0.1), "unmeasured": (10.0, None)}
+    result = summary(Row("mine", name, "", "", "raw", psnr, own_noise=own) for name, (psnr, own) in known.items())
     assert [image.get("own_noise") for image in result["images"]] == [pytest.approx(0.5), pytest.approx(0.1), None]
     assert result["own_noise"] == pytest.approx(1.5e-4 / 1.1e-3)
     assert ": mine 14%; " in own_noise_note({"mine": result, "theirs": {"own_noise": 0.09}, "none": {}})
-    assert own_noise_note({"theirs": {"own_noise": 0.09}}) == "" and "own_noise" not in with_own_noise(
-        {"images": []}, {}
-    )
+    assert own_noise_note({"theirs": {"own_noise": 0.09}}) == "" and "own_noise" not in summary([])
 
 
 def test_noise_as_weak_as_the_references_own_is_said() -> None:
     raw = torch.rand(1, 128, 128, generator=torch.Generator().manual_seed(0))
     texture = Pair("texture", torch.zeros(3, 128, 128, dtype=torch.uint8), raw, CFA.RGGB)
-    assert own_variances([texture], [texture], noise_model((1e-3, 1e-5))) == {}, "no flat regions, no figure"
-    assert added_noise_note({}) == added_noise_note({"a": OwnNoise(1e-5, 1e-3)}) == ""
-    said = added_noise_note({"a": OwnNoise(2e-5, 2e-5)})
+    assert Measured([texture])[0].own_noise is None, "no flat regions, no figure"
+
+    def trial(own: float, added: float) -> Trial:
+        return Trial(torch.zeros(1), torch.zeros(1), torch.full((1,), added), own=own)
+
+    assert added_noise_note([]) == added_noise_note([trial(1e-5, 1e-3)]) == ""
+    said = added_noise_note([trial(2e-5, 2e-5)])
     assert "100% of the variance" in said and "would score 47.0 dB" in said

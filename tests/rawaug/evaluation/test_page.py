@@ -18,7 +18,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
 from rawaug.evaluation.page import WINDOW, Page, draw_curves, most_detailed
-from rawaug.evaluation.tables import Row
+from rawaug.evaluation.scores import Panels
+from rawaug.evaluation.trials import raw_trial
 
 
 def scores(psnr: float) -> dict[str, Any]:
@@ -40,7 +41,8 @@ def page(tmp_path: Path) -> str:
     raw = torch.rand(1, 200, 800, generator=generator)
     pair = Pair("a <frame>", torch.zeros(3, 200, 800, dtype=torch.uint8), raw, CFA.GRBG, (2, 1, 1.6), torch.eye(3))
     packed = bayer.pack(raw[None], CFA.GRBG)
-    made.add_frame(Row(pair, {"noisy": packed, "real": packed, "clean": packed}, {"real": "40.12 dB"}), CFA.GRBG)
+    trial = raw_trial(pair, packed, packed, packed, None, CFA.GRBG)
+    made.add_frame(Panels(trial, {"noisy": packed, "real": packed, "clean": packed}, {"real": "40.12 dB"}))
     return made.write(tmp_path / "new" / "report.html", {"steps": 4}).read_text(encoding="utf-8")
 
 

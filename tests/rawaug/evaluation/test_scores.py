@@ -18,20 +18,11 @@ from rawaug.bayer import CFA
 from rawaug.cli import main
 from rawaug.commands.evaluate import run as evaluate
 from rawaug.data import Pair, demo_pairs
-from rawaug.data.pairs import Sample
-from rawaug.evaluation.scores import (
-    Score,
-    classical_method,
-    compared,
-    denoise,
-    frozen_levels,
-    frozen_sample,
-    installed_classical,
-    require_classical,
-    score_method,
-    summary,
-)
+from rawaug.denoise.denoiser import Noisy, RawDenoiser, require_classical
+from rawaug.evaluation.scores import NOISY, Row, compared, score, summary
 from rawaug.evaluation.tables import print_scores
+from rawaug.evaluation.trials import trial_of
+from rawaug.experiment.denoising import installed_classical
 from rawaug.io import write_picture
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -51,11 +42,11 @@ def test_the_noise_map_of_a_test_is_that_of_the_noisy_frame() -> None:
     assert captured.shot_var is not None and captured.read_var is not None
     drawn = replace(captured, noisy=None, shot_var=None, read_var=None)
     for pair, levels in ((captured, (captured.shot_var, captured.read_var)), (drawn, (1e-2, 1e-4))):
-        sample = frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=0)
+        sample = trial_of(pair, noise_model((1e-2, 1e-4)))
         assert not torch.equal(sample.noisy, sample.clean) and sample.noisy.min() < 0
         expected = levels[0] * sample.noisy.clamp_min(0.0) + levels[1]
         torch.testing.assert_close(sample.variance, expected, rtol=1e-4, atol=1e-8)
-        again, other = (frozen_sample(pair, noise_model((1e-2, 1e-4)), pair.cfa, seed=k).noisy for k in (0, 1))
+        again, other = (trial_of(pair, noise_model((1e-2, 1e-4)), seed=k).noisy for k in (0, 1))
         assert torch.equal(sample.noisy, again) and torch.equal(again, other) == (pair is captured)
 
 
@@ -63,9 +54,8 @@ def test_scores_whose_levels_came_from_the_clean_frame_are_marked(capsys: pytest
     pair = demo_pairs("test", count=1)[0].middle(64)
     measured = replace(pair, name="measured", shot_var=None, read_var=None)  # so that they are measured
     noise = noise_model((1e-2, 1e-4))
-    pairs = [pair, measured]
-    scored = score_method(lambda _, sample: sample.noisy * 0.99, pairs, noise, pair.cfa, 0, "marked")
-    result = summary(scored)
+    trials = [trial_of(frame, noise) for frame in (pair, measured)]
+    result = summary(score([RawDenoiser.of(lambda noisy: noisy * 0.99)], trials))
     assert result["levels_from_clean"] == 1
     assert [image.get("levels_from_clean") for image in result["images"]] == [None, True]
     print_scores({"kind": "denoiser", "data": "demo", **result})
@@ -124,10 +114,11 @@ def test_a_capture_without_levels_is_the_test_case_and_its_levels_are_measured()
     pair = demo_pairs("test", count=1)[0]
     assert pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None
     bare, noise = replace(pair, shot_var=None, read_var=None), noise_model("cycleisp_sidd")
-    with_levels, measured = (frozen_sample(p, noise, pair.cfa, seed=0) for p in (pair, bare))
+    with_levels, measured = (trial_of(p, noise) for p in (pair, bare))
+    assert measured.variance is not None and with_levels.variance is not None
     assert torch.equal(measured.noisy, with_levels.noisy)
     assert (measured.variance / with_levels.variance).mean() == pytest.approx(1.0, abs=0.1)
-    levels = frozen_levels(bare, noise, seed=0)
+    levels = measured.levels
     assert levels is not None
     y = pair.raw.mean().item()
     assert levels[0] * y + levels[1] == pytest.approx(pair.shot_var * y + pair.read_var, rel=0.1)
@@ -146,16 +137,17 @@ def test_classical_denoisers_stand_beside_it(identity: Path, given: list[Pair]) 
 def test_noise_of_another_kind_is_scored_without_stabilisation() -> None:
     pair = replace(demo_pairs("test", count=1)[0], noisy=None, shot_var=None, read_var=None)
     noise = noise_model((0.0, 1e-3))
-    (scored,) = score_method(classical_method("Wavelet", noise, 0), [pair], noise, pair.cfa, 0, "Wavelet")
-    assert scored.psnr > (scored.psnr_noisy or 99.0) + 3.0
+    noisy, denoised = score([NOISY, RawDenoiser.of("Wavelet")], [trial_of(pair, noise)])
+    assert denoised.psnr > noisy.psnr + 3.0
 
 
 def test_the_development_is_the_same_for_both() -> None:
     """Halving clean and result alike changes nothing after development, since the exposure is the clean frame's."""
     pair = demo_pairs("test", count=1)[0]
-    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
-    whole = compared(sample.noisy, sample.clean, pair.cfa, pair)
-    half = compared(sample.noisy / 2, sample.clean / 2, pair.cfa, pair)
+    trial = trial_of(pair, noise_model("cycleisp_sidd"))
+    whole = compared(trial.noisy, trial)
+    dark = replace(trial_of(replace(pair, raw=pair.raw / 2), noise_model((0.0, 0.0))), noisy=trial.noisy / 2)
+    half = compared(dark.noisy, dark)
     assert half[2:] == pytest.approx(whole[2:], rel=1e-4) and half[0] == pytest.approx(whole[0] + 6.02, abs=0.01)
 
 
@@ -163,9 +155,10 @@ def test_progress_within_a_frame(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setenv("RAWAUG_PROGRESS_SECONDS", "0")
     packed = torch.rand(1, 4, 4, 2000, generator=torch.Generator().manual_seed(0))
     model = denoisers.build("UNet", width=4, scales=2)
-    assert torch.equal(denoise(model, Sample(packed, packed, packed), CFA.GRBG, 1), packed)
+    denoiser = RawDenoiser.of(model, cfa=CFA.GRBG)
+    assert torch.equal(denoiser(Noisy(packed, packed, cfa=CFA.GRBG)), packed)
     assert "frame: 1/2 tiles, 00:00 elapsed" in capsys.readouterr().err
-    denoise(model, Sample(*(packed[..., :8] for _ in range(3))), CFA.GRBG, 8)
+    replace(denoiser, views=8)(Noisy(packed[..., :8], packed[..., :8], cfa=CFA.GRBG))
     assert "view groups, " in capsys.readouterr().err
 
 
@@ -198,12 +191,13 @@ def crops(tmp_path: Path) -> Path:
 def test_a_score_that_is_no_number_is_named_and_left_out_of_the_mean(
     identity: Path, crops: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scores = [Score("a", 30.0, 0.5), Score("b", float("inf"), 0.7), Score("c", 20.0, float("nan"))]
-    result = summary(scores)
+    scores = {"a": (30.0, 0.5), "b": (float("inf"), 0.7), "c": (20.0, float("nan"))}
+    rows = [Row("mine", name, "", "", "raw", *both) for name, both in scores.items()]
+    result = summary(rows)
     assert result["psnr"] == 25.0 and result["ssim"] == pytest.approx(0.6)
     assert [set(image) for image in result["images"]] == [{"name", "psnr", "ssim"}, {"name", "ssim"}, {"name", "psnr"}]
     assert result["no_numbers"] == ["b: psnr is inf", "c: ssim is nan"]
-    assert "no_numbers" not in summary(scores[:1])
+    assert "no_numbers" not in summary(rows[:1])
     figures = crops / "scores.json"
     arguments = ["evaluate", str(identity), "--data", f"rawir:{crops}", "--noise", "[0, 0]", "--json", str(figures)]
     assert main(arguments) == 2  # nothing to denoise: the frames are equal

@@ -16,7 +16,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data import demo_pictures
 from rawaug.data.pairs import Pair
-from rawaug.experiment.demosaicing import JointRecipe, Scene, demosaiced, frozen_mosaic, full_colour, run
+from rawaug.evaluation.scores import compared
+from rawaug.experiment.demosaicing import JointRecipe, demosaiced, full_colour, rgb_trial, run
 from rawaug.experiment.denoising import run as train_denoiser
 from rawaug.experiment.plan import planned
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
@@ -62,7 +63,8 @@ def test_the_truth_of_a_grey_scene_is_grey(cfa: CFA, factor: int) -> None:
 
 
 def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
-    one, again, other = (frozen_mosaic(a_pair(name=name), NOISE) for name in ("a", "a", "b"))
+    one, again, other = (rgb_trial(a_pair(name=name), NOISE) for name in ("a", "a", "b"))
+    assert one.variance is not None
     assert torch.equal(one.noisy, again.noisy) and not torch.equal(one.noisy, other.noisy)
     relative = (one.noisy - bayer.pack_rgb(one.clean, CFA.RGGB)) / one.variance.sqrt()
     assert relative.std().item() == pytest.approx(1.0, abs=0.03)
@@ -71,11 +73,11 @@ def test_noise_is_on_the_mosaic_of_the_truth_and_the_same_every_time() -> None:
 @pytest.mark.parametrize("method", ["malvar", "VNG", "PPG", "AHD", "DCB", "DHT", "AAHD"])
 def test_what_is_smooth_is_demosaiced_to_itself(method: str) -> None:
     """LibRaw's result is in the same units, though it works on balanced RAW: red and blue are twice as bright there."""
-    scene = Scene(a_pair(), NOISE)
-    rgb = demosaiced(bayer.pack_rgb(scene.sample.clean, CFA.RGGB), scene.pair, method)
-    error = (rgb - scene.sample.clean)[..., 6:-6, 6:-6].abs().amax(dim=(0, 2, 3))
+    trial = rgb_trial(a_pair(), NOISE)
+    rgb = demosaiced(bayer.pack_rgb(trial.clean, CFA.RGGB), a_pair(), method)
+    error = (rgb - trial.clean)[..., 6:-6, 6:-6].abs().amax(dim=(0, 2, 3))
     assert error.max() < 4e-3, error
-    assert scene.score(rgb).psnr > scene.score(rgb + 0.01).psnr > 35
+    assert compared(rgb, trial)[0] > compared(rgb + 0.01, trial)[0] > 35
 
 
 def small(folder: Path, **changes: Any) -> JointRecipe:
@@ -120,7 +122,8 @@ def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:
 
 
 def test_developed_truth_and_result_share_exposure_and_colours() -> None:
-    scene = Scene(a_pair(), NOISE)
-    shown: list[Tensor] = [scene.develop(x) for x in (scene.sample.noisy, scene.sample.clean)]
+    trial = rgb_trial(a_pair(), NOISE)
+    assert trial.develop is not None
+    shown: list[Tensor] = [trial.develop(x) for x in (trial.noisy, trial.clean)]
     assert shown[0].shape == (3, 48, 64) and shown[1].shape == (3, 96, 128)
     assert abs(shown[0].mean() - shown[1].mean()) < 0.02

@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from rawaug.bayer import pack
 from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.contestants import Contestant
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import results, score
+from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.experiment.srgb import Shot, SrgbRecipe, best_filter, developed, filtered, key_of, raw_way, scored, shots_of
+from rawaug.experiment.srgb import SrgbRecipe, best_filter, developed, filtered, srgb_trials
 from rawaug.metrics import psnr
 from rawaug.training.config import DenoiserConfig
 
@@ -33,8 +36,9 @@ def pairs() -> list[Pair]:
 
 
 @pytest.fixture(scope="module")
-def shots(pairs: list[Pair]) -> dict[tuple[float, float], list[Shot]]:
-    return shots_of(pairs, LEVELS, "test")
+def trials(pairs: list[Pair]) -> list[Trial]:
+    """Both frames, each at the weak and at the strong level."""
+    return srgb_trials(pairs, LEVELS, "test")
 
 
 def test_libraw_develops_grey_to_grey_by_its_own_curve(pairs: list[Pair]) -> None:
@@ -48,33 +52,35 @@ def test_libraw_develops_grey_to_grey_by_its_own_curve(pairs: list[Pair]) -> Non
     assert not developed(mosaic - 0.5, pair).any(), "below black is black"
 
 
-def test_noise_is_that_of_the_level_the_same_for_all(shots: dict[tuple[float, float], list[Shot]]) -> None:
-    weak, strong = (found[0] for found in shots.values())
+def test_noise_is_that_of_the_level_the_same_for_all(trials: list[Trial], pairs: list[Pair]) -> None:
+    weak, strong, *_ = trials
     assert psnr(weak.noisy, weak.clean) > 55 and torch.equal(weak.clean, strong.clean)
-    noise = strong.raw.noisy - strong.raw.clean
-    told = strong.raw.variance.mean().item()
-    assert noise[strong.raw.clean < 0.9].var().item() == pytest.approx(told, rel=0.05)
-    again = shots_of([strong.pair], LEVELS[1:], "again")[LEVELS[1]][0]
+    assert strong.raw is not None and strong.raw.variance is not None
+    clean = pack(pairs[0].raw[None], pairs[0].cfa)
+    noise, told = strong.raw.image - clean, strong.raw.variance.mean().item()
+    assert noise[clean < 0.9].var().item() == pytest.approx(told, rel=0.05)
+    (again,) = srgb_trials(pairs[:1], LEVELS[1:], "again")
     assert torch.equal(again.noisy, strong.noisy)
 
 
-def test_a_raw_denoiser_is_developed_after(shots: dict[tuple[float, float], list[Shot]]) -> None:
-    def brighter(by: float) -> Contestant:
-        return Contestant("brighter", lambda noisy, variance, cfa: noisy + by)
+def test_a_raw_denoiser_is_developed_after(trials: list[Trial]) -> None:
+    def brighter(by: float) -> torch.Tensor:
+        denoiser = RawDenoiser.of(lambda noisy: noisy + by, name="brighter")
+        ((name, image),) = results(denoiser.name, denoiser(trials[1].given_to(denoiser)), trials[1])
+        assert name == "brighter, then LibRaw"
+        return image
 
-    shot = shots[LEVELS[1]][0]
-    assert torch.equal(raw_way(brighter(0.0))(shot), shot.noisy)
-    assert raw_way(brighter(0.1))(shot).mean() > shot.noisy.mean() + 0.02
+    assert torch.equal(brighter(0.0), trials[1].noisy)
+    assert brighter(0.1).mean() > trials[1].noisy.mean() + 0.02
 
 
-def test_the_filter_is_as_strong_as_the_noise_of_its_shots(shots: dict[tuple[float, float], list[Shot]]) -> None:
-    weak, strong = shots.values()
-    spec = "NonLocalMeans"
-    chosen = scored(best_filter(spec, strong), {LEVELS[1]: strong}, "chosen")[key_of(LEVELS[1])]
+def test_the_filter_is_as_strong_as_the_noise_of_its_shots(trials: list[Trial]) -> None:
+    weak, strong, spec = trials[::2], trials[1::2], "NonLocalMeans"
+    chosen = [row.psnr for row in score([best_filter(spec, strong)], strong)]
     for deviation in (0.01, 0.16):
-        assert scored(filtered(spec, deviation), {LEVELS[1]: strong}, "")[key_of(LEVELS[1])]["psnr"] < chosen["psnr"]
+        assert sum(row.psnr for row in score([filtered(spec, deviation)], strong)) < sum(chosen)
     gentle = best_filter(spec, weak)
-    assert torch.equal(gentle(weak[0]), filtered(spec, 0.01)(weak[0]))
+    assert torch.equal(gentle(weak[0].given), filtered(spec, 0.01)(weak[0].given))
 
 
 @pytest.mark.usefixtures("tiny")

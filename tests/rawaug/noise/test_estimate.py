@@ -16,6 +16,7 @@ from torch.nn.functional import interpolate
 
 from rawaug.bayer import CFA, binned_variance, unpack
 from rawaug.data import Binned, Pair
+from rawaug.evaluation.own_noise import Measured
 from rawaug.noise import (
     DefectPixels,
     FixedLevels,
@@ -230,11 +231,11 @@ def reference(truth: Tensor) -> Pair:
 @pytest.mark.parametrize(("factor", "together"), [(1, False), (4, False), (4, True)])
 def test_the_share_of_a_known_own_noise_is_found(factor: int, together: bool) -> None:
     truth = patches()
-    pairs = Binned([reference(truth)], factor, together)
+    pairs = Binned(Measured([reference(truth)]), factor, together)
     clean = Pair("truth", pairs.pairs[0].srgb, truth, CFA.GRBG).binned(factor, together).raw
     denoised = clean + 3e-3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     error = (denoised - pairs[0].raw).square().mean().item()
-    levels = own_noise(pairs, 0)
+    levels = pairs[0].own_noise
     assert levels is not None
     known = (clean - pairs[0].raw).square().mean().item() / error
     assert 0.05 < known < 0.95 and own_noise_share(levels, pairs[0].raw, error) == pytest.approx(known, rel=0.1)
@@ -242,7 +243,7 @@ def test_the_share_of_a_known_own_noise_is_found(factor: int, together: bool) ->
 
 def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> None:
     small = reference(patches(64, 64))
-    assert own_noise([small], 0) is None
+    assert own_noise(small.raw, small.cfa) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
     for together, left in ((False, binned_variance(4)), (True, binned_variance(4, together=True))):
-        assert own_noise(Binned([stated], 4, together), 0) == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
+        assert Binned(Measured([stated]), 4, together)[0].own_noise == pytest.approx((3.2e-5 * left, 1.6e-7 * left))

@@ -14,7 +14,7 @@ from torch import Tensor
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Pair
-from rawaug.evaluation.scores import score_method
+from rawaug.evaluation.trials import trial_of
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
@@ -50,16 +50,16 @@ def test_crops_keep_the_pattern_in_every_turn(cfa: CFA) -> None:
 
 
 @pytest.fixture
-def scores(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callable[..., Pair]) -> list[list[Pair]]:
-    """The test frames of each call of :func:`psnr_d`, two small ones; one is measured whole and one in part."""
-    seen: list[list[Pair]] = []
+def scored(monkeypatch: pytest.MonkeyPatch, given: list[Pair], frame_of: Callable[..., Pair]) -> list[Pair]:
+    """The test frames of :func:`psnr_d`, two small ones a call; one is measured whole and one in part."""
+    seen: list[Pair] = []
 
-    def score(method: Any, frames: list[Pair], *rest: Any) -> Any:
-        seen.append(frames)
-        return score_method(method, frames, *rest)
+    def trial(pair: Pair, *rest: Any) -> Any:
+        seen.append(pair)
+        return trial_of(pair, *rest)
 
     given.extend([frame_of("small", size=(64, 64)), frame_of("large", size=(96, 130))])
-    monkeypatch.setattr(downstream, "score_method", score)
+    monkeypatch.setattr(downstream, "trial_of", trial)
     return seen
 
 
@@ -72,7 +72,7 @@ MODELS: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("family", list(MODELS))
-def test_psnr_d_depends_on_the_seed_alone(family: str, scores: list[list[Pair]], tmp_path: Path) -> None:
+def test_psnr_d_depends_on_the_seed_alone(family: str, scored: list[Pair], tmp_path: Path) -> None:
     torch.manual_seed(0)
     once = psnr_d(MODELS[family](), PICTURES, TINY, tmp_path / "a", 3)
     log = tmp_path / "a" / "seed3" / "log.csv"
@@ -88,10 +88,10 @@ def test_psnr_d_depends_on_the_seed_alone(family: str, scores: list[list[Pair]],
     assert 5.0 < once < 60.0
 
 
-def test_the_piece_at_the_centre_is_scored_in_its_pattern(scores: list[list[Pair]], tmp_path: Path) -> None:
+def test_the_piece_at_the_centre_is_scored_in_its_pattern(scored: list[Pair], tmp_path: Path) -> None:
     for side in (None, 66):
         psnr_d(MODELS["upi"](), PICTURES, replace(TINY, test_crop=side), tmp_path, 0)
-    (small, large), (same, piece) = scores
+    small, large, same, piece = scored
     assert torch.equal(same.raw, small.raw) and piece.raw.shape == (1, 66, 66) and piece.srgb.shape == (3, 66, 66)
     assert piece.cfa == large.cfa
     assert torch.equal(piece.raw, large.raw[:, 14:80, 32:98]) and torch.equal(piece.srgb, large.srgb[:, 14:80, 32:98])

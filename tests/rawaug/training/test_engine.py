@@ -30,7 +30,7 @@ from rawaug.training.estimators import Noisier, Neighbor2Neighbor
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.stream import TrainingStream
 from rawaug.training.loop import train
-from rawaug.training.validation import Watched
+from rawaug.evaluation.trials import Trial
 
 generator = torch.Generator().manual_seed(0)
 frame = NoisyFrame("frame", torch.rand(1, 64, 64, generator=generator), 1e-3, 1e-4, CFA.RGGB)
@@ -39,7 +39,7 @@ config = TrainConfig(
     learning_rate=3e-3,
 )
 network = DenoiserConfig("UNet", {"width": 4, "scales": 2})
-watched = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
+watched = [Trial(*sample) for sample in held_out([frame], CFA.RGGB)]
 for name in names:
     estimator = {"noisier": Noisier(1.0, correct=True), "neighbor2neighbor": Neighbor2Neighbor()}[name]
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)

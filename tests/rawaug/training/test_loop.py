@@ -16,7 +16,7 @@ import torch
 
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import frozen_sample
+from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
 from rawaug.training import loop
 from rawaug.training.config import DenoiserConfig, TrainConfig
@@ -24,7 +24,6 @@ from rawaug.training.estimators import Supervised
 from rawaug.training.loop import Journal
 from rawaug.training.state import TrainingState, first_network, learning_rate_factor
 from rawaug.training.stream import RealCrops, TrainingStream
-from rawaug.training.validation import Watched
 
 NETWORK = DenoiserConfig("UNet", {"width": 4, "scales": 3, "deviation": True})
 CONFIG = TrainConfig(steps=12, batch=2, crop=32, validate_every=6, checkpoint_every=5, learning_rate=3e-3, warmup=2)
@@ -37,9 +36,9 @@ def stream() -> TrainingStream:
 
 
 @pytest.fixture(scope="module")
-def validation() -> list[Watched]:
+def validation() -> list[Trial]:
     pair = demo_pairs("validation", count=1)[0]
-    return [Watched(*frozen_sample(pair, noise_model("cycleisp_sidd"), CFA.GRBG, seed=0))]
+    return [replace(trial_of(pair, noise_model("cycleisp_sidd"), CFA.GRBG), develop=None)]
 
 
 @pytest.fixture
@@ -77,7 +76,7 @@ class Dying(Supervised):
 
 
 def test_the_best_weights_survive_a_kill_after_which_scores_fall(
-    stream: TrainingStream, validation: list[Watched], tmp_path: Path, scored: Callable[..., Any]
+    stream: TrainingStream, validation: list[Trial], tmp_path: Path, scored: Callable[..., Any]
 ) -> None:
     seen = scored(30.0, 40.0, 20.0, 10.0)
     config = replace(CONFIG, steps=8, validate_every=2, checkpoint_every=4)
@@ -88,7 +87,7 @@ def test_the_best_weights_survive_a_kill_after_which_scores_fall(
 
 
 def test_a_checkpoint_of_other_settings_is_not_resumed_and_a_damaged_one_is_named(
-    stream: TrainingStream, validation: list[Watched], tmp_path: Path
+    stream: TrainingStream, validation: list[Trial], tmp_path: Path
 ) -> None:
     config = replace(CONFIG, steps=5, validate_every=5)
     first, again, other = (
@@ -119,7 +118,7 @@ def test_the_average_warms_up(steps: int) -> None:
 
 
 def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
-    stream: TrainingStream, validation: list[Watched], tmp_path: Path
+    stream: TrainingStream, validation: list[Trial], tmp_path: Path
 ) -> None:
     losses = []
 
@@ -142,14 +141,14 @@ def test_the_log_has_the_mean_loss_since_the_row_before_and_the_rate(
 
 @pytest.mark.parametrize("choose", [True, False])
 def test_the_best_weights_are_kept_or_the_last(
-    choose: bool, stream: TrainingStream, validation: list[Watched], tmp_path: Path, scored: Callable[..., Any]
+    choose: bool, stream: TrainingStream, validation: list[Trial], tmp_path: Path, scored: Callable[..., Any]
 ) -> None:
     seen = scored(40.0, 30.0)
     kept = loop.train(stream, validation, NETWORK, CONFIG, tmp_path, device="cpu", choose=choose).state_dict()
     assert all(torch.equal(kept[key], value) for key, value in seen[0 if choose else 1].items())
 
 
-def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Watched], tmp_path: Path) -> None:
+def test_a_diverged_training_says_so(stream: TrainingStream, validation: list[Trial], tmp_path: Path) -> None:
     config = replace(CONFIG, learning_rate=1e9, clip_norm=0.0, warmup=0)
     with pytest.raises(ValueError, match="diverged"):
         loop.train(stream, validation, NETWORK, config, tmp_path, device="cpu")
@@ -192,7 +191,7 @@ def test_the_rate_warms_up_and_falls() -> None:
     assert [learning_rate_factor(step, config) for step in range(8)] == [0.5, 1, 1, 0.5, 0.5, 0.5, 0.25, 0.25]
 
 
-def test_tensorboard_has_the_rate_and_crops_of_this_run_alone(tmp_path: Path, validation: list[Watched]) -> None:
+def test_tensorboard_has_the_rate_and_crops_of_this_run_alone(tmp_path: Path, validation: list[Trial]) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     class Nothing(torch.nn.Module):

@@ -13,6 +13,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs
 from rawaug.data.pairs import Pair
+from rawaug.evaluation.trials import Trial
 from rawaug.experiment.arms import frames_of, training_stream, validation_samples
 from rawaug.experiment.recipe import ArmConfig, DataConfig, Recipe
 from rawaug.isp.model import DictionaryISP
@@ -32,7 +33,7 @@ from rawaug.training.noisy_frames import (
     signal_estimate,
 )
 from rawaug.training.stream import TrainingStream
-from rawaug.training.validation import Watched, validate
+from rawaug.training.validation import validate
 
 LEVELS = (0.01, 1e-3)
 
@@ -103,7 +104,7 @@ def test_a_self_supervised_recipe_never_meets_a_clean_frame(pictures: list[torch
         stream = training_stream(recipe, recipe.arms["r2r"], frames, pictures, isp, noise, seed=0)
         watched = validation_samples(recipe, frames, pictures, isp, noise)
         assert watched[0].develop is None
-        return [*stream[0], *stream[1], *watched[0][:3]]
+        return [*stream[0], *stream[1], watched[0].noisy, watched[0].clean, watched[0].variance]
 
     assert all(torch.equal(a, b) for a, b in zip(seen(pairs), seen(spoilt), strict=True))
 
@@ -192,10 +193,10 @@ def test_each_estimator_learns_to_denoise_from_one_noisy_frame(estimator: SelfSu
     stream = TrainingStream(NoisyCrops([frame], estimator, 32, CFA.RGGB), None, 4, 0.0, seed=0)
     config = TrainConfig(steps=80, batch=4, crop=32, learning_rate=5e-3, warmup=5, loss="l2", ema=0.9)
     network = DenoiserConfig("UNet", {"width": 8, "scales": 2})
-    frames = [Watched(*sample) for sample in held_out([frame], CFA.RGGB)]
+    frames = [Trial(*sample) for sample in held_out([frame], CFA.RGGB)]
     net = train(stream, frames, network, config, tmp_path, device="cpu", estimator=estimator)
     packed, unseen = (bayer.pack(image[None], CFA.RGGB) for image in (clean[2:], shots[2:]))
-    sample = Watched(unseen, packed, noise_variance(unseen, 0.01, 1e-3))
+    sample = Trial(unseen, packed, noise_variance(unseen, 0.01, 1e-3))
     assert validate(net, [sample], torch.device("cpu"))["psnr"] > float(psnr(unseen, packed)) + 1.0
 
 

@@ -10,7 +10,8 @@ import torch
 import denoisers
 from rawaug.bayer import CFA
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import denoise, frozen_sample
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.trials import trial_of
 from rawaug.experiment.arms import in_pattern
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
@@ -73,10 +74,10 @@ def test_a_mosaic_of_another_pattern_is_denoised_in_the_network_s_own() -> None:
             return noisy * torch.tensor([2.0, 3.0, 5.0, 7.0]).reshape(1, 4, 1, 1)
 
     pair = demo_pairs("test", count=1)[0]
-    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
+    trial = trial_of(pair, noise_model("cycleisp_sidd"))
     for own in CFA:
-        denoised = denoise(Red(width=4, scales=2), sample, pair.cfa, 1, own)
+        denoised = RawDenoiser.of(Red(width=4, scales=2), cfa=own)(trial.given)
         # The two greens may exchange their names where the pattern moves by a line.
-        ratio = denoised.sum((0, 2, 3)) / sample.noisy.sum((0, 2, 3))
+        ratio = denoised.sum((0, 2, 3)) / trial.noisy.sum((0, 2, 3))
         assert ratio[[0, 3]].tolist() == pytest.approx([2.0, 7.0], rel=1e-4)
         assert sorted(ratio[1:3].tolist()) == pytest.approx([3.0, 5.0], rel=1e-4)

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from rawaug.data import demo_pairs
-from rawaug.evaluation.scores import compared, frozen_sample
+from rawaug.evaluation.scores import compared
+from rawaug.evaluation.trials import Trial, trial_of
 from rawaug.noise import noise_model
-from rawaug.training.validation import Watched, panels, validate, watched
+from rawaug.training.validation import panels, validate
 
 CPU = torch.device("cpu")
 
@@ -24,7 +25,7 @@ class Nothing(torch.nn.Module):
 def test_thirds_by_noise_whatever_the_order() -> None:
     clean = torch.full((1, 4, 8, 8), 0.5)
     errors = [0.1, 0.001, 0.01, 0.1, 0.001, 0.01, 0.01]
-    frames = [Watched(clean + error, clean, torch.full_like(clean, error**2)) for error in errors]
+    frames = [Trial(clean + error, clean, torch.full_like(clean, error**2)) for error in errors]
     scores = validate(Nothing(), frames, CPU)
     assert set(scores) == {"psnr", "psnr_low", "psnr_middle", "psnr_high"}
     assert scores["psnr_low"] == pytest.approx(60.0, abs=0.01) and scores["psnr_middle"] == pytest.approx(
@@ -44,13 +45,13 @@ class Doubled(torch.nn.Module):
 
 def test_full_colour_is_shown_beside_the_raw_that_it_is_made_of() -> None:
     clean = torch.rand(1, 3, 200, 240, generator=torch.Generator().manual_seed(0))
-    shown = panels(Doubled(), Watched(torch.rand(1, 4, 100, 120), clean, torch.ones(1, 4, 100, 120)))
+    shown = panels(Doubled(), Trial(torch.rand(1, 4, 100, 120), clean, torch.ones(1, 4, 100, 120)))
     assert shown.shape == (3, 192, 3 * 192) and torch.equal(shown[..., 384:], clean[0, :, 4:196, 24:216])
 
 
 def test_srgb_is_that_of_the_evaluation() -> None:
     pair = demo_pairs("validation", count=1)[0]
-    sample = frozen_sample(pair, noise_model("cycleisp_sidd"), pair.cfa, seed=0)
-    scores = validate(Nothing(), [watched(sample, pair, pair.cfa)], CPU)
-    expected = compared(sample.noisy, sample.clean, pair.cfa, pair)
+    trial = trial_of(pair, noise_model("cycleisp_sidd"))
+    scores = validate(Nothing(), [trial], CPU)
+    expected = compared(trial.noisy, trial)
     assert (scores["psnr"], scores["psnr_srgb"]) == pytest.approx((expected[0], expected[2]), abs=1e-3)

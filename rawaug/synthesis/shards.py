@@ -24,10 +24,10 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.commands.pair_maker import Origin, PairMaker, Settings, noise_levels, replayed
 from rawaug.files import digest, parse_object, replacing, write_json
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.synthesis.maker import Origin, PairMaker, Settings, noise_levels, replayed
 
 PER_SHARD = 500
 """Pictures in a shard: of half a megapixel each, two gigabytes."""

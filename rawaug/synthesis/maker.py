@@ -1,19 +1,17 @@
 """The pairs of a picture: what every format of ``rawaug synth`` writes, and what they were made from.
 
-The draws of a pair depend on (seed, picture's name, number) alone. The settings that the files of an output folder were
-made with are kept in it, so that it never holds files of two settings.
+The draws of a pair depend on (seed, picture's name, number) alone.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from rawaug import __version__
-from rawaug.files import find_weights, sha256, write_json
+from rawaug.files import find_weights, sha256
 from rawaug.io import read_picture
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.plugin.augment import RawAugment
@@ -22,22 +20,6 @@ from rawaug.plugin.pictures import even_sided
 from rawaug.plugin.sampling_config import SamplingConfig, draw_key
 from rawaug.plugin.targets import Target
 from rawaug.registry import Spec
-
-
-def require_same_settings(path: Path, settings: dict[str, object], overwrite: bool = False) -> None:
-    """Write the settings of a folder's files to ``path``, or require that they equal those stored there."""
-    if path.is_file() and not overwrite:
-        try:
-            known = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: not valid JSON ({error.msg}); choose another folder") from None
-        for key in known | settings:
-            value, asked = known.get(key), settings.get(key)
-            if asked != value:
-                raise ValueError(f"{path}: made with {key} {value}, not {asked}; choose another folder")
-        return
-    write_json(settings, path)
-
 
 Format = Literal["dng", "npz", "tiff", "png", "webdataset"]
 TARGETS: dict[Format, tuple[Target, ...]] = {"dng": ("raw",), "png": ("srgb",)}

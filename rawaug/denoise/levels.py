@@ -1,46 +1,27 @@
-r"""What denoises a RAW frame, and the noise levels that it is told.
+r"""The noise levels that a denoiser is told of a frame: (shot_var, read_var), and where they are from.
 
-The levels come from the NoiseProfile tag, an estimate, a camera's law at the frame's ISO, or are given. A network takes
-packed RAW and its noise map shot_var max(y, 0) + read_var, a filter the same RAW with its noise made white
-(:class:`denoisers.Stabilised`). Both work in tiles, on the mosaic as the sensor gave it.
+They come from the NoiseProfile tag, an estimate, a camera's law at the frame's ISO, or are given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
-import denoisers
-from denoisers.classical import Stabilised
-from denoisers.files import DEFAULT, JOINT, find
-from rawaug import bayer
-from rawaug.bayer import CFA
-from rawaug.data.pairs import Sample
-from rawaug.evaluation.contestants import load_network
-from rawaug.evaluation.scores import counted, denoise, require_classical
-from rawaug.files import sha256
+from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.io import RawFrame
 from rawaug.isp.model import DictionaryISP
-from rawaug.kernels.runtime import fast_in_bfloat16, find_device
 from rawaug.noise import (
     EldLevels,
     FixedLevels,
     MeasuredLevels,
-    anscombe,
     camera_law,
     camera_names,
     estimate_noise,
     noise_levels,
 )
 from rawaug.noise.cameras import ProfileLevels
-from rawaug.registry import FILTERS, Spec
 from rawaug.seeding import keyed_generator
 
 Shots = Mapping[tuple[str, float | None], tuple[float, float]]
@@ -152,14 +133,14 @@ def _of_law(law: MeasuredLevels, frame: RawFrame) -> tuple[float, float]:
         raise UnknownNoise(f"{frame.name}: {error}; pass --noise estimate or {_GIVEN}") from None
 
 
-def stored_noise(noise: Noise, denoiser: str | Path) -> Noise:
+def stored_noise(noise: Noise, denoiser: RawDenoiser) -> Noise:
     """``"camera"`` as the law in the denoiser's file, an ISP's file as the law in it; anything else as it is."""
     if not isinstance(noise, str) or not (noise == "camera" or noise.endswith(".safetensors")):
         return noise
-    stored = load_network(find(denoiser))[1] if noise == "camera" else DictionaryISP.from_pretrained(noise).info
+    stored = denoiser.info if noise == "camera" else DictionaryISP.from_pretrained(noise).info
     law = stored.get("noise")
     if not isinstance(law, Mapping) or not ("shot_var" in law or law.get("name") == "MeasuredNoise"):
-        file = denoiser if noise == "camera" else noise
+        file = denoiser.name if noise == "camera" else noise
         raise ValueError(f"{file}: holds no camera's noise law; give an ISP's file that does, or --noise estimate")
     return camera_law(law)
 
@@ -168,77 +149,3 @@ def as_json(noise: Noise) -> Any:
     if isinstance(noise, MeasuredLevels):
         return noise.spec()
     return noise if isinstance(noise, str) else list(noise)
-
-
-FILTER_TILE, FILTER_OVERLAP = 512, 32
-"""Packed pixels; the filters look 8 pixels around, and BM3D 20."""
-
-
-@dataclass(frozen=True)
-class FrameDenoiser:
-    """Denoises the mosaic of a frame, given its noise levels.
-
-    ``run`` maps packed RAW ``(1, 4, h, w)``, its levels and its CFA to packed RAW, or to full colour if ``linear``;
-    ``settings`` is what the result depends on besides, as JSON; ``reads_levels`` says whether the levels are used.
-    """
-
-    run: Callable[[Tensor, tuple[float, float], CFA], Tensor]
-    settings: dict[str, Any]
-    reads_levels: bool = True
-    linear: bool = False
-
-    def __call__(self, frame: RawFrame, levels: tuple[float, float]) -> Tensor:
-        """float32 ``(1, H, W)``, of full colour ``(3, H, W)``, on the CPU, at most 1, not clipped at black."""
-        denoised = self.run(bayer.pack(frame.mosaic[None], frame.cfa), levels, frame.cfa)
-        image = denoised if self.linear else bayer.unpack(denoised, frame.cfa)
-        return image[0].clamp(max=1.0)
-
-
-def network_denoiser(weights: str | Path, self_ensemble: bool = False, device: str = "auto") -> FrameDenoiser:
-    """A trained network, by its file or the name of a shipped one."""
-    where, path = find_device(device), find(weights)
-    model, info = load_network(path)
-    model = model.to(where, memory_format=torch.channels_last)
-    own, views = CFA(info.get("cfa", "RGGB")), 8 if self_ensemble else 1
-
-    def run(packed: Tensor, levels: tuple[float, float], cfa: CFA) -> Tensor:
-        with torch.autocast(where.type, torch.bfloat16, enabled=model.mixed and fast_in_bfloat16(where)):
-            return denoise(model, Sample(packed, packed, bayer.noise_variance(packed, *levels)), cfa, views, own)
-
-    settings = {"denoiser_sha256": sha256(path), "self_ensemble": self_ensemble}
-    return FrameDenoiser(run, settings, model.reads_variance, model.upscale > 1)
-
-
-def filter_denoiser(spec: Spec) -> FrameDenoiser:
-    """A classical filter of :data:`rawaug.registry.FILTERS`, which needs no training."""
-    require_classical([spec])
-    stabilised = Stabilised(FILTERS.make(spec), anscombe)
-
-    def run(packed: Tensor, levels: tuple[float, float], _: CFA) -> Tensor:
-        tile = partial(stabilised, shot_var=levels[0], read_var=levels[1])
-        return denoisers.tiled(tile, packed, None, FILTER_TILE, FILTER_OVERLAP, counted("tile"))
-
-    return FrameDenoiser(run, {"classical": spec})
-
-
-def frame_denoiser(
-    denoiser: str | Path | None = None,
-    classical: Spec | None = None,
-    self_ensemble: bool = False,
-    device: str = "auto",
-    linear: bool = False,
-) -> FrameDenoiser:
-    """What denoises: the network, the classical filter, or the network that is taken where neither is named."""
-    if classical is not None:
-        if denoiser is not None or self_ensemble or linear:
-            raise ValueError(
-                "classical: a filter takes no --denoiser, --self-ensemble or --linear; give one or the other"
-            )
-        return filter_denoiser(classical)
-    name = denoiser or (JOINT if linear else DEFAULT)
-    network = network_denoiser(name, self_ensemble, device)
-    if network.linear and not linear:
-        raise ValueError(f"--denoiser {name}: demosaics too, to a linear DNG; add --linear")
-    if linear and not network.linear:
-        raise ValueError(f"--linear: {name} denoises the mosaic and does not demosaic; use {JOINT}")
-    return network

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.commands import pair_shards
-from rawaug.commands.synth import Synthesis, part_of, replay_sample, synth
 from rawaug.files import replacing
 from rawaug.io import write_picture
+from rawaug.synthesis import shards as pair_shards
+from rawaug.synthesis.folder import Synthesis, part_of, synth
+from rawaug.synthesis.shards import replay_sample
 
 FIXED = (2e-3, 1e-4)
 

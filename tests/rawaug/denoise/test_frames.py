@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 import denoisers
-from rawaug.bayer import CFA, mosaic, noise_variance, pack, unpack
+from rawaug.bayer import CFA, mosaic, pack, unpack
 from rawaug.cli import main
-from rawaug.commands.denoise import denoise_file, denoise_folder, run
-from rawaug.commands.frame_denoisers import frame_denoiser, levels_of
-from rawaug.data.pairs import Sample
-from rawaug.evaluation.scores import denoise
+from rawaug.commands.denoise import run
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoise.frames import denoise_file, denoise_folder
+from rawaug.denoise.levels import levels_of
 from rawaug.io import RawFrame, read_picture, read_raw, write_dng
 from rawaug.noise import noise_levels
 
@@ -73,8 +73,8 @@ def test_a_frame_of_any_pattern_becomes_cleaner_where_it_stands(
 ) -> None:
     frame = read_raw(shot(tmp_path / "a.dng", bayer_dng, own))
     model, packed = LocalMean(width=4, scales=2), pack(frame.mosaic[None], own)
-    sample = Sample(packed, packed, noise_variance(packed, *LEVELS))
-    denoised = unpack(denoise(model, sample, own, 8 if self_ensemble else 1, CFA.GRBG), own)[0]
+    denoiser = RawDenoiser.of(model, cfa=CFA.GRBG, views=8 if self_ensemble else 1)
+    denoised = unpack(denoiser(Noisy.told(packed, LEVELS, own)), own)[0]
     assert denoised.shape == frame.mosaic.shape
     clean = a_scene(own)
     inner = (..., slice(12, -12), slice(12, -12))
@@ -161,19 +161,19 @@ def test_a_strength_below_1_leaves_that_much_of_the_noise(
     tmp_path: Path, bayer_dng: Dng, adding: Callable[[float], Path]
 ) -> None:
     source, brighter = shot(tmp_path / "a.dng", bayer_dng), adding(0.1)
-    denoise_file(source, tmp_path / "b.dng", brighter, strength=0.75)
+    denoise_file(source, tmp_path / "b.dng", RawDenoiser.of(brighter, strength=0.75))
     before, after = read_raw(source), read_raw(tmp_path / "b.dng")
     assert (after.mosaic - before.mosaic).mean().item() == pytest.approx(0.075, abs=1e-4)
     assert after.noise_profile == pytest.approx((LEVELS[0] / 16, LEVELS[1] / 16))
-    denoise_file(source, tmp_path / "c.dng", brighter, strength=0.0)
+    denoise_file(source, tmp_path / "c.dng", RawDenoiser.of(brighter, strength=0.0))
     assert torch.equal(read_raw(tmp_path / "c.dng").mosaic, before.mosaic)
 
 
 def test_in_bfloat16_a_network_of_dense_convolutions_does_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, results = gradient(), []
     for fast in (False, True):
-        monkeypatch.setattr("rawaug.commands.frame_denoisers.fast_in_bfloat16", lambda device, fast=fast: fast)
-        results.append(frame_denoiser("rawaug-base", device="cpu")(frame, (1e-3, 1e-5)))
+        monkeypatch.setattr("rawaug.denoise.denoiser.fast_in_bfloat16", lambda device, fast=fast: fast)
+        results.append(RawDenoiser.of("rawaug-base", "cpu", "auto").frame(frame, (1e-3, 1e-5)))
     assert results[1].dtype == torch.float32 and not torch.equal(*results)
     assert (results[0] - results[1]).std() < 0.03 * (results[0] - frame.mosaic).std()
 
@@ -187,7 +187,7 @@ def test_a_filter_denoises_without_a_network(tmp_path: Path, bayer_dng: Dng) -> 
     assert after < before / 3
     frame = read_raw(source)
     white = dataclasses.replace(frame, mosaic=clean + 0.01 * torch.randn(clean.shape))
-    rest = (frame_denoiser(classical="TotalVariation")(white, (0.0, 1e-4)) - clean).square().mean()
+    rest = (RawDenoiser.of("TotalVariation").frame(white, (0.0, 1e-4)) - clean).square().mean()
     assert rest < 1e-4 / 2
 
 
@@ -215,12 +215,12 @@ def test_a_full_disk_ends_a_folder_in_one_line(
     for name in "abc":
         shot(source / f"{name}.dng", bayer_dng)
 
-    def write(path: Path, *rest: Any) -> None:
+    def write(path: Path, *rest: Any, **colours: Any) -> None:
         if path.stem != "a":
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
-        write_dng(path, *rest)
+        write_dng(path, *rest, **colours)
 
-    monkeypatch.setattr("rawaug.commands.denoise.write_dng", write)
+    monkeypatch.setattr("rawaug.denoise.frames.write_dng", write)
     assert main(["denoise", str(source), str(out), "--denoiser", str(identity)]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert "b.dng" in said[-1] and "No space left on device" in said[-1] and "c.dng" not in str(said)

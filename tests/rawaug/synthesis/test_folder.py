@@ -15,11 +15,11 @@ import torch
 from rawaug import DictionaryISP, ISPConfig, RawAugment
 from rawaug.bayer import pack
 from rawaug.cli import main
-from rawaug.commands.pair_files import camera_frames, replay
-from rawaug.commands.synth import synth
 from rawaug.files import replacing
 from rawaug.io import read_picture, read_raw, write_picture
 from rawaug.noise import estimate_noise
+from rawaug.synthesis.files import camera_frames, replay
+from rawaug.synthesis.folder import synth
 
 FIXED = (2e-3, 1e-4)
 
@@ -129,7 +129,7 @@ def test_a_killed_run_leaves_no_worker(tmp_path: Path, pictures: Path) -> None:
     many.mkdir()
     for k in range(20):
         (many / f"{k}.png").write_bytes((pictures / "a.png").read_bytes())
-    code = "import os; os.setsid(); from rawaug.commands.synth import synth; synth(many, out, workers=1)"
+    code = "import os; os.setsid(); from rawaug.synthesis.folder import synth; synth(many, out, workers=1)"
     process = multiprocessing.get_context("forkserver").Process(target=exec, args=(code, {"many": many, "out": out}))
     process.start()
     assert process.pid is not None

@@ -15,12 +15,14 @@ import torch
 from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.commands.frame_denoisers import levels_of, stored_noise
+from rawaug.camera.fit import fit
+from rawaug.camera.noise import measure_camera_noise
 from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoise.levels import levels_of, stored_noise
 from rawaug.io import RawFrame
 from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, camera_law, estimate_noise, noise_model
 from rawaug.plugin.augment import noise_for
-from rawaug.training.camera import fit, measure_camera_noise
 from rawaug.training.noisy_frames import noisy_frame
 
 SHOT_VAR, READ_VAR = 1e-3, 4e-5
@@ -89,7 +91,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
     assert noisy_pair.noisy is not None
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
-    monkeypatch.setattr("rawaug.training.camera.estimate_noise", estimate)
+    monkeypatch.setattr("rawaug.camera.noise.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair]).law.at(None)[0] == shot_var
     else:
@@ -141,7 +143,7 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
     law = MeasuredLevels([IsoLevel(100, 2e-4, 1e-6), IsoLevel(400, 8e-4, 1e-5)], "Maker Model")
     weights = tmp_path / "small.safetensors"
     save(build("PMRID", width=4, variance_map=True), weights, {"cfa": "RGGB", "noise": law.spec()})
-    stored = stored_noise("camera", weights)
+    stored = stored_noise("camera", RawDenoiser.of(weights))
     frame = RawFrame(
         noisy_pair.raw, CFA.GRBG, (0.0, 0.0, 0.0, 0.0), 4095.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), torch.eye(3),
         camera="Maker Model", iso=400, noise_profile=None, orientation=0, name="a",
@@ -152,4 +154,4 @@ def test_denoise_takes_the_law_at_the_files_iso(noisy_pair: Pair, tmp_path: Path
     with pytest.raises(ValueError, match=r"a: ISO 800 is outside the measured range .*pass --noise estimate"):
         levels_of(replace(frame, iso=800), stored)
     with pytest.raises(ValueError, match="rawaug-small: holds no camera's noise law"):
-        stored_noise("camera", "rawaug-small")
+        stored_noise("camera", RawDenoiser.of("rawaug-small"))

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rawaug.commands.pair_maker import Format, Origin, PairMaker, noise_levels, replayed
 from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, read_header, replacing, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
@@ -27,6 +26,7 @@ from rawaug.io.pictures import encode_png
 from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
+from rawaug.synthesis.maker import Format, Origin, PairMaker, noise_levels, replayed
 
 LONGEST_STEM = 200
 """Bytes of a picture's name in those of its pairs, which have at most 255."""

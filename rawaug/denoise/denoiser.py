@@ -1,0 +1,335 @@
+r"""What makes clean RAW of noisy RAW, whatever it is made of, and the one place where its name is looked up.
+
+    d = f(y, v),    v = shot_var max(y, 0) + read_var,    result = y + s (d - y)
+
+:class:`RawDenoiser` holds what is the same for a network, an ONNX file, a filter and a function f: tiles, the CFA that
+f was trained for, the self-ensemble, device and precision, the strength s. A mosaic of another pattern than f's is
+continued by a mirrored line on the sides where the patterns differ, and the result is cropped.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+import denoisers
+from denoisers.classical import Stabilised
+from denoisers.files import find, shipped
+from denoisers.network import PACKED
+from rawaug import bayer
+from rawaug.bayer import CFA, aligned, noise_variance
+from rawaug.denoise.onnx import STRIDE, OnnxNetwork
+from rawaug.denoise.published import AGAIN, BiasFreeDnCNN, published_pmrid
+from rawaug.files import read_header, read_tensors, sha256
+from rawaug.io import RawFrame
+from rawaug.kernels.runtime import fast_in_bfloat16, find_device
+from rawaug.noise import anscombe
+from rawaug.progress import progress
+from rawaug.registry import DENOISERS, FILTERS, Spec, label_of, name_and_settings, nearest
+
+Levels = tuple[float, float]
+"""(shot_var, read_var)."""
+Model = Callable[[Tensor, Tensor | None], Tensor]
+"""``model(noisy, variance) -> denoised``, ``(B, 4, h, w)``; its ``stride`` and ``upscale``, if any, are heeded."""
+CPU = torch.device("cpu")
+FILTER_TILES = (512, 32)
+"""Side and overlap in packed pixels; the filters look 8 pixels around, and BM3D 20."""
+
+
+class Noisy(NamedTuple):
+    """What a denoiser is given: an image, and what it may know of its noise.
+
+    Attributes:
+        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; or developed sRGB ``(1, 3, H, W)``.
+        variance: of the noise of each value, shape of ``image``; None where it is not known.
+        levels: (shot_var, read_var) where the variance is ``shot_var max(image, 0) + read_var``.
+        cfa: the pattern of packed RAW.
+    """
+
+    image: Tensor
+    variance: Tensor | None = None
+    levels: Levels | None = None
+    cfa: CFA = CFA.RGGB
+
+    @classmethod
+    def told(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
+        """Packed RAW ``(1, 4, h, w)`` with the variance of these levels."""
+        return cls(image, noise_variance(image, *levels), levels, CFA(cfa))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawDenoiser:
+    """Anything that denoises RAW; made by :meth:`of`, and changed by :func:`dataclasses.replace`.
+
+    Attributes:
+        name: in tables.
+        model: what denoises a piece of packed RAW once the levels, or None, are given: ``model(levels) -> f``.
+        cfa: the pattern that it was trained for; None if it works on any.
+        info: what its file says of it.
+        reads_levels: whether noise levels make a difference.
+        upscale: 2 if it demosaics as well: the result is linear camera RGB ``(1, 3, 2h, 2w)``.
+        tiles: side and overlap of the pieces, in packed pixels, None being the default of :func:`denoisers.tiled`;
+            None alone denoises a frame in one piece.
+        views: 1, or 4 or 8 of a self-ensemble, at that many times the work.
+        strength: s in [0, 1]; ``(1 - s)^2`` of the noise's variance is left.
+        device: where it runs.
+        mixed: whether it computes in bfloat16.
+        around: what the estimator of a training puts around the network.
+        checked: whether a result that is not finite is an error; a training that diverged is scored as such.
+        settings: what its results depend on, as JSON.
+    """
+
+    name: str
+    model: Callable[[Levels | None], Model]
+    cfa: CFA | None = None
+    info: Mapping[str, Any] = field(default_factory=dict)
+    reads_levels: bool = True
+    upscale: int = 1
+    tiles: tuple[int, int | None] | None = (1536, None)
+    views: int = 1
+    strength: float = 1.0
+    device: torch.device = CPU
+    mixed: bool = False
+    around: Callable[[Model], Model] | None = None
+    checked: bool = True
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    takes: ClassVar[str] = "raw"
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.strength <= 1.0:
+            raise ValueError(f"strength must be between 0 and 1, got {self.strength}; --noise takes higher levels")
+        if self.upscale > 1 and self.strength != 1.0:
+            raise ValueError(
+                f"--strength {self.strength}: of a linear DNG it is 1; there is no noisy full colour to mix in"
+            )
+
+    @classmethod
+    def of(
+        cls,
+        spec: RawDenoiser | Spec | Path | nn.Module | Callable[..., Tensor],
+        device: str | torch.device = "cpu",
+        precision: Literal["full", "auto"] = "full",
+        **changes: Any,
+    ) -> RawDenoiser:
+        """The denoiser that a name, a file or an object stands for. Nothing is imported by name.
+
+        Args:
+            spec: the name of a shipped denoiser; a ``.safetensors`` of rawaug, of PMRID's authors or of BF-DnCNN; an
+                ``.onnx``; a classical filter by its name, or ``{"name": ..., "settings": {...}}``; a network
+                ``model(noisy, variance)`` or ``model(noisy)`` of packed RAW ``(B, 4, h, w)``; or a function of the
+                same arguments, which gets whole frames.
+            device: auto, cpu, cuda, ...; where a network runs. Filters, functions and ONNX run on the CPU.
+            precision: ``"auto"`` computes in bfloat16 where that is fast and costs the network less than 0.05 dB.
+            changes: attributes in place of those found, such as ``name``, ``views``, ``strength``.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if there is no such denoiser, or its file is damaged.
+            ImportError: if a library that it needs is not installed.
+
+        Example:
+            >>> denoiser = RawDenoiser.of("NonLocalMeans")
+            >>> denoiser(Noisy.told(torch.rand(1, 4, 32, 48), (1e-3, 1e-5), "RGGB")).shape
+            torch.Size([1, 4, 32, 48])
+        """
+        found = spec if isinstance(spec, cls) else _found(spec, changes.get("name"))
+        network = found.model(None)
+        if isinstance(network, nn.Module) and not isinstance(network, OnnxNetwork):
+            where = find_device(device)
+            network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            mixed = precision == "auto" and getattr(network, "mixed", False) and fast_in_bfloat16(where)
+            changes = {"device": where, "mixed": mixed, **changes}
+        made = replace(found, **changes)
+        return replace(made, settings={**made.settings, "self_ensemble": made.views > 1}) if made.settings else made
+
+    def require_mosaic(self) -> RawDenoiser:
+        """This denoiser; ValueError if it gives full colour, which cannot be compared with a mosaic."""
+        if self.upscale > 1:
+            raise ValueError(f"{self.name}: demosaics, too; rawaug run demosaic --denoiser.start {self.name} scores it")
+        return self
+
+    @torch.inference_mode()
+    def __call__(self, given: Noisy) -> Tensor:
+        """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; linear camera RGB ``(1, 3, 2h, 2w)`` if it demosaics.
+
+        ValueError if the result has another shape, or is not finite where ``checked``.
+        """
+        own = self.cfa or given.cfa
+        image, variance = (x if x is None else _continued(x, given.cfa, own) for x in given[:2])
+        run = self._around(self.model(given.levels), own)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+            denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
+        height, width = (self.upscale * side for side in image.shape[-2:])
+        expected = (1, PACKED if self.upscale == 1 else 3, height, width)
+        if tuple(denoised.shape) != expected or (self.checked and not denoised.isfinite().all()):
+            got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
+            raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
+        denoised = _cropped(denoised, own, given.cfa)
+        if self.strength == 1.0:
+            return denoised.to(given.image.dtype)
+        return given.image.lerp(denoised.clamp(max=1.0), self.strength)
+
+    def _around(self, model: Model, cfa: CFA) -> Model:
+        """The model in tiles, within what its training puts around it, within the self-ensemble."""
+        run = model
+        if self.tiles is not None:
+            run = partial(denoisers.tiled, model, tile=self.tiles[0], overlap=self.tiles[1], each=counted("tile"))
+        if self.around is not None:
+            run = self.around(run)
+        if self.views > 1:
+            run = denoisers.SelfEnsemble(run, cfa, views=self.views, each=counted("view group"))
+        return run
+
+    def frame(self, frame: RawFrame, levels: Levels | None) -> Tensor:
+        """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1; linear camera RGB ``(3, H, W)`` if it
+        demosaics. ``levels`` may be None where :attr:`reads_levels` is False.
+        """
+        packed = bayer.pack(frame.mosaic[None], frame.cfa)
+        denoised = self(Noisy(packed, cfa=frame.cfa) if levels is None else Noisy.told(packed, levels, frame.cfa))
+        image = bayer.unpack(denoised, frame.cfa) if self.upscale == 1 else denoised
+        return image[0].clamp(max=1.0)
+
+
+def counted(unit: str) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Goes through the parts of a frame, where there are several with progress: its tiles, or views of one shape."""
+    return lambda parts: progress(parts, label="frame", unit=unit) if len(parts) > 1 else iter(parts)
+
+
+def _continued(packed: Tensor, cfa: CFA, own: CFA) -> Tensor:
+    """The same mosaic in the pattern ``own``, with a mirrored line on the sides where the patterns differ."""
+    if own == cfa:
+        return packed
+    rows, columns = cfa.shift_to(own)
+    mosaic = F.pad(bayer.unpack(packed, cfa), (columns, columns, rows, rows), mode="reflect")
+    return bayer.pack(mosaic, own)
+
+
+def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
+    """A result without the lines that :func:`_continued` added, packed by ``cfa`` again."""
+    if own == cfa:
+        return image
+    packed = image.shape[1] == PACKED
+    upright = aligned(bayer.unpack(image, own) if packed else image, own, cfa)
+    return bayer.pack(upright, cfa) if packed else upright
+
+
+# -- by what it is made of ---------------------------------------------------------------------------------------------
+
+
+def shipped_of_mosaics() -> list[str]:
+    """The shipped networks that denoise the mosaic and leave demosaicing to others."""
+    return [name for name in shipped() if DENOISERS[read_header(find(name))["model"]].upscale == 1]
+
+
+def require_classical(specs: Sequence[Spec]) -> None:
+    """Check names, settings and libraries of classical denoisers."""
+    for spec in specs:
+        reason = FILTERS.make(spec).missing()
+        if reason is not None:
+            raise ValueError(f"classical: {name_and_settings(spec)[0]}: {reason}")
+
+
+def _found(spec: Any, name: str | None) -> RawDenoiser:
+    if isinstance(spec, nn.Module):
+        return _of_network(type(spec).__name__, spec, {})
+    if callable(spec):
+        return _of_function(spec, name)
+    if isinstance(spec, Mapping):
+        return _of_filter(spec)
+    path = Path(spec)
+    if path.suffix == ".onnx":
+        network = OnnxNetwork(path)
+        return replace(_of_network(path.stem, network, network.info), settings=_hashed(path))
+    if path.suffix or str(spec) in shipped():
+        return replace(_of_weights(find(spec)), settings=_hashed(find(spec)))
+    if str(spec) in FILTERS:
+        return _of_filter(str(spec))
+    known = [*shipped(), *FILTERS]
+    raise ValueError(
+        f"{spec}: no such denoiser{nearest(spec, known)}; give one of {', '.join(known)}, a .safetensors or an .onnx"
+    )
+
+
+def _hashed(path: Path) -> dict[str, Any]:
+    return {"denoiser_sha256": sha256(path)}
+
+
+def _of_weights(path: Path) -> RawDenoiser:
+    """Of rawaug, PMRID's authors or BF-DnCNN: the tensors say which."""
+    metadata, tensors = read_tensors(path, AGAIN)
+    if "conv00" in tensors:
+        return replace(_of_network("BF-DnCNN", BiasFreeDnCNN(tensors), {}), cfa=None)
+    if "conv0.conv.weight" in tensors and metadata.get("format") != "rawaug":
+        return _of_network("PMRID, published weights", published_pmrid(path), {})
+    if metadata.get("format") != "rawaug":
+        raise ValueError(f"{path}: weights of no known denoiser; give a network or a function from Python")
+    arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors
+    return _of_network(arm if path.stem == "denoiser" else path.stem, *denoisers.load(path))
+
+
+def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> RawDenoiser:
+    """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
+    reads = getattr(network, "reads_variance", None)
+    reads = _takes_two(network.forward) if reads is None else reads
+    if not isinstance(network, (denoisers.Denoiser, OnnxNetwork, BiasFreeDnCNN)):
+        network = _Foreign(network, bool(reads))
+    made = network.eval()
+    upscale, own = getattr(made, "upscale", 1), CFA(info.get("cfa", "RGGB"))
+    return RawDenoiser(
+        name=name, model=lambda levels: made, cfa=own, info=info, reads_levels=bool(reads), upscale=upscale
+    )
+
+
+class _Foreign(nn.Module):
+    """A network that states no stride, and takes noisy RAW alone unless it ``reads`` the variance."""
+
+    def __init__(self, network: nn.Module, reads: bool) -> None:
+        super().__init__()
+        self.network, self.reads = network, reads
+        self.stride, self.upscale = getattr(network, "stride", STRIDE), getattr(network, "upscale", 1)
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        denoised: Tensor = self.network(noisy, variance) if self.reads else self.network(noisy)
+        return denoised
+
+
+def _of_filter(spec: Spec) -> RawDenoiser:
+    require_classical([spec])
+    denoiser = FILTERS.make(spec)
+    stabilised = Stabilised(denoiser, anscombe)
+
+    def model(levels: Levels | None) -> Model:
+        """Noise of an unknown law is taken for white, at the mean level of its map."""
+        return denoiser if levels is None else partial(stabilised, shot_var=levels[0], read_var=levels[1])
+
+    return RawDenoiser(name=label_of(spec), model=model, tiles=FILTER_TILES, settings={"classical": spec})
+
+
+def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:
+    name = name or getattr(function, "__name__", type(function).__name__)
+    reads = _takes_two(function)
+
+    def run(noisy: Tensor, variance: Tensor | None) -> Tensor:
+        given = (noisy, variance) if reads else (noisy,)
+        try:
+            return torch.as_tensor(function(*(x if x is None else x.clone() for x in given))).to(noisy)
+        except Exception as error:  # anybody's function
+            raise ValueError(f"{name}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+
+    return RawDenoiser(name=name, model=lambda levels: run, reads_levels=reads, tiles=None)
+
+
+def _takes_two(function: Callable[..., Any]) -> bool:
+    """Whether a function must be given the variance besides noisy RAW."""
+    parameters = inspect.signature(function).parameters.values()
+    placed = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
+    return sum(one.default is one.empty for one in placed) > 1

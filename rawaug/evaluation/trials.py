@@ -1,0 +1,130 @@
+"""Trials: a frame with its frozen noise, read and drawn once, and all that a score of it needs.
+
+A test case is what was captured, or noise that is keyed by (seed, name) on a clean frame. A denoiser is given
+:attr:`Trial.given` alone; the clean image, and all that follows from it, stays with the trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+from torch import Tensor
+
+from rawaug import bayer
+from rawaug.bayer import CFA, aligned, noise_variance
+from rawaug.data.development import develop_packed, exposure_of
+from rawaug.data.folders import Cached
+from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import Levels, Noisy
+from rawaug.noise import NoiseModel
+from rawaug.seeding import keyed_generator
+
+Domain = Literal["raw", "rgb", "srgb"]
+"""What a result is compared in: packed RAW ``(1, 4, h, w)``, linear camera RGB or developed sRGB ``(1, 3, H, W)``."""
+KEPT = 1024
+"""Megabytes of trials that stay in memory; others are made again for each pass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One frame at one strength of noise.
+
+    Attributes:
+        noisy: the input: packed RAW ``(1, 4, h, w)``, or sRGB ``(1, 3, H, W)`` in the domain ``srgb``.
+        clean: the truth, in the form of ``domain``.
+        variance: of the noise of each value, at the noisy signal, shape of ``noisy``; None where it is not known.
+        frame: its name.
+        domain: what results are compared in.
+        condition: what the denoiser is told, or what the sensor does; rows carry it.
+        strength: the name of the noise's strength; rows carry it.
+        levels: (shot_var, read_var) that the denoiser is told, if the noise has any.
+        cfa: the pattern of packed RAW.
+        develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both.
+        raw: of developed pictures, the RAW that they were developed from, as a denoiser of RAW gets it.
+        ways: from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
+        own: the mean variance of the noise that the reference itself has, where that is known.
+        levels_from_clean: whether the levels were measured against the clean frame.
+    """
+
+    noisy: Tensor
+    clean: Tensor
+    variance: Tensor | None = None
+    frame: str = ""
+    domain: Domain = "raw"
+    condition: str = ""
+    strength: str = ""
+    levels: Levels | None = None
+    cfa: CFA = CFA.RGGB
+    develop: Callable[[Tensor], Tensor] | None = None
+    raw: Noisy | None = None
+    ways: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)
+    own: float | None = None
+    levels_from_clean: bool = False
+
+    @property
+    def amount(self) -> float:
+        """How much noise there is, to put trials in order: the mean variance, or that which the levels give white."""
+        levels = self.raw.levels if self.levels is None and self.raw is not None else self.levels
+        return sum(levels or ()) if self.variance is None else self.variance.mean().item()
+
+    @property
+    def given(self) -> Noisy:
+        """What a denoiser of this kind of image gets."""
+        return Noisy(self.noisy, self.variance, self.levels, self.cfa)
+
+    def given_to(self, denoiser: Any) -> Noisy:
+        """What this denoiser gets: of a developed picture a denoiser of RAW gets the RAW before."""
+        return self.raw if self.raw is not None and denoiser.takes == "raw" else self.given
+
+
+def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: int = 0, **about: Any) -> Trial:
+    """A frame as a test case in the domain ``raw``: its own captured noise, or noise keyed by (seed, name).
+
+    Args:
+        pair: the frame; levels of a capture that states none are measured against its clean version.
+        noise: drawn for frames without a noisy capture.
+        cfa: the pattern to pack by, if another than the frame's.
+        seed: of the drawn noise.
+        about: other attributes, such as ``condition``.
+    """
+    pair, cfa = pair.with_levels(), CFA(pair.cfa if cfa is None else cfa)
+    clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
+    levels: Levels | None
+    if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
+        noisy, levels = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var)
+        variance = noise_variance(noisy, *levels)
+    else:
+        params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))
+        noisy = noise.apply(clean, params)
+        variance = noise.variance(noisy, params)
+        levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
+    return raw_trial(pair, noisy, clean, variance, levels, cfa, levels_from_clean=pair.levels_from_clean, **about)
+
+
+def raw_trial(
+    pair: Pair, noisy: Tensor, clean: Tensor, variance: Tensor, levels: Levels | None, cfa: CFA, **about: Any
+) -> Trial:
+    """Packed RAW of a frame, clean and with noise, as a trial that is developed with the frame's colours."""
+    develop = partial(develop_packed, cfa=cfa, pair=pair, exposure=exposure_of(clean, pair))
+    own = None if pair.own_noise is None else noise_variance(clean, *pair.own_noise).mean().item()
+    return Trial(noisy, clean, variance, pair.name, levels=levels, cfa=cfa, develop=develop, own=own, **about)
+
+
+class _Made(Sequence[Trial]):
+    def __init__(self, pairs: Sequence[Pair], make: Callable[[Pair], Trial]) -> None:
+        self.pairs, self.make = pairs, make
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.make(self.pairs[index])
+
+
+def trials_of(pairs: Sequence[Pair], make: Callable[[Pair], Trial]) -> Sequence[Trial]:
+    """``make(pair)`` of every pair, made when asked for and kept, up to :data:`KEPT`."""
+    kept: Any = Cached(_Made(pairs, make), KEPT)
+    return kept

@@ -1,0 +1,204 @@
+"""RAW pairs on disk from a folder of sRGB pictures, in parallel, on one machine or on many.
+
+What is drawn for a pair depends on (seed, picture's name, number) alone, and files are written whole: however often a
+run is stopped and started again, and with however many workers on however many machines, the same files come out, each
+made once.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+
+from rawaug.bayer import CFA
+from rawaug.data.folders import PICTURE_EXTENSIONS
+from rawaug.files import LOCK, files_in, find_weights, locked, require_same_settings, sha256
+from rawaug.io.pictures import MAX_PIXELS
+from rawaug.plugin.sampling_config import SamplingConfig
+from rawaug.progress import progress
+from rawaug.synthesis import shards
+from rawaug.synthesis.files import PictureTask, picture_tasks
+from rawaug.synthesis.maker import TARGETS, Format, PairMaker, Settings
+from rawaug.synthesis.shards import PER_SHARD, ShardTask
+
+Task = PictureTask | ShardTask
+Outcome = tuple[int, dict[str, str]]
+"""Of a task: the pairs made, and the reason for each picture that could not be read."""
+
+
+@dataclass
+class Synthesis:
+    """Result of a run: pairs made, pairs that existed before, and the reason for each unreadable picture."""
+
+    out: Path
+    pictures: int = 0
+    made: int = 0
+    existing: int = 0
+    broken: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def synth(
+    source: str | Path,
+    out: str | Path,
+    format: Format = "dng",
+    per_image: int = 1,
+    *,
+    seed: int = 0,
+    workers: int | None = None,
+    max_pixels: int = MAX_PIXELS,
+    shard: str = "1/1",
+    per_shard: int = PER_SHARD,
+    **drawn: Any,
+) -> Synthesis:
+    """Make ``per_image`` pairs of every picture of a folder and its subfolders, or of one; existing pairs are kept.
+
+    :mod:`rawaug.synthesis.files` and :mod:`rawaug.synthesis.shards` say what is written.
+
+    Args:
+        source: a folder of sRGB pictures, or one picture.
+        out: the output folder.
+        format: ``"dng"`` (16 bits, target raw only), ``"npz"``, ``"tiff"``, ``"png"`` (target srgb only) or
+            ``"webdataset"``, tar shards.
+        per_image: pairs of each picture; may grow from run to run, but not in shards.
+        seed: with a picture's name and a pair's number it decides what is drawn.
+        workers: 0 for this process only. Others start by forkserver or spawn, so a script needs
+            ``if __name__ == "__main__":`` around its main part.
+        max_pixels: larger pictures are refused before they are decoded.
+        shard: ``"K/N"`` makes part K of N, for job arrays; all N write to the same folder.
+        per_shard: pictures in a tar file.
+        drawn: ``isp``, ``noise``, ``camera``, ..., as in :class:`rawaug.plugin.sampling_config.SamplingConfig`.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, picture or ISP.
+        ValueError: if the folder contains no readable picture, or ``out`` contains pairs of other settings
+            or is in use by another run.
+        OSError: if a worker dies, or the output folder is removed meanwhile.
+    """
+    start = time.perf_counter()
+    source, out = Path(source).resolve(), Path(out)
+    if source.is_dir() and out.resolve().is_relative_to(source):
+        raise ValueError(f"{out}: is inside the picture folder {source}; choose an output folder outside it")
+    pictures = files_in(source, "picture", PICTURE_EXTENSIONS)
+    source = source.parent if source.is_file() else source
+    settings = _settings(format, per_image, seed, drawn)
+    if workers is not None and workers < 0:
+        raise ValueError(f"workers must be at least 0, got {workers}")
+    part, parts = part_of(shard)
+    cfa = PairMaker(settings, max_pixels).augment.cfa  # raises for a wrong name here, not in a worker
+    if format == "dng" and cfa not in CFA.__members__:
+        raise ValueError(f"format dng holds Bayer mosaics, not {cfa}; use npz, tiff or webdataset")
+    stored, tasks = settings.stored(), list[Task]()
+    with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
+        if format == "webdataset":
+            tasks += shards.shard_tasks(pictures, source, out, per_image, per_shard)
+            stored["isp"] = Path(settings.drawing.isp).name  # its path differs between machines
+            stored |= shards.shard_settings(pictures, source, per_image, per_shard, max_pixels)
+        else:
+            tasks += picture_tasks(pictures, source, out, per_image)
+        require_same_settings(out / "synth.json", stored)
+        result = _worked_off(out, tasks[part - 1 :: parts], settings, max_pixels, workers)
+        if format == "webdataset":
+            shards.finish(out, len(tasks), settings)
+    result.seconds = time.perf_counter() - start
+    if result.pictures and len(result.broken) == result.pictures:
+        count, reason = result.pictures, min(result.broken.values())
+        raise ValueError(f"{source}: none of its {count} pictures can be read; {reason}")
+    return result
+
+
+def part_of(shard: str) -> tuple[int, int]:
+    first, _, second = shard.partition("/")
+    if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
+        raise ValueError(f"shard must be K/N with K from 1 to N, as 3/32, got {shard!r}")
+    return int(first), int(second)
+
+
+def _settings(format: Format, per_image: int, seed: int, drawn: dict[str, Any]) -> Settings:
+    if format not in get_args(Format) or per_image < 1:
+        wanted = f"format must be one of {', '.join(get_args(Format))} and per_image at least 1"
+        raise ValueError(f"{wanted}, got {format} and {per_image}")
+    drawing = SamplingConfig(**drawn)
+    isp, target = Path(drawing.isp), drawing.target or "raw"
+    if target not in TARGETS.get(format, (target,)):
+        able = [name for name in get_args(Format) if target in TARGETS.get(name, (target,))]
+        raise ValueError(f"format {format} cannot hold target {target!r}; use {', '.join(able)}")
+    drawing = replace(drawing, isp=str(isp.resolve() if isp.suffix else isp))
+    return Settings(format, drawing, sha256(find_weights(isp)), seed)
+
+
+def _worked_off(
+    out: Path, tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None
+) -> Synthesis:
+    result = Synthesis(out, sum(task.pictures for task in tasks), existing=sum(task.existing for task in tasks))
+    for task in tasks:
+        result.broken |= task.broken
+    todo = [task for task in tasks if task.todo]
+    outcomes = _done(todo, settings, max_pixels, workers)
+    for made, broken in progress(outcomes, label="synth", unit="file", total=len(todo), leave=True):
+        result.made += made
+        result.broken |= broken
+    result.broken = dict(sorted(result.broken.items()))
+    return result
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+_maker: PairMaker
+
+
+def _done(tasks: Sequence[Task], settings: Settings, max_pixels: int, workers: int | None) -> Iterator[Outcome]:
+    workers = min(len(tasks), os.cpu_count() or 1 if workers is None else workers)
+    if workers < 1:
+        _prepare(settings, max_pixels)
+        yield from map(_make, tasks)
+        return
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    pool = ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(settings, max_pixels))
+    try:
+        for future in as_completed([pool.submit(_make, task) for task in tasks]):
+            yield future.result()
+    except BrokenProcessPool:
+        raise OSError(
+            "a worker died, perhaps out of memory or of a damaged picture; run it again with fewer --workers, "
+            "or look for the picture with rawaug data check"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker(settings: Settings, max_pixels: int) -> None:
+    """Single-threaded; ignores Ctrl-C, which the parent handles; exits when the parent dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    torch.set_num_threads(1)
+    _prepare(settings, max_pixels)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _prepare(settings: Settings, max_pixels: int) -> None:
+    global _maker
+    _maker = PairMaker(settings, max_pixels)
+
+
+def _make(task: Task) -> Outcome:
+    return task.make(_maker)

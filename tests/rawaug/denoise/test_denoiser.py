@@ -1,0 +1,134 @@
+"""One class for all that denoises RAW: found by name, told its levels, checked, in any pattern and at any strength."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import denoisers
+from rawaug.bayer import CFA
+from rawaug.commands.benchmark import named
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoise.published import BiasFreeDnCNN
+from rawaug.experiment.demosaicing import JointRecipe
+from rawaug.experiment.recipe import ArmConfig, DataConfig
+from rawaug.registry import EXPERIMENTS
+
+LEVELS = (1.8e-3, 1.2e-5)
+
+
+@pytest.fixture
+def noisy() -> Noisy:
+    """A grey ramp with the noise of a phone."""
+    clean = torch.linspace(0.1, 0.9, 64).expand(1, 4, 64, 64)
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    return Noisy.told(clean + noise * (LEVELS[0] * clean + LEVELS[1]).sqrt(), LEVELS, CFA.RGGB)
+
+
+@pytest.mark.parametrize(
+    ("run", "said"),
+    [
+        (lambda noisy, variance: noisy[..., 1:], "mine: the result is not finite, or of another shape"),
+        (lambda noisy, variance: noisy / 0, "mine: the result is not finite"),
+        (lambda noisy, variance: noisy @ noisy[..., 1:, :], "mine: RuntimeError: "),
+    ],
+)
+def test_a_function_that_fails_is_named(run: Callable[..., Any], said: str, noisy: Noisy) -> None:
+    with pytest.raises(ValueError, match=said) as error:
+        RawDenoiser.of(run, name="mine")(noisy)
+    assert "\n" not in str(error.value)
+
+
+def test_a_function_is_imported_from_the_command_line_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "blind_one.py").write_text("def half(noisy):\n    return (noisy / 2).numpy()\n")
+    monkeypatch.chdir(tmp_path)
+    assert (named("blind_one:half")(Noisy(torch.ones(1, 4, 8, 8))) == 0.5).all()
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')\n")
+    given: dict[str, Any] = {"camera": "universal", "arms": {"joint": ArmConfig(1.0)}, "out": str(tmp_path)}
+    recipe = JointRecipe(data=DataConfig(pairs=None), rivals=["evil:f"], **given)
+    with pytest.raises(ValueError, match="evil:f: no such denoiser"):
+        EXPERIMENTS["demosaic"](recipe)
+    with pytest.raises(ValueError, match="evil:f: no such denoiser"):
+        RawDenoiser.of("evil:f")
+    assert "evil" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("rawaug-smal", r"no such denoiser \(nearest: rawaug-small\)"),
+        ("", "no such denoiser"),
+        ("nowhere:function", "nowhere:function: cannot be imported"),
+        ("json:nothing", "json:nothing: cannot be imported"),
+        ("gone.onnx", "gone.onnx: no such file"),
+        ("gone.safetensors", "gone.safetensors"),
+    ],
+)
+def test_what_is_no_denoiser_is_one_line(spec: str, said: str) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        named(spec)
+
+
+def test_networks_of_others_get_the_variance_if_they_take_two_arguments(noisy: Noisy) -> None:
+    class Blind(torch.nn.Module):
+        def forward(self, noisy: torch.Tensor) -> torch.Tensor:
+            return noisy - 0.1
+
+    class Told(torch.nn.Module):
+        def forward(self, noisy: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+            return noisy + variance
+
+    blind, told = RawDenoiser.of(Blind()), RawDenoiser.of(Told())
+    assert (blind.reads_levels, told.reads_levels) == (False, True)
+    assert noisy.variance is not None and torch.equal(told(noisy), noisy.image + noisy.variance)
+    assert torch.equal(blind(noisy), noisy.image - 0.1)
+
+
+def test_strength_blends_and_views_agree_with_a_denoiser_that_changes_nothing(noisy: Noisy) -> None:
+    darker = RawDenoiser.of(lambda noisy: noisy - 0.05, name="darker", strength=0.4)
+    torch.testing.assert_close(darker(noisy), noisy.image - 0.02)
+    same = RawDenoiser.of(torch.nn.Identity(), views=8, cfa=CFA.GRBG)
+    torch.testing.assert_close(same(noisy), noisy.image)
+    with pytest.raises(ValueError, match=r"strength must be between 0 and 1, got 1\.5"):
+        RawDenoiser.of("NonLocalMeans", strength=1.5)
+
+
+def test_a_filter_in_tiles_and_a_filter_without_levels(noisy: Noisy) -> None:
+    whole, tiled = (RawDenoiser.of("NonLocalMeans", tiles=tiles) for tiles in (None, (48, 16)))
+    assert (whole(noisy) - tiled(noisy)).abs().max() < 1e-3
+    unknown = noisy._replace(levels=None)
+    assert not torch.equal(whole(unknown), whole(noisy)), "at the mean level, not stabilised"
+
+
+def test_weights_of_others_are_known_by_their_tensors(tmp_path: Path, noisy: Noisy) -> None:
+    save_file({f"conv{k:02}": torch.zeros(1, 1, 3, 3) for k in range(20)}, tmp_path / "bf.safetensors")
+    save_file(denoisers.PMRID().state_dict(), tmp_path / "pmrid.safetensors")
+    save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
+    assert RawDenoiser.of(tmp_path / "bf.safetensors").name == "BF-DnCNN"
+    pmrid = RawDenoiser.of(tmp_path / "pmrid.safetensors")
+    assert pmrid.name.startswith("PMRID") and pmrid(noisy).shape == noisy.image.shape
+    (tmp_path / "finetuned").mkdir()
+    denoisers.save(denoisers.build("DnCNN", width=4, depth=3), tmp_path / "finetuned" / "denoiser.safetensors", {})
+    assert RawDenoiser.of(tmp_path / "finetuned" / "denoiser.safetensors").name == "finetuned"  # an arm of a run
+    with pytest.raises(ValueError, match="weights of no known denoiser"):
+        RawDenoiser.of(tmp_path / "other.safetensors")
+
+
+def test_bf_dncnn_takes_white_noise_out_of_the_stabilised_planes(noisy: Noisy) -> None:
+    mean = torch.zeros(1, 1, 3, 3)
+    mean[..., 1, 1] = 1.0
+    away = mean - 1 / 9  # u - (u - mean of u)
+    denoised = BiasFreeDnCNN({"conv00": torch.cat([away, -away]), "conv01": torch.cat([mean, -mean], dim=1)})(
+        *noisy[:2]
+    )
+    clean = torch.linspace(0.1, 0.9, 64).expand(1, 4, 64, 64)
+    inner = (slice(None), slice(None), slice(1, -1), slice(1, -1))
+    before, after = (((x - clean)[inner]).square().mean() for x in (noisy.image, denoised))
+    assert after < before / 7  # of nine sites
+    assert (denoised - clean)[inner].mean().abs() < 5e-4  # the exact unbiased inverse
