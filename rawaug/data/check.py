@@ -29,6 +29,7 @@ from rawaug.files import files_below, files_in
 from rawaug.io import RawFrame, read_raw
 from rawaug.io.isolated import isolated
 from rawaug.io.raw import RAW_EXTENSIONS
+from rawaug.registry import DATASETS, PICTURES
 
 _SHOWN = 6
 _PAIRS = "pairs:"
@@ -87,7 +88,7 @@ class DataReport:
 
 
 def check(path: str | Path, first: int | None = None, **settings: Any) -> DataReport:
-    """Identify the data in a folder, a RAW file, a SIDD submission or ``pairs:PATH``, and read it.
+    """Identify the data in a folder, a RAW file or a SIDD submission, or take that of ``kind:PATH``, and read it.
 
     At most ``first`` items of each kind are read; ``settings`` are those of :class:`PairFolder`, for ``pairs:PATH``.
     """
@@ -98,6 +99,9 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
         return DataReport(folder, [_part("noisy/clean pairs", partial(PairFolder, folder, **settings), first)])
     if settings:
         raise ValueError(f"{path}: {', '.join(settings)} can only be given for {_PAIRS}PATH")
+    kind, colon, _ = str(path).partition(":")
+    if colon and not Path(path).exists():
+        return DataReport(Path(path), [_part(what, opened, first) for what, opened in _of_kind(kind, str(path))])
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
@@ -107,6 +111,17 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
     if not known:
         raise ValueError(f"{path}: contains no known dataset, RAW file or picture; see docs/datasets.md")
     return DataReport(path, [_part(what, open_part, first) for what, open_part in known])
+
+
+def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
+    """What ``kind:path`` opens everywhere else, as pairs, as pictures, or as both."""
+    from rawaug.data import open_pairs, open_pictures  # late: they are made of what is checked
+
+    openers = ((DATASETS, "pairs", open_pairs), (PICTURES, "pictures", open_pictures))
+    found = [(f"{what} of {spec}", partial(opener, spec)) for kinds, what, opener in openers if kind in kinds]
+    if not found:
+        open_pairs(spec)  # raises for an unknown kind
+    return found
 
 
 def _datasets(path: Path) -> Iterator[tuple[str, Callable[[], Any]]]:

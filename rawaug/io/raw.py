@@ -200,6 +200,10 @@ def read_raw_and_develop(path: str | Path, adjust_maximum_thr: float = 0.0) -> t
     return frame, torch.from_numpy(pixels[:height, :width]).permute(2, 0, 1).contiguous()
 
 
+DEVELOPED = (b"\xff\xd8\xff", b"\x89PNG", b"RIFF", b"GIF8", b"\x00\x00\x00\x0cJXL", b"\xff\x0a")
+"""How files begin that hold a picture and never RAW: JPEG, PNG, WebP, GIF, JPEG XL."""
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
     """The unpacked file, and its TIFF tags; LibRaw's errors become one line that names the file."""
@@ -223,6 +227,9 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
             raw.unpack()
             yield raw, tags
     except rawpy.LibRawError as error:
+        with path.open("rb") as file:
+            if file.read(12).startswith(DEVELOPED):
+                raise ValueError(f"{path}: this is a developed picture, not RAW; give the camera's RAW file") from None
         reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
         advice = "check that it is complete and from a supported camera"
         raise OSError(f"{path}: cannot be read as RAW (LibRaw: {reason}); {advice}") from error

@@ -120,14 +120,25 @@ def estimate_noise(
     if not measured:
         raise ValueError("no frames given to measure the noise of")
     levels = _split_levels(_Blocks(*map(torch.cat, zip(*measured, strict=True))))
-    points = _start(levels)
-    for _ in range(_ROUNDS):
-        shot, read, _ = _fit(points, read_var)
-        points = _points(levels, shot, read)
-    shot, read, points = _fit(points, read_var)
+    first = points = _start(levels)
+    try:
+        for _ in range(_ROUNDS):
+            shot, read, _ = _fit(points, read_var)
+            points = _points(levels, shot, read)
+        shot, read, points = _fit(points, read_var)
+    except ValueError:
+        if float(first.variance.median()) <= _rounding(frames[0]):
+            raise ValueError("no noise found: flat regions vary by no more than the file's rounding") from None
+        raise
     x, y = points.signal[points.used], points.variance[points.used]
     r2 = float(1 - (y - shot * x - read).square().sum() / (y - y.mean()).square().sum())
     return NoiseEstimate(shot, read, r2, points)
+
+
+def _rounding(frame: Tensor) -> float:
+    """Twice the variance of rounding to the steps that a frame's values have."""
+    steps = frame.flatten()[:: max(1, frame.numel() // 2**18)].double().unique().diff()
+    return 2.0 * float(steps.min()) ** 2 / 12.0 if len(steps) else math.inf
 
 
 def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:

@@ -133,3 +133,15 @@ def test_the_command_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFix
     assert "1.png" in printed.out and printed.err.strip().endswith("1 damaged, listed above")
     assert main(["data", "check", str(tmp_path / "none")]) == 2
     assert "none: no such file or folder" in capsys.readouterr().err
+
+
+def test_kinds_of_data_are_opened_as_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAWAUG_READ_SECONDS", "120")
+    pictures, pairs = "pictures of shapes:3", "pairs of real:test"
+    report = check("shapes:3")
+    assert [part.what for part in report.parts] == [pictures] and report.parts[0].items == 3 and not report.broken
+    report = check("real:test", first=1)
+    assert [part.what for part in report.parts] == [pairs] and report.parts[0].examined == 1 and not report.broken
+    assert set(report.parts[0].counts) >= {"sizes", "cfas"}
+    with pytest.raises(ValueError, match=r"reel:test: unknown kind of data; .*\(nearest: real\)"):
+        check("reel:test")

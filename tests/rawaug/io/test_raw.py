@@ -188,3 +188,12 @@ def test_canon_and_gopro_frames(camera_files: Path) -> None:
     camera = (tag[0::2] / tag[1::2]).reshape(3, 3) @ raw.XYZ_FROM_SRGB
     expected = np.linalg.inv(camera / camera.sum(1, keepdims=True))
     assert np.allclose(frame.color_matrix.numpy(), expected, atol=1e-3)
+
+
+def test_a_developed_picture_is_called_one(tmp_path: Path) -> None:
+    from rawaug.io import write_picture
+
+    for name in ("a.jpg", "a.png"):
+        write_picture(tmp_path / name, torch.zeros(3, 8, 8, dtype=torch.uint8))
+        with pytest.raises(ValueError, match=f"{name}: this is a developed picture, not RAW"):
+            read_raw(tmp_path / name)

@@ -150,7 +150,7 @@ def test_dark_frames_show_banding_black_level_and_ignore_hot_pixels() -> None:
         (torch.rand(1, 8, 8), "too small"),
         (torch.rand(1, 32, 32), "too few blocks"),
         (torch.ones(1, 512, 512), "too few blocks"),
-        (torch.zeros(1, 512, 512), "too few"),
+        (torch.zeros(1, 512, 512), "no noise found"),
         (0.3 + 0.01 * torch.randn(1, 512, 512, generator=torch.Generator().manual_seed(0)), "of the same brightness"),
     ],
 )
@@ -247,3 +247,10 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
     for together, left in ((False, binned_variance(4)), (True, binned_variance(4, together=True))):
         assert Binned(Measured([stated]), 4, together)[0].own_noise == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
+
+
+def test_of_a_clean_frame_it_is_said_that_there_is_no_noise() -> None:
+    steps = torch.linspace(0.05, 0.8, 8).repeat_interleave(64).repeat(512, 1)[None]  # a chart
+    for clean in (steps, unpack(scene(1, texture=0.0), "RGGB")[0]):
+        with pytest.raises(ValueError, match="no noise found: flat regions vary by no more than the file's rounding"):
+            estimate_noise((clean * 65535).round() / 65535, "RGGB")
