@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
@@ -21,6 +22,9 @@ from rawaug.experiment import plan
 from rawaug.experiment.plan import settings_of, with_own_pairs
 from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
 from rawaug.registry import EXPERIMENTS, nearest
+
+SHARED = ("channels", "variance_map", "deviation", "domain")
+"""Settings that all networks have: they say what a recipe's network is for."""
 
 
 def run(
@@ -50,8 +54,8 @@ def run(
     if keys:
         print_keys(settings_of(kind), content)
         return
-    given = list(_given(changes))
-    whole = content
+    given = [_in_full(key, value) for key, value in _given(changes)]
+    whole = _without_old_settings(content, given)
     for key, value in given:
         whole = _with(whole, settings_of(kind), key.split("."), value)
     settings = with_values(settings_of(kind), whole, file)
@@ -94,7 +98,9 @@ def keys_of(settings: type[Any], above: str = "") -> Iterator[Key]:
         name = f"{above}{field.name}"
         if part is None or named:
             default = field.default if field.default_factory is MISSING else field.default_factory()
-            yield Key(name, default, meanings.get(field.name, ""))
+            among = field.metadata.get("registry", ())
+            listed = f" One of {', '.join(among)}." if among else ""
+            yield Key(name, default, meanings.get(field.name, "") + listed)
         if part is not None:
             yield from keys_of(part, f"{name}.NAME." if named else f"{name}.")
 
@@ -130,6 +136,33 @@ def _given(words: Sequence[str]) -> Iterator[tuple[str, Any]]:
         if found is None:
             raise ValueError(f"{key} needs a value")
         yield key.removeprefix("--"), value_of(found)
+
+
+def _in_full(key: str, value: Any) -> tuple[str, Any]:
+    """``--denoiser DnCNN`` is short for ``--denoiser.name DnCNN``."""
+    return (f"{key}.name", value) if key.split(".")[-1] == "denoiser" and isinstance(value, str) else (key, value)
+
+
+def _without_old_settings(content: Mapping[str, Any], given: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """The recipe without the settings of a network in whose place another is named; what all networks have stays."""
+    result = deepcopy(dict(content))
+    for key, name in given:
+        path = key.split(".")
+        if path[-2:] != ["denoiser", "name"]:
+            continue
+        place: Any = result
+        for part in path[:-1]:
+            place = place.get(part) if isinstance(place, Mapping) else None
+        if not isinstance(place, dict) or not place.get("settings") or place.get("name", "UNet") == name:
+            continue
+        kept = {setting: value for setting, value in place["settings"].items() if setting in SHARED}
+        dropped = {setting: value for setting, value in place["settings"].items() if setting not in SHARED}
+        place["settings"] = kept
+        if dropped:
+            of = place.get("name", "UNet")
+            said = f"{'.'.join(path[:-1])}: the settings of {of} are dropped for {name}'s own: {json.dumps(dropped)}"
+            print(f"{said}; others: --{'.'.join(path[:-1])}.settings.KEY VALUE")
+    return result
 
 
 def _with(content: Any, settings: type[Any] | None, path: Sequence[str], value: Any) -> Any:

@@ -106,7 +106,7 @@ class Page:
             about["Noise"] = f"as captured with the frames, else {named}; {levels_range(first)}".rstrip("; ")
         about = {name: text for name, text in about.items() if text}
         page = cls(title, [Part(terms=about), Part("Methods", terms=arms or {})][: 2 if arms else 1])
-        page.lead = verdict(results, classical)
+        _, page.lead = verdict(results, classical)
         note = levels_note(first)
         for heading, columns in (("Scores", PLAIN), ("Self-ensemble", ENSEMBLE), ("Worst and best frames", QUARTERS)):
             table = figures_of(results, classical, columns)

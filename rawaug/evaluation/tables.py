@@ -141,16 +141,23 @@ def _cell(key: str, values: Sequence[float]) -> str:
     return formatted(key, statistics.fmean(values) if values else None)
 
 
-def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
-    """Which method to use: the arm of the highest mean PSNR against the best of the others, or of the noisy input."""
+NOISY = "the noisy input"
+
+
+def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> tuple[str, str]:
+    """The method to use, an arm, one of the others or :data:`NOISY`, and why in a line.
+
+    The arm of the highest mean PSNR is compared with the best of the others, or with the noisy input. Both are empty
+    where nothing has a PSNR.
+    """
     means = {arm: statistics.fmean(found) for arm, runs in results.items() if (found := _values(runs, "plain", "psnr"))}
     if not means:
-        return ""
+        return "", ""
     arm = max(means, key=means.__getitem__)
     runs = [run["plain"] for run in results[arm]]
     noisy = {key.removesuffix("_noisy"): value for key, value in runs[0].items() if key.endswith("_noisy")}
     noisy["images"] = [{"psnr": image.get("psnr_noisy")} for image in runs[0]["images"]]
-    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {"the noisy input": noisy}
+    scored = {name: scores for name, scores in others.items() if "psnr" in scores} or {NOISY: noisy}
     other = max(scored, key=lambda name: scored[name]["psnr"])
     gains = [run["psnr"] - scored[other]["psnr"] for run in runs if "psnr" in run]
     gain = statistics.fmean(gains)
@@ -167,7 +174,8 @@ def verdict(results: Runs, others: Mapping[str, Mapping[str, Any]]) -> str:
     if "psnr_srgb" in scored[other] and all("psnr_srgb" in run for run in runs):
         developed = statistics.fmean(run["psnr_srgb"] for run in runs) - scored[other]["psnr_srgb"]
         said += [f"{developed:+.2f} dB after development"]
-    return f"Use {arm if better else other}: {', '.join(said)}."
+    chosen = arm if better else other
+    return chosen, f"Use {chosen}: {', '.join(said)}."
 
 
 def print_rows(title: str, head: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:

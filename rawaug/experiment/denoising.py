@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -25,7 +26,7 @@ from rawaug.errors import extra
 from rawaug.evaluation.own_noise import added_noise_note, own_noise_note
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import NOISY, Panels, Row, by_denoiser, panels_of, require_numbers, score, summary
-from rawaug.evaluation.tables import draw, first_runs, print_table
+from rawaug.evaluation.tables import draw, first_runs, print_table, verdict
 from rawaug.evaluation.trials import Trial, trial_of, trials_of
 from rawaug.experiment.arms import (
     chosen,
@@ -46,7 +47,7 @@ from rawaug.progress import timed
 from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, label_of, name_and_settings
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
-from rawaug.training.noisy_frames import noisy_only
+from rawaug.training.noisy_frames import faintness_note, noisy_only
 from rawaug.training.state import first_network, start_of
 
 SHOWN = 3
@@ -141,6 +142,7 @@ class TrainingRun:
             if not self.frames or recipe.noise == "camera":
                 parts = {"pairs": self.pairs, "validation": self.validation}
                 self.frames = {part: frames_of(recipe, pairs, isp) for part, pairs in parts.items()}
+                _say(faintness_note(self.frames["pairs"]) if recipe.self_supervised else "")
             for arm in recipe.arms:
                 models[arm] = self.trained(arm, in_pattern(isp, self.pattern(arm, isp)), noise, seed)
                 if _leads():
@@ -308,7 +310,7 @@ class TrainingRun:
         settings = f"real pairs: {len(self.pairs)}, steps: {recipe.train.steps}, seeds: {recipe.seeds}"
         title = f"{recipe.name} tested on {self.data.test} ({settings})"
         everyone = [*others, *(self.denoiser(arm, model, isp) for arm, model in models.items())]
-        facts = {"Noise": recipe.noise, "To use the best run": self.usage(results)[-1].partition(": ")[2]}
+        facts = {"Noise": recipe.noise, "To use it": self.usage(results, classical)[-1].partition(": ")[2]}
         named = {one.name for one in everyone}
         about = {name: text for name, text in methods_of(recipe).items() if name in named}
         page = Page.of_scores(title, results, classical, facts, about)
@@ -321,7 +323,7 @@ class TrainingRun:
             for arm, found in searches.items()
         ]
         spent = "time: " + ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in self.seconds.items())
-        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results))
+        _say(*reports(self.pictures), *self.unreadable, *searched, spent, *self.usage(results, classical))
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
@@ -345,13 +347,22 @@ class TrainingRun:
         page.write(self.folder / "report.html", asdict(self.recipe))
         return draw(rows, self.folder / "picture.png")
 
-    def usage(self, results: Results) -> list[str]:
-        """The files of weights, and the command that uses those of the arm with the highest PSNR."""
+    def usage(self, results: Results, others: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """The files of weights, and the command that uses what the verdict names; of an arm the best seed's."""
         files = {(arm, s): self.place(arm, s) / "denoiser.safetensors" for arm in results for s in self.seeds}
-        runs = [run["plain"].get("psnr", 0.0) for found in results.values() for run in found]
-        best = list(files.values())[runs.index(max(runs))]
         lines = [f"denoiser, {arm}: {file}" for (arm, _), file in files.items()]
-        return [*lines, f"to use it: rawaug denoise IN.dng OUT.dng --denoiser {best}"]
+        chosen, _ = verdict(results, others)
+        if chosen in results:
+            runs = [run["plain"].get("psnr", 0.0) for run in results[chosen]]
+            what = f"--denoiser {files[chosen, self.seeds[runs.index(max(runs))]]}"
+        elif chosen in [one.name for one in self.untouched]:
+            what = f"--denoiser {next(name for name in self.recipe.untouched if Path(name).stem == chosen)}"
+        elif chosen in others:
+            spec = next(spec for spec in self.classical if label_of(spec) == chosen)
+            what = f"--classical {spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))}"
+        else:
+            return [*lines, "to use: nothing, the frames are best as they are"]
+        return [*lines, f"to use {chosen}: rawaug denoise IN.dng OUT.dng {what}"]
 
 
 def _say(*lines: str) -> None:

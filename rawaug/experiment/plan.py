@@ -199,6 +199,8 @@ def dry_run(kind: str, settings: Any, overwrite: bool = False) -> None:
     folder = require_free(settings, overwrite)
     if isinstance(settings, Recipe):
         print("\n".join(planned(settings, {}).lines(settings)))
-    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()):
+    with TemporaryDirectory() as elsewhere, redirect_stdout(io.StringIO()) as said:
         EXPERIMENTS[kind](replace(settings.shortest(), out=elsewhere))
-    print(f"Dry run: no problems found, nothing written to {folder}")
+    notes = [line for line in said.getvalue().splitlines() if line.startswith("note: ")]
+    found = "it runs, but see the note above" if notes else "no problems found"
+    print("\n".join([*notes, f"Dry run: {found}, nothing written to {folder}"]))

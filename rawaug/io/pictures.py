@@ -75,7 +75,7 @@ def read_picture(path: str | Path, max_pixels: int = MAX_PIXELS) -> Tensor:
 
 def read_plane(path: str | Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """The numbers of a file with one channel as they are stored, uint8 or uint16 ``(H, W)``: a mosaic kept as a PNG."""
-    pixels, spec = _decoded(Path(path), max_pixels, lambda spec: spec.format)
+    pixels, spec = decode_file(Path(path), max_pixels, lambda spec: spec.format)
     if pixels.shape[-1] != 1 or pixels.dtype not in (np.uint8, np.uint16):
         names = ", ".join(spec.channelnames)
         raise ValueError(f"{path}: has {pixels.dtype} channels {names}; a mosaic must have one channel of 8 or 16 bits")
@@ -100,6 +100,11 @@ def write_picture(path: str | Path, srgb: Tensor) -> None:
         raise ValueError(f"{path}: unsupported extension; use .png, .tif or .jpg ({oiio.geterror()})")
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     written = output.open(str(path), spec) and output.write_image(np.ascontiguousarray(pixels))
+    require_written(output, written, path)
+
+
+def require_written(output: Any, written: bool, path: str | Path) -> None:
+    """Close OpenImageIO's ``output``; OSError if it, or what was ``written`` to it, failed."""
     if not (output.close() and written):
         raise OSError(f"{path}: cannot be written (OpenImageIO: {_reason(output) or 'no reason given'})")
 
@@ -122,7 +127,7 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
         floats = _oiio().HALF, _oiio().FLOAT, _oiio().DOUBLE
         return "float" if spec.format.basetype in floats else "uint8"
 
-    pixels, spec = _decoded(path, max_pixels, kind)
+    pixels, spec = decode_file(path, max_pixels, kind)
     pixels = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     if pixels.dtype != np.uint8:
         pixels = _round_to_8_bits(pixels, path, linear=spec.get_string_attribute(_FORMAT) in _LINEAR_FORMATS)
@@ -132,7 +137,7 @@ def _read(path: Path, max_pixels: int) -> tuple[np.ndarray, int]:
     return pixels, spec.get_int_attribute("Orientation", 1)
 
 
-def _decoded(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
+def decode_file(path: Path, max_pixels: int, kind: Callable[[Any], Any]) -> tuple[np.ndarray, Any]:
     """The pixels ``(H, W, C)`` of the first picture in the type that ``kind`` chooses, and OpenImageIO's spec of it."""
     source = _opened(path)
     spec = source.spec()

@@ -51,15 +51,15 @@ class Finish:
         ValueError: if a range is out of order, or a share leaves [0, 1].
     """
 
-    luma_blur: tuple[float, float] = (0.5, 1.0)
-    edges: float = 0.75
-    edge_threshold: tuple[float, float] = (0.8, 3.0)
-    chroma_blur: tuple[float, float] = (0.8, 5.0)
+    luma_blur: tuple[float, float] = (0.6, 0.95)
+    edges: float = 0.8
+    edge_threshold: tuple[float, float] = (1.5, 4.0)
+    chroma_blur: tuple[float, float] = (1.0, 4.0)
     chroma_mix: tuple[float, float] = (0.6, 1.0)
     sharpening: tuple[float, float] = (0.0, 0.6)
-    sharpened: float = 0.4
+    sharpened: float = 0.5
     sharpening_radius: tuple[float, float] = (0.7, 1.6)
-    quality: tuple[int, int] | None = (75, 99)
+    quality: tuple[int, int] | None = (80, 99)
     unfinished: float = 0.1
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from rawaug.files import fingerprint
-from rawaug.registry import LOSSES, require_between
+from rawaug.registry import DENOISERS, LOSSES, require_between
 
 MOST = 2**31
 """Of steps, samples and processes."""
@@ -20,15 +20,18 @@ class DenoiserConfig:
     """The network.
 
     Args:
-        name: UNet, DHDN, DnCNN, PMRID, NAFNet, or one of another package.
+        name: of the network; another one than the recipe's has its own settings.
         settings: its constructor's keys.
         start: weights that training continues from: the name of a shipped denoiser or a file; name and settings are
             then the file's, unless they are given, and must agree with it. Null starts from random weights.
     """
 
-    name: str = "UNet"
+    name: str = field(default="UNet", metadata={"registry": DENOISERS})
     settings: dict[str, Any] = field(default_factory=dict)
     start: str | None = None
+
+    def __post_init__(self) -> None:
+        DENOISERS[self.name]  # an unknown name is answered with the nearest
 
 
 @dataclass

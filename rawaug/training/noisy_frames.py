@@ -13,9 +13,11 @@ explains 0.3 standard deviations of its target with y, 0.06 in flat areas and 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import median
 from typing import Any
 
 import torch
@@ -86,7 +88,10 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
     if pair.shot_var is not None and pair.read_var is not None:
         return pair.shot_var, pair.read_var
     if camera is None:
-        raise ValueError(f'{pair.name}: has no noise levels; measure them with noise: "camera"')
+        raise ValueError(
+            f"{pair.name}: has no noise levels, and those of noise are the pictures'; "
+            "add --noise camera to measure them on the frames that the ISP is fitted to"
+        )
     try:
         return camera_law(camera).at(pair.iso)
     except ValueError as error:
@@ -95,6 +100,22 @@ def noise_of(pair: Pair, camera: Mapping[str, Any] | None) -> tuple[float, float
 
 def noisy_frame(pair: Pair, camera: Mapping[str, Any] | None) -> NoisyFrame:
     return NoisyFrame(pair.name, pair.raw, *noise_of(pair, camera), pair.cfa)
+
+
+FAINT = 45.0
+"""PSNR in dB of noisy frames from which on there is next to nothing to remove."""
+
+
+def faintness_note(frames: Sequence[NoisyFrame]) -> str:
+    """A line on frames with next to no noise, by their levels; empty for others."""
+    variances = [bayer.noise_variance(frame.shots, frame.shot_var, frame.read_var) for frame in frames]
+    found = [-10.0 * math.log10(max(float(variance.mean()), 1e-12)) for variance in variances]
+    if not found or (typical := median(found)) < FAINT:
+        return ""
+    return (
+        f"note: these frames have next to no noise ({typical:.1f} dB PSNR): a denoiser can learn little from them; "
+        "take frames of a higher ISO, or these as clean ones: rawaug run fewshot"
+    )
 
 
 class FrozenPictures(Lazy[NoisyFrame]):

@@ -62,7 +62,8 @@ def test_the_verdict_says_whether_the_gain_is_more_than_noise(
         return {"psnr": psnr, "images": [{"psnr": psnr + spread}, {"psnr": psnr - spread}]}
 
     arms = {"real": [{"plain": scores(psnr, 2.0)} for psnr in seeds], "weak": [{"plain": scores(30.0)}] * len(seeds)}
-    assert re.match(said, verdict(arms, {"NLM": scores(other), "TV": scores(20.0)}))
+    chosen, why = verdict(arms, {"NLM": scores(other), "TV": scores(20.0)})
+    assert re.match(said, why) and why.startswith(f"Use {chosen}: ")
 
 
 def test_the_table_names_every_arm(capsys: pytest.CaptureFixture[str]) -> None:

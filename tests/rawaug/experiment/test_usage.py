@@ -1,0 +1,99 @@
+"""What a run says at its ends: which settings a network has, and the command that uses what the verdict names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from rawaug.bayer import CFA
+from rawaug.commands.run import run
+from rawaug.data import demo_pairs
+from rawaug.evaluation.tables import verdict
+from rawaug.experiment import plan
+from rawaug.experiment.denoising import TrainingRun
+from rawaug.registry import DENOISERS
+from rawaug.training.noisy_frames import NoisyFrame, faintness_note, noise_of
+
+
+def scores(psnr: float) -> dict[str, Any]:
+    return {"psnr": psnr, "psnr_noisy": 30.0, "images": [{"name": "a", "psnr": psnr, "psnr_noisy": 30.0}]}
+
+
+@pytest.mark.parametrize(
+    ("arm", "last"),
+    [
+        ((41.0, 41.2), "to use mine: rawaug denoise IN.dng OUT.dng --denoiser runs/seed1/mine/denoiser.safetensors"),
+        ((39.0, 39.2), "to use rawaug-small: rawaug denoise IN.dng OUT.dng --denoiser rawaug-small"),
+    ],
+)
+def test_the_last_line_is_the_command_of_the_verdict(arm: tuple[float, ...], last: str) -> None:
+    results = {"mine": [{"plain": scores(psnr)} for psnr in arm]}
+    others = {"rawaug-small": scores(40.0), "Wavelet strength=0.5": scores(35.0)}
+    said = usage(results, others)
+    assert said[-1] == last and verdict(results, others)[1].startswith(f"Use {last.split(': ')[0][7:]}: ")
+
+
+def test_a_filter_or_nothing_is_used_as_the_verdict_says() -> None:
+    results = {"mine": [{"plain": scores(29.0)}]}
+    assert usage(results, {"Wavelet strength=0.5": scores(35.0)})[-1].endswith(
+        """--classical '{"name": "Wavelet", "settings": {"strength": 0.5}}'"""
+    )
+    assert usage(results, {})[-1] == "to use: nothing, the frames are best as they are"
+
+
+def usage(results: Any, others: Any) -> list[str]:
+    made: Any = SimpleNamespace(
+        place=lambda arm, seed: Path("runs") / f"seed{seed}" / arm,
+        seeds=range(len(results["mine"])),
+        untouched={"rawaug-small": None},
+        recipe=SimpleNamespace(untouched=["rawaug-small"]),
+        classical=[{"name": "Wavelet", "settings": {"strength": 0.5}}],
+    )
+    return TrainingRun.usage(made, results, others)
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    found: list[Any] = []
+    monkeypatch.setattr(plan, "dry_run", lambda kind, settings, overwrite: found.append(settings))
+    return found
+
+
+def test_another_network_has_its_own_settings(given: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    run("fewshot", "--denoiser.name", "DnCNN", dry_run=True)
+    assert given[-1].denoiser.name == "DnCNN" and given[-1].denoiser.settings == {}
+    assert "denoiser: the settings of UNet are dropped for DnCNN's own" in capsys.readouterr().out
+    run("fewshot", "--denoiser", "DHDN", "--denoiser.settings.width", "8", dry_run=True)
+    assert given[-1].denoiser.name == "DHDN" and given[-1].denoiser.settings == {"width": 8}
+    run("fewshot", "--denoiser.name", "UNet", dry_run=True)
+    assert given[-1].denoiser.settings == {"width": 16, "scales": 4}
+    run("srgb", "--denoiser.name", "DnCNN", dry_run=True)
+    assert given[-1].denoiser.settings == {"channels": 3, "variance_map": False}
+
+
+def test_an_unknown_network_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ValueError, match=r"denoiser 'DHDNN' is unknown; use one of .*\(nearest: DHDN\)"):
+        run("fewshot", "--denoiser", "DHDNN", dry_run=True)
+
+
+def test_the_help_lists_the_networks_of_the_registry(capsys: pytest.CaptureFixture[str]) -> None:
+    run("fewshot", keys=True)
+    text = " ".join(capsys.readouterr().out.split())
+    assert all(name in text for name in DENOISERS)
+
+
+def test_frames_without_known_noise_ask_for_the_command_to_type() -> None:
+    with pytest.raises(ValueError, match="add --noise camera to measure them"):
+        noise_of(replace(demo_pairs("train", count=1)[0], shot_var=None, read_var=None), None)
+
+
+def test_frames_with_next_to_no_noise_are_named_before_training() -> None:
+    mosaic = torch.full((1, 8, 8), 0.2)
+    clean = [NoisyFrame("a", mosaic, 1e-5, 1e-7, CFA.RGGB)]
+    assert "next to no noise (56.8 dB PSNR)" in faintness_note(clean)
+    assert faintness_note([NoisyFrame("a", mosaic, 1e-3, 1e-5, CFA.RGGB)]) == faintness_note([]) == ""
