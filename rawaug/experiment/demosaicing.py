@@ -73,6 +73,10 @@ class JointRecipe(Recipe):
         if self.classical or self.untouched:
             raise ValueError("classical and untouched: denoisers to compare with are named in rivals")
 
+    @property
+    def validated_with(self) -> object:
+        return self.test_noise
+
 
 @EXPERIMENTS.register("demosaic")
 def run(recipe: JointRecipe, overwrite: bool = False, **given: Sequence[Pair]) -> Results:

@@ -103,13 +103,14 @@ class TrainingRun:
         self.classical = installed_classical(recipe.classical, shown=_leads())
         if recipe.noise != "camera":
             noise_model(recipe.noise)
-        for arm in recipe.arms:
+        self.estimators = {label: ESTIMATORS.make(arm.estimator) for label, arm in recipe.arms.items()}
+        for arm, estimator in self.estimators.items():
             network = first_network(recipe.network_of(arm), seed=0)
+            estimator.require(network)
             if (network.upscale > 1) != (recipe.target == "rgb"):
                 named = recipe.network_of(arm).start or type(network).__name__
                 gives = "full colour: rawaug run demosaic trains it" if network.upscale > 1 else "no full colour"
                 raise ValueError(f"denoiser: {named} gives {gives}; take another network")
-        self.estimators = {label: ESTIMATORS.make(arm.estimator) for label, arm in recipe.arms.items()}
         self.starts = {arm: start_of(recipe.network_of(arm)) for arm in recipe.arms}
         self.untouched = [RawDenoiser.of(find(name), recipe.device, name=Path(name).stem) for name in recipe.untouched]
         plan = planned(recipe, given)
@@ -232,7 +233,8 @@ class TrainingRun:
         real = isp.info["key"], recipe.noise, data.pairs, stamps(self.pairs)
         pictures = data.pictures, len(self.pictures), data.max_pixels
         how = recipe.target, asdict(recipe.arms[arm]), self.estimators[arm].revision, start and start.sha256
-        validation = (data.validation, data.validation_crop, stamps(self.validation)) if self.validation else None
+        watched = data.validation, data.validation_crop, stamps(self.validation), recipe.validated_with
+        validation = watched if self.validation else None
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 

@@ -236,6 +236,10 @@ class Recipe:
                     SRGB_NOISE.make(arm.srgb_noise)
                     if self.target != "srgb":
                         raise ValueError(f"srgb_noise is for target 'srgb', not {self.target!r}; omit it")
+                name, _ = name_and_settings(arm.estimator)
+                weigh, known = self.loop_of(label).weigh, ESTIMATORS[name].weighings
+                if weigh not in known:
+                    raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(known)}")
             except ValueError as error:
                 raise ValueError(f"arms.{label}: {error}") from None
 
@@ -256,6 +260,11 @@ class Recipe:
         if find_device(self.device).type == "cpu":
             train = replace(train, batch=min(train.batch, 4 * self.devices))
         return replace(self, data=data, isp=self.isp.shortest(), train=train, steps=None, seeds=1, views=4)
+
+    @property
+    def validated_with(self) -> object:
+        """What the scores of validation frames depend on, besides the frames and what the training depends on."""
+        return None
 
     @property
     def self_supervised(self) -> bool:

@@ -86,6 +86,10 @@ class SrgbRecipe(Recipe):
             if (name := name_and_settings(spec)[0]) not in _WITHOUT_PLANES:
                 raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
 
+    @property
+    def validated_with(self) -> object:
+        return self.levels
+
 
 @EXPERIMENTS.register("srgb")
 def run(recipe: SrgbRecipe, overwrite: bool = False) -> Results:

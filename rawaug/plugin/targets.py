@@ -10,8 +10,8 @@ developed clean RAW is the target, not the picture, which demosaicing alone woul
 
 *Bursts* are several noisy frames of one scene, moved by the hand that holds the camera. Frame k shows the scene of the
 first frame at ``R(angle) (p - c) + c + (dy, dx)`` for pixel p and centre c, in sensor pixels: light is interpolated
-(bicubic) before the mosaic, so that each frame samples the scene at other places, and has noise of its own. Lens
-shading and defects of the sensor stay where they are. What comes into view at the edges is reflected.
+(bicubic, and clipped at black) before the mosaic, so that each frame samples the scene at other places, and has noise
+of its own. Lens shading and defects of the sensor stay where they are. What comes into view at the edges is reflected.
 """
 
 from __future__ import annotations
@@ -128,6 +128,7 @@ class Burst:
     def frames_of(self, scene: Tensor, motion: Tensor) -> Tensor:
         """Linear light ``(B, 3, H, W)`` as the frames see it, ``(B * N, 3, H, W)``."""
         moving = moved(scene.repeat_interleave(self.frames, 0), motion.flatten(0, 1))
+        moving.clamp_(min=0.0)  # beside edges a bicubic curve undershoots
         first = (motion == 0.0).all(-1).flatten().nonzero()[:, 0].to(scene.device)
         moving[first] = scene[first // self.frames]  # which nothing interpolates
         return moving

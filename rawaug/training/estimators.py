@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -36,7 +36,7 @@ from denoisers.network import Denoiser
 from rawaug.bayer import noise_variance
 from rawaug.data.pairs import Sample
 from rawaug.registry import ESTIMATORS
-from rawaug.training.criteria import Criterion
+from rawaug.training.criteria import WEIGHINGS, Criterion
 
 
 @ESTIMATORS.register("supervised")
@@ -46,14 +46,19 @@ class Supervised:
     Attributes:
         sees_clean: whether it needs clean frames; a recipe cannot mix estimators that do with others.
         revision: increased whenever it makes other samples of the same frames, so that old weights are trained anew.
+        weighings: those of :mod:`rawaug.training.criteria` that it can be trained with.
     """
 
     sees_clean: ClassVar[bool] = True
     revision: ClassVar[int] = 0
+    weighings: ClassVar[Collection[str]] = WEIGHINGS
 
     def loss(self, model: Any, sample: Any, criterion: Criterion, progress: float = 1.0) -> Tensor:
         """The loss of a batch, a scalar; ``progress`` is the share of the training that is over."""
         return criterion(model(sample.noisy, sample.variance), sample.clean)
+
+    def require(self, model: Denoiser) -> None:
+        """Refuse a network that it cannot train, by a ValueError."""
 
     def corrected(self, model: Denoiser) -> Denoiser:
         """The denoiser to use in place of the trained network: itself, or a new one."""
@@ -83,12 +88,16 @@ class NoisyCrop(NamedTuple):
 
 
 class SelfSupervised(Supervised, ABC):
-    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames."""
+    """Base: ``apply(crop, sample(shape, generator))`` makes a training sample of noisy frames.
+
+    Of the weighings those remain whose factors do not depend on the noisy target: the others would move its mean.
+    """
 
     shots: ClassVar[int] = 1
     adds_noise: ClassVar[bool] = False
     sees_clean = False
     revision = 1  # since weights are chosen on r2r pairs
+    weighings: ClassVar[Collection[str]] = ("linear", "normalised")
 
     def sample(self, shape: torch.Size, generator: torch.Generator) -> Tensor:
         """All that is random for a packed crop of ``shape`` (4, h, w); by default white noise of variance 1."""
@@ -132,6 +141,13 @@ class Noisier(_AddsNoise):
     def apply(self, crop: NoisyCrop, drawn: Tensor) -> Sample:
         noisier, variance = self.recorrupted(crop, drawn)
         return Sample(noisier, crop.shots[0], variance)
+
+    def require(self, model: Denoiser) -> None:
+        if self.correct and model.domain not in ("linear", "ksigma"):
+            raise ValueError(
+                f"estimator: noisier with correct extrapolates the RAW, which a network in the domain {model.domain} "
+                "does not add to; use r2r, or a network in the domain linear or ksigma"
+            )
 
     def corrected(self, model: Denoiser) -> Denoiser:
         if not self.correct:
@@ -207,6 +223,8 @@ class Neighbor2Neighbor(SelfSupervised):
         gamma: weight of the second term at the end; it grows in proportion to the steps. Published: 2 for synthetic
             noise, 16 for the RAW of SIDD; the larger it is, the smoother the result.
     """
+
+    weighings = ("linear",)  # two pixels of different noise are compared
 
     def __init__(self, gamma: float = 2.0) -> None:
         if gamma < 0:

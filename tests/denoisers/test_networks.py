@@ -431,6 +431,27 @@ def test_a_pyramid_takes_out_wide_noise_and_leaves_the_scene(channels: int) -> N
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_pyramid_is_told_the_variance_that_is_left_at_every_scale(channels: int) -> None:
+    seen: list[tuple[float, float]] = []
+
+    class Told(Denoiser):
+        def __init__(self) -> None:
+            super().__init__(channels, True, False, 1, {}, pyramid=2)
+
+        def residual(self, features: Tensor) -> Tensor:
+            picture, variance = (x[..., 4:-4, 4:-4] for x in features.split(channels, dim=1))
+            seen.append((picture.var().item(), variance.mean().item()))
+            return torch.zeros_like(features[:, :channels])
+
+    noise = 0.05 * torch.randn(1, channels, 512, 512, generator=torch.Generator().manual_seed(0))
+    Told()(0.4 + noise, torch.full_like(noise, 0.05**2))
+    assert len(seen) == 3
+    for measured, told in seen:
+        assert told == pytest.approx(measured, rel=0.3)  # binned packed RAW is a little correlated
+
+
+@torch.no_grad()
 def test_a_pyramid_asks_nothing_of_clipped_values() -> None:
     bright = 1.1 + 0.1 * torch.randn((1, 4, 64, 64), generator=torch.Generator().manual_seed(0))
     bright[..., 32:] -= 0.6

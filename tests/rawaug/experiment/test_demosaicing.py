@@ -104,6 +104,9 @@ def test_the_recipe_compares_it_with_one_after_the_other(tmp_path: Path, capsys:
     assert plain["psnr"] == pytest.approx(plain["psnr_noisy"], abs=1.0), "two steps from the interpolation of the noisy"
     assert all(scores["psnr"] > plain["psnr_noisy"] + 3 for scores in written["rivals"].values())
     assert "Wavelet, DCB" in capsys.readouterr().out
+    other = small(tmp_path, test_noise="upi", rivals=[])
+    run(other, overwrite=True, test=[a_pair(name="test")], validation=[a_pair(name="validation")])
+    assert "already trained" not in capsys.readouterr().out, "the noise of validation chooses the weights"
 
 
 def test_what_it_cannot_compare_is_refused(tmp_path: Path) -> None:

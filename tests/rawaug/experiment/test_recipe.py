@@ -6,7 +6,7 @@ import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -14,12 +14,13 @@ from rawaug.cli import main
 from rawaug.commands.run import with_values
 from rawaug.experiment import plan
 from rawaug.experiment.plan import settings_of
-from rawaug.experiment.recipe import find_recipe, kind_of, read_recipe
+from rawaug.experiment.recipe import ArmConfig, Recipe, find_recipe, kind_of, read_recipe
 from rawaug.isp.fit.samples import BLOCK
 from rawaug.paper.baselines import BASELINES
 from rawaug.paper.methods import FAMILIES, ROWS
 from rawaug.paper.reconstruction import Comparison
 from rawaug.registry import EXPERIMENTS
+from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
@@ -136,6 +137,22 @@ def test_null_or_a_setting_that_nobody_means_is_named(
     (tmp_path / "a.yaml").write_text(f"{line}\n" if "experiment" in line else f"{head}{line}\n")
     text = refused("run", tmp_path / "a.yaml", "--out", tmp_path)
     assert re.search(named, text)
+
+
+@pytest.mark.parametrize("name", ["noisier", "noise2noise", "r2r", "neighbor2neighbor"])
+def test_a_weighing_that_moves_the_mean_of_noisy_targets_is_refused(name: str) -> None:
+    unbiased = ["linear"] if name == "neighbor2neighbor" else ["linear", "normalised"]
+    for weigh in get_args(Weighing):
+        given: dict[str, Any] = {"own": ArmConfig(1.0, estimator=name, weigh=weigh)}
+        for arms, train in (
+            (given, TrainConfig()),
+            ({"own": ArmConfig(1.0, estimator=name)}, TrainConfig(weigh=weigh)),
+        ):
+            if weigh in unbiased:
+                Recipe(arms=arms, train=train)
+                continue
+            with pytest.raises(ValueError, match=f"arms.own: weigh: {weigh} is not for noisy targets of {name}; use"):
+                Recipe(arms=arms, train=train)
 
 
 def test_on_and_off_are_words_and_truth_values_stay(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,9 +17,9 @@ from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.evaluation.scores import results, score
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.experiment.srgb import SrgbRecipe, best_filter, developed, filtered, srgb_trials
+from rawaug.experiment.srgb import SrgbRecipe, SrgbRun, best_filter, developed, filtered, srgb_trials
 from rawaug.metrics import psnr
-from rawaug.training.config import DenoiserConfig
+from rawaug.training.config import DenoiserConfig, TrainConfig
 
 LEVELS = [(1e-9, 1e-12), (2e-3, 1e-5)]
 SMALL = [
@@ -104,6 +105,39 @@ def test_the_recipe_scores_every_arm_and_method_at_every_level(
     assert "0.002, 1e-05" in said and (tmp_path / "srgb" / "picture.png").is_file()
     assert main(["run", "srgb", *SMALL, "--out", str(tmp_path), "--seeds", "2"]) == 0
     assert capsys.readouterr().out.count("already trained") == 6
+
+
+@pytest.mark.usefixtures("tiny")
+def test_the_strength_of_a_filter_is_chosen_on_validation_whatever_the_test_frames_are(
+    pairs: list[Pair], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Flat validation frames choose a strong filter, which test frames with detail would not have chosen."""
+    test = pairs[0]
+    flat = replace(test, name="flat", raw=torch.full_like(test.raw, 0.2))
+    detailed = replace(test, name="detailed", raw=test.raw.clone())
+    recipe = SrgbRecipe(
+        name="a",
+        data=DataConfig(pairs=None, pictures="tiny:"),
+        camera="universal",
+        arms={"gaussian": ArmConfig(1.0, srgb_noise="Gaussian")},
+        denoiser=DenoiserConfig(settings={"width": 4, "scales": 2, "channels": 3, "variance_map": False}),
+        train=TrainConfig(steps=1, batch=1, crop=32),
+        classical=["NonLocalMeans"],
+        rivals=[],
+        levels=[(8e-3, 1e-4)],
+        device="cpu",
+        out=str(tmp_path),
+    )
+    found = {}
+    for frame in (flat, detailed):
+        SrgbRun(recipe, True, {"validation": [frame], "test": [test]}).all_stages()
+        others = json.loads((tmp_path / "a" / "results.json").read_text())["others"]
+        found[frame.name] = others["NonLocalMeans"]["0.008, 0.0001"]["psnr"]
+    assert found["flat"] < found["detailed"] - 0.2
+    capsys.readouterr()
+    other = replace(recipe, classical=[], levels=[(2e-3, 1e-5)])
+    SrgbRun(other, True, {"validation": [detailed], "test": [test]}).all_stages()
+    assert "already trained" not in capsys.readouterr().out, "the levels of validation choose the weights"
 
 
 def test_what_has_no_meaning_is_refused() -> None:

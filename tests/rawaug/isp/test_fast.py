@@ -186,6 +186,17 @@ def test_gradients_of_fast_forward_are_those_of_the_isp() -> None:
 
 
 @pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("method", bayer.DIRECTIONAL)
+def test_a_choice_of_direction_sees_nothing_below_black(method: str) -> None:
+    """RAW developers clip before they compare directions, so that noise around black does not choose."""
+    isp = DictionaryISP.from_pretrained("universal").requires_grad_(False)
+    params, forward = isp.draw_setting(1, torch.Generator().manual_seed(1)), FastForward(isp)
+    raw = 0.02 * torch.randn(1, 1, 32, 48, generator=torch.Generator().manual_seed(0)) + 0.01
+    below, clipped = forward.develop([raw, raw.clamp_min(0.0)], [method], params)
+    assert torch.equal(below, clipped) and clipped.std() > 0.01
+
+
+@pytest.mark.usefixtures("either_way")
 @pytest.mark.parametrize("cfa", list(bayer.CFA))
 def test_mosaics_are_demosaiced_by_their_own_method_and_developed(cfa: bayer.CFA) -> None:
     isp, methods = DictionaryISP.from_pretrained("universal"), ["malvar", "bilinear", "malvar"]

@@ -74,6 +74,26 @@ def undone(frames: Tensor, motion: Tensor) -> Tensor:
     return moved(frames.flatten(0, 1), back).unflatten(0, frames.shape[:2])[..., 16:-16, 16:-16]
 
 
+def test_a_frame_shows_the_scene_where_its_motion_says() -> None:
+    """``R(angle) (p - c) + c + (dy, dx)`` in rows that go down: after a quarter turn what was below is on the right."""
+    scene = torch.rand(1, 3, 24, 24, generator=seeded())
+    turned = moved(scene, torch.tensor([[0.0, 0.0, math.pi / 2]]))
+    torch.testing.assert_close(turned, torch.rot90(scene, 1, (-2, -1)), atol=1e-3, rtol=0)
+    both = moved(scene, torch.tensor([[3.0, -2.0, math.pi / 2]]))
+    inner = (..., slice(6, 18), slice(6, 18))
+    torch.testing.assert_close(
+        both[inner], torch.rot90(scene.roll((-3, 2), (-2, -1)), 1, (-2, -1))[inner], atol=1e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize("target", ["raw", "rgb"])
+def test_a_moved_frame_is_not_darker_than_black(universal: DictionaryISP, target: Any) -> None:
+    stripes = torch.zeros(1, 3, 64, 96)
+    stripes[..., ::8] = stripes[..., 1::8] = 1.0
+    pair = RawAugment(universal, noise=(0.0, 0.0), burst=4, motion=(2.0, 2.0), target=target)(stripes, seeded())
+    assert pair.noisy.min() >= 0.0 and pair.clean.min() >= 0.0 and pair.noisy.max() > 0.3
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
 def test_undoing_the_saved_motion_gives_the_scene_back(universal: DictionaryISP, noise: float) -> None:
     coarse = torch.rand(2, 3, 3, 4, generator=seeded())

@@ -115,6 +115,13 @@ def test_every_demosaicing_and_quality_is_drawn_and_a_low_quality_costs_more(uni
     assert psnr(high.noisy, without.noisy).min() > psnr(low.noisy, without.noisy).max()
 
 
+def test_the_target_of_a_jpeg_is_the_picture_before_it_was_compressed(universal: DictionaryISP) -> None:
+    srgb = smooth()
+    settings: dict[str, Any] = {"noise": (1e-3, 1e-5), "target": "srgb", "demosaicing": "malvar"}
+    without, low = (RawAugment(universal, jpeg=jpeg, **settings)(srgb, seeded()) for jpeg in (None, (10, 10)))
+    assert torch.equal(low.clean, without.clean) and not torch.equal(low.noisy, without.noisy)
+
+
 def test_datasets_and_loaders_collate_them(universal: DictionaryISP) -> None:
     augment = RawAugment(universal, target="srgb", jpeg=(80, 90))
     pictures = list((smooth(4) * 255).to(torch.uint8))

@@ -105,6 +105,16 @@ def test_the_variance_map_is_that_of_the_input(alpha: float) -> None:
         assert float(sample.variance.mean()) == pytest.approx(float((sample.noisy - clean).var()), rel=0.02)
 
 
+def test_the_noise_map_of_two_shots_is_that_of_the_one_that_is_the_input() -> None:
+    clean, shots = scene_and_shots(2)
+    chosen = set()
+    for seed in range(8):
+        sample = sampled(Noise2Noise(), crop_of(shots, clean), seed)
+        assert torch.equal(sample.variance, noise_variance(sample.noisy, SHOT_VAR, READ_VAR))
+        chosen.add(torch.equal(sample.noisy, shots[0]))
+    assert chosen == {True, False}, "either shot may be the input"
+
+
 def test_inputs_are_clipped_at_white_and_targets_are_not() -> None:
     shots = torch.ones(1, 4, 32, 32)
     for estimator in (Noisier(), R2R()):
@@ -130,6 +140,23 @@ def test_the_correction_is_the_extrapolation_of_the_network(name: str, settings:
         torch.testing.assert_close(corrected, expected, rtol=1e-4, atol=1e-4)
         assert torch.equal(net(noisy, variance), taught)  # the trained network itself is left as it was
     assert Noisier(alpha).corrected(net) is net and Supervised().corrected(net) is net
+
+
+@pytest.mark.parametrize("domain", ["linear", "ksigma", "anscombe"])
+def test_a_network_whose_correction_is_no_extrapolation_is_refused(domain: str) -> None:
+    net = denoisers.build("UNet", width=4, scales=2, domain=domain)
+    net.initialise(seed=3)
+    noisy = 0.1 + 0.5 * torch.rand(1, 4, 16, 16, generator=torch.Generator().manual_seed(0))
+    variance, estimator = noise_variance(noisy, SHOT_VAR, READ_VAR), Noisier(1.0, correct=True)
+    with torch.no_grad():
+        exact = torch.allclose(estimator.corrected(net)(noisy, variance), 2 * net(noisy, variance) - noisy, atol=1e-4)
+    assert exact == (domain != "anscombe")
+    Noisier(1.0).require(net)
+    if exact:
+        estimator.require(net)
+    else:
+        with pytest.raises(ValueError, match=r"noisier with correct .* in the domain anscombe .* use r2r"):
+            estimator.require(net)
 
 
 def test_neighbours_touch_and_differ() -> None:

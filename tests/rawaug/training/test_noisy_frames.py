@@ -133,6 +133,16 @@ def test_held_out_frames_are_recorrupted_at_their_signal() -> None:
     assert float(added.var()) == pytest.approx(1.0, rel=0.03)
 
 
+def test_held_out_frames_have_noise_of_their_own_by_name() -> None:
+    scene = torch.full((1, 32, 32), 0.2)
+    first, other, again = (
+        held_out([NoisyFrame(name, scene, 8e-3, 3e-4, CFA.RGGB, scene)], CFA.RGGB)[0] for name in ("a", "b", "a")
+    )
+    assert torch.equal(first.noisy, again.noisy)
+    noise, others = ((sample.noisy - 0.2).flatten() for sample in (first, other))
+    assert abs(torch.corrcoef(torch.stack([noise, others]))[0, 1].item()) < 0.15
+
+
 def test_real_frames_are_estimated_once_and_only_for_estimators_that_add_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     estimated: list[int] = []
 

@@ -16,8 +16,8 @@ from rawaug.experiment.arms import in_pattern
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import noise_model
-from rawaug.training.config import DenoiserConfig
-from rawaug.training.state import first_network, start_of
+from rawaug.training.config import DenoiserConfig, TrainConfig
+from rawaug.training.state import TrainingState, first_network, start_of
 
 
 @pytest.fixture
@@ -55,6 +55,21 @@ def test_without_a_start_the_seed_draws_the_weights() -> None:
     first, again, other = (first_network(config, seed).state_dict() for seed in (1, 1, 2))
     assert all(torch.equal(first[key], again[key]) for key in first)
     assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
+@pytest.mark.parametrize("decay", [0.5, 0.9])
+def test_the_average_forgets_at_the_decay_of_the_recipe(decay: float) -> None:
+    net = first_network(DenoiserConfig("UNet", {"width": 4, "scales": 2}), seed=0)
+    state = TrainingState(net, TrainConfig(ema=decay))
+    for _ in range(150):  # at first it forgets faster
+        state.average.update_parameters(net)
+    before = [weights.clone() for weights in state.averaged.parameters()]
+    with torch.no_grad():
+        for weights in net.parameters():
+            weights.add_(1.0)
+    state.average.update_parameters(net)
+    for old, new in zip(before, state.averaged.parameters(), strict=True):
+        torch.testing.assert_close(new, old + (1.0 - decay), rtol=0.0, atol=1e-5)
 
 
 def test_an_isp_behind_another_pattern_has_the_same_colours() -> None:

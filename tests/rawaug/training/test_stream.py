@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rawaug import bayer
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, noise_variance
 from rawaug.data import demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.pairs import Pair
 from rawaug.isp.model import DictionaryISP
@@ -35,6 +35,20 @@ def test_crops_of_any_sensor_come_in_the_networks_pattern(cfa: CFA) -> None:
         sample = crops.draw(torch.Generator().manual_seed(seed))
         assert torch.equal(sample.clean, expected)
         assert torch.equal(sample.noisy, expected)
+
+
+@pytest.mark.parametrize("source", ["captured", "drawn", "made of pictures"])
+def test_the_noise_map_of_a_sample_is_that_of_its_noisy_frame(source: str) -> None:
+    """No network is told of the clean frame, not even through its noise map, wherever a sample comes from."""
+    pair = replace(demo_pairs("train", count=1)[0], shot_var=1e-2, read_var=1e-4)
+    if source == "drawn":
+        pair = replace(pair, noisy=None, shot_var=None, read_var=None)
+    real = RealCrops([pair], noise_model((1e-2, 1e-4)), crop=32, cfa=pair.cfa)
+    pictures = RawPairs(demo_pictures(1), RawAugment(DictionaryISP(), noise=(1e-2, 1e-4)), crop=32)
+    stream = TrainingStream(real, pictures, batch=1, augmented=float("pictures" in source), seed=0)
+    sample = stream[0]
+    assert not torch.allclose(sample.noisy, sample.clean, atol=1e-2)
+    torch.testing.assert_close(sample.variance, noise_variance(sample.noisy, 1e-2, 1e-4))
 
 
 @pytest.mark.parametrize("levels", [True, False])

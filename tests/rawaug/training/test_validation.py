@@ -36,6 +36,20 @@ def test_thirds_by_noise_whatever_the_order() -> None:
     assert set(validate(Nothing(), frames[:2], CPU)) == {"psnr"}
 
 
+class Dropping(Nothing):
+    """Drops half of what it is given, in train mode."""
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        return torch.nn.functional.dropout(noisy, 0.5, self.training)
+
+
+def test_a_network_is_validated_in_eval_mode_and_goes_on_in_train_mode() -> None:
+    net, clean = Dropping().train(), torch.full((1, 4, 32, 32), 0.5)
+    frame = Trial(clean + 0.01, clean, clean)
+    assert validate(net, [frame], CPU)["psnr"] == pytest.approx(40.0, abs=0.01) and net.training
+    assert torch.equal(panels(net, frame), panels(Nothing(), frame)) and net.training
+
+
 class Doubled(torch.nn.Module):
     """Full colour of packed RAW."""
 
