@@ -357,8 +357,8 @@ class TrainingRun:
         if chosen in results:
             runs = [run["plain"].get("psnr", 0.0) for run in results[chosen]]
             what = f"--denoiser {files[chosen, self.seeds[runs.index(max(runs))]]}"
-        elif chosen in [one.name for one in self.untouched]:
-            what = f"--denoiser {next(name for name in self.recipe.untouched if Path(name).stem == chosen)}"
+        elif untouched := [name for name in self.recipe.untouched if Path(name).stem == chosen]:
+            what = f"--denoiser {untouched[0]}"
         elif chosen in others:
             spec = next(spec for spec in self.classical if label_of(spec) == chosen)
             what = f"--classical {spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))}"
