@@ -14,7 +14,10 @@ from rawaug.camera_names import alike, key_of
 from rawaug.files import find_weights, read_header, sha256
 from rawaug.isp.cameras import published_cameras
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise.cameras import measured_ranges, published_profiles
+from rawaug.noise.cameras import SPREAD, measured_ranges, profile_ends, published_profiles
+
+_WITH_LEVELS = 3
+"""So few cameras are listed with their levels."""
 
 
 def run(weights: str, /, *part: str, json: bool = False) -> None:
@@ -38,6 +41,8 @@ def run(weights: str, /, *part: str, json: bool = False) -> None:
 def cameras(part: str = "") -> list[dict[str, Any]]:
     """The cameras with ``part`` in their names: ``name``, ``xyz_to_camera`` (3 x 3) and ``iso`` of the noise, or None.
 
+    One with a noise profile has ``noise``, the least and the greatest levels that are likely by ISO.
+
     Raises:
         ValueError: if there is none.
     """
@@ -52,16 +57,25 @@ def cameras(part: str = "") -> list[dict[str, Any]]:
     wanted = sorted(alike(part, named), key=str.casefold)
     if not wanted:
         raise ValueError(f"no camera has {part!r} in its name; rawaug info cameras lists all")
-    return [named[name] for name in wanted]
+    few = {name for name in wanted if part and name in limits}
+    return [named[name] | ({"noise": profile_ends(name)} if name in few else {}) for name in wanted]
 
 
 def _listed(found: Sequence[Mapping[str, Any]]) -> str:
     width = max(len(camera["name"]) for camera in found)
-    lines = [f"{'camera':<{width}}  matrix  noise measured at ISO"]
+    shot, read = ("{:.2f} to {:.2f}".format(*ends) for ends in SPREAD)
+    known = f"a profile's shot_var within {shot}, read_var {read}"
+    lines = [f"{'camera':<{width}}  matrix  noise measured at ISO ({known})"]
     for camera in found:
         iso = "-" if camera["iso"] is None else "{:g} to {:g}".format(*camera["iso"])
         lines.append(f"{camera['name']:<{width}}  {'-' if camera['xyz_to_camera'] is None else 'yes':<6}  {iso}")
+        lines += [_level_row(*ends) for ends in camera.get("noise", ()) if len(found) <= _WITH_LEVELS]
     return "\n".join(lines)
+
+
+def _level_row(iso: float, shot_var: tuple[float, float], read_var: tuple[float, float]) -> str:
+    shot, read = ("{:.2e} to {:.2e}".format(*ends) for ends in (shot_var, read_var))
+    return f"  ISO {iso:<7g} shot_var {shot}   read_var {read}"
 
 
 def as_json(weights: str | Path) -> dict[str, Any]:

@@ -19,9 +19,11 @@ no name: ``{"pair_psnr": 41.18}``.
 
 *Profiles.* darktable has var = a y + b for 374 cameras by ISO. Its red and blue figures contain a white balance, so the
 green ones serve all channels. It measures after demosaicing, where noise has been averaged: for four cameras that ELD
-measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance. All are
-multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the median shot_var at ISO 100 is
-then 2.8e-5, a full well of 36,000 electrons. Rows whose green variance is not positive are left out.
+measured on the mosaic its profiles are too low, by 7.2 to 11.4 in shot variance and 2.2 to 16 in read variance
+(:data:`SPREAD`). All are multiplied by the geometric means, :data:`SHOT_ON_MOSAIC` and :data:`READ_ON_MOSAIC`; the
+median shot_var at ISO 100 is then 2.8e-5, a full well of 36,000 electrons. A fifth camera bears the first factor out:
+frames of a Nikon D5000 at ISO 200 measure 2.6 to 3.2e-5, and its profile gives 3.09e-5. ``any camera`` draws the
+factors, log-uniformly over the spread and each on its own. Rows whose green variance is not positive are left out.
 
 *Measured cameras.* Between the ISO values of a fitted camera's files, the logarithms of both variances are linear in
 that of the ISO. Outside the measured range an ISO is refused. Files without an ISO give one level for every picture.
@@ -70,6 +72,8 @@ from rawaug.seeding import keyed_generator
 ANY_CAMERA = "any camera"
 SHOT_ON_MOSAIC = 8.6
 READ_ON_MOSAIC = 6.2
+SPREAD = ((7.2 / SHOT_ON_MOSAIC, 11.4 / SHOT_ON_MOSAIC), (2.2 / READ_ON_MOSAIC, 16.0 / READ_ON_MOSAIC))
+"""Of the levels of a profile, shot_var and read_var: the least and the greatest part that a camera may really have."""
 _ROUNDING = 1e-9  # of logarithms that are the same ISO
 _LEAST = 1e-12  # stands for a variance of 0 in the logarithms
 
@@ -112,7 +116,10 @@ def published_profiles() -> Profiles:
 
 
 class ProfileLevels:
-    """Levels of one camera's profile, or of any, each alike, within its share of the limits of the ISO."""
+    """Levels of one camera's profile, or of any, each alike, within its share of the limits of the ISO.
+
+    Of any camera they are drawn within :data:`SPREAD`; of one camera they are the middle of it.
+    """
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
         profiles = published_profiles()
@@ -129,6 +136,7 @@ class ProfileLevels:
         if not within.any():
             raise ValueError(f"no camera has a profile within ISO {iso}; widen the range")
         self.cameras, self.limits = chosen[within], limits[within]
+        self.spread = camera.casefold() == ANY_CAMERA
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         device = generator.device
@@ -139,7 +147,39 @@ class ProfileLevels:
         right = torch.searchsorted(iso, at[:, None]).clamp(1, iso.shape[1] - 1)
         (x0, x1), (s0, s1), (r0, r1) = ((y.gather(1, right - 1), y.gather(1, right)) for y in (iso, shot, read))
         t = ((at[:, None] - x0) / (x1 - x0)).clamp(0.0, 1.0)
-        return torch.exp(torch.lerp(s0, s1, t))[:, 0].float(), torch.exp(torch.lerp(r0, r1, t))[:, 0].float()
+        levels = [torch.exp(torch.lerp(y0, y1, t))[:, 0].float() for y0, y1 in ((s0, s1), (r0, r1))]
+        if self.spread:
+            levels = [y * log_uniform(ends, batch, generator) for y, ends in zip(levels, SPREAD, strict=True)]
+        return levels[0], levels[1]
+
+
+class LevelEnds(NamedTuple):
+    """The least and the greatest level that one camera is likely to have at an ISO, white = 1."""
+
+    iso: float
+    shot_var: tuple[float, float]
+    read_var: tuple[float, float]
+
+
+def profile_ends(camera: str) -> list[LevelEnds]:
+    """How far the levels of a camera's profile are known, at its lowest ISO and that doubled up to its highest.
+
+    Raises:
+        ValueError: if the camera has no profile.
+
+    Example:
+        >>> iso, shot_var, _ = profile_ends("Sony ILCE-7M3")[0]
+        >>> f"ISO {iso:g}: {shot_var[0]:.1e} to {shot_var[1]:.1e}"
+        'ISO 100: 1.0e-05 to 1.6e-05'
+    """
+    low, high = map(round, ProfileLevels(camera).limits[0].exp().tolist())
+    found = []
+    for step in range(int(math.log2(high / low)) + 1):
+        iso = float(low * 2**step)
+        middle = ProfileLevels(camera, iso).sample(1, torch.Generator())
+        shot, read = ((float(level) * a, float(level) * b) for level, (a, b) in zip(middle, SPREAD, strict=True))
+        found.append(LevelEnds(iso, shot, read))
+    return found
 
 
 class IsoLevel(NamedTuple):

@@ -64,11 +64,15 @@ def test_an_unknown_camera_is_compared_by_its_words() -> None:
 
 def test_the_list_says_what_is_known_of_each(capsys: pytest.CaptureFixture[str], refused: Callable[..., str]) -> None:
     assert main(["info", "cameras", "A7", "III"]) == 0
-    head, row = capsys.readouterr().out.splitlines()
+    head, row, *levels = capsys.readouterr().out.splitlines()
     assert head.split()[:2] == ["camera", "matrix"] and row.split("  ")[0] == "Sony ILCE-7M3"
     assert row.split()[2:] == ["yes", "100", "to", "102400"]
+    assert len(levels) == 11 and levels[0].split()[:6] == ["ISO", "100", "shot_var", "1.00e-05", "to", "1.59e-05"]
     assert main(["info", "cameras", "Nikon D850", "--json"]) == 0
     (camera,) = json.loads(capsys.readouterr().out)["cameras"]
+    assert camera["noise"][0][0] == camera["iso"][0] and all(
+        low < high for _, *ends in camera["noise"] for low, high in ends
+    )
     index = MATRICES.index("Nikon D850")
     assert camera["xyz_to_camera"] == published_cameras().xyz_to_camera[index].tolist()
     assert main(["info", "cameras"]) == 0

@@ -25,7 +25,14 @@ from rawaug.noise import (
     noise_model,
     noise_names,
 )
-from rawaug.noise.cameras import READ_ON_MOSAIC, SHOT_ON_MOSAIC, ProfileLevels, published_profiles
+from rawaug.noise.cameras import (
+    READ_ON_MOSAIC,
+    SHOT_ON_MOSAIC,
+    SPREAD,
+    ProfileLevels,
+    profile_ends,
+    published_profiles,
+)
 from rawaug.noise.levels import MixedLevels
 from rawaug.noise.models import NoiseModel
 
@@ -211,13 +218,40 @@ def test_levels_stay_within_the_profile_and_replay() -> None:
 
 
 def test_any_camera_draws_each_camera_alike() -> None:
+    """By its profile's levels where it has one row alone, whose factors then lie within the spread."""
     levels = ProfileLevels("any camera")
     assert len(levels.cameras) == len(published_profiles().names) == 369
+    levels.spread = False
     one_row = published_profiles().rows == 1
     fixed = published_profiles().table[1, one_row, 0].exp().float()
     shot_var, _ = levels.sample(200_000, generator())
     hits = torch.isclose(shot_var[:, None], fixed, rtol=1e-6, atol=0).float().mean(dim=0)
     torch.testing.assert_close(hits, torch.full_like(hits, 1 / 369), atol=5e-4, rtol=0)
+
+
+def test_any_camera_draws_how_far_its_levels_are_known() -> None:
+    """The factors of both levels fill their spread, whatever the camera, and each is drawn on its own."""
+    levels = ProfileLevels("any camera")
+    drawn = levels.sample(20_000, generator(1))
+    levels.spread = False
+    factors = [a / b for a, b in zip(drawn, levels.sample(20_000, generator(1)), strict=True)]
+    for factor, (low, high) in zip(factors, SPREAD, strict=True):
+        assert low * 0.9999 <= factor.min() < low * 1.01 and high * 0.99 < factor.max() <= high * 1.0001
+        middle = math.sqrt(low * high)
+        assert factor.log().mean().exp().item() == pytest.approx(middle, rel=0.02)
+    assert torch.corrcoef(torch.stack(factors).log())[0, 1].abs() < 0.03
+
+
+def test_a_profile_says_how_far_its_levels_are_known() -> None:
+    """The four cameras' own ratios of 7.2 to 11.4 and 2.2 to 16; a fifth camera, measured, is within the ends."""
+    ends = profile_ends("Sony ILCE-7M3")
+    assert [row.iso for row in ends] == [100.0 * 2**k for k in range(11)]
+    assert ends[0].shot_var == pytest.approx((1.392e-6 * 7.2, 1.392e-6 * 11.4), rel=1e-4)
+    assert ends[0].read_var == pytest.approx((7.017e-11 * 2.2, 7.017e-11 * 16), rel=1e-4)
+    at_200 = float(ProfileLevels("Nikon D5000", iso=200).sample(1, generator())[0])
+    assert at_200 * SPREAD[0][0] <= 2.6e-5 and at_200 * SPREAD[0][1] >= 3.2e-5
+    with pytest.raises(ValueError, match="is not listed"):
+        profile_ends("Nikon D75O")
 
 
 def test_limits_of_iso_leave_out_the_cameras_without_a_share() -> None:
