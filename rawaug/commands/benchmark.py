@@ -13,9 +13,9 @@ from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, SomePairs
 from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
 from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_of, strengths_of, tables, trials
-from rawaug.evaluation.own_noise import Measured, own_noise_note
 from rawaug.evaluation.page import Figure, Page, Part, draw_costs
 from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.trials import Measured, own_noise_note
 from rawaug.files import require_writable, write_json
 
 ON_PAGE = 4

@@ -18,11 +18,10 @@ from rawaug.data.folders import Kept, Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
-from rawaug.evaluation.own_noise import Measured, own_noise_note
 from rawaug.evaluation.page import Page, shown_on_page
 from rawaug.evaluation.scores import NOISY, Row, by_denoiser, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import print_scores
-from rawaug.evaluation.trials import Trial, trial_of, trials_of
+from rawaug.evaluation.trials import Measured, Trial, own_noise_note, trial_of, trials_of
 from rawaug.files import find_weights, read_header, require_writable, sha256, write_json
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseSpec, noise_model

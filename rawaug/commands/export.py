@@ -28,7 +28,7 @@ from rawaug.bayer import pack_rgb
 from rawaug.commands import YAML
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import centre
-from rawaug.denoise.onnx import feeds, session_of
+from rawaug.denoise.foreign import feeds, session_of
 from rawaug.errors import extra
 from rawaug.evaluation.trials import trial_of
 from rawaug.files import find_weights, read_header, replacing

@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from rawaug.camera.fit import fit
-from rawaug.camera.noise import noise_figures
+from rawaug.camera.fit import fit, noise_figures
 from rawaug.commands import OPTIONS
 from rawaug.data.pair_folder import MosaicSettings
 from rawaug.errors import escape

@@ -26,8 +26,7 @@ from denoisers.files import find, shipped
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned, noise_variance
-from rawaug.denoise.onnx import STRIDE, OnnxNetwork
-from rawaug.denoise.published import AGAIN, BiasFreeDnCNN, published_pmrid
+from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, published_pmrid
 from rawaug.files import read_header, read_tensors, sha256
 from rawaug.io import RawFrame
 from rawaug.kernels.runtime import fast_in_bfloat16, find_device

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from denoisers.network import PACKED
 from rawaug.errors import extra
-from rawaug.evaluation.own_noise import own_noise_note
 from rawaug.evaluation.scores import Panels
 from rawaug.evaluation.tables import (
     ENSEMBLE,
@@ -36,7 +35,7 @@ from rawaug.evaluation.tables import (
     levels_note,
     verdict,
 )
-from rawaug.evaluation.trials import Trial
+from rawaug.evaluation.trials import Trial, own_noise_note
 from rawaug.io.pictures import encode_png
 
 WINDOW = 64

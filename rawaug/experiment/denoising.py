@@ -23,11 +23,10 @@ from rawaug.data.folders import reports
 from rawaug.data.pairs import OWN_PICTURES, Pair, PairPictures, stamps
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.errors import extra
-from rawaug.evaluation.own_noise import added_noise_note, own_noise_note
 from rawaug.evaluation.page import Page, draw_curves, shown_on_page
 from rawaug.evaluation.scores import NOISY, Panels, Row, by_denoiser, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import draw, first_runs, print_table, verdict
-from rawaug.evaluation.trials import Trial, trial_of, trials_of
+from rawaug.evaluation.trials import Trial, added_noise_note, own_noise_note, trial_of, trials_of
 from rawaug.experiment.arms import (
     chosen,
     frames_of,

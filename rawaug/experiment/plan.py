@@ -23,7 +23,7 @@ from rawaug.data.pairs import (
     selected,
     shared_frame,
 )
-from rawaug.evaluation.own_noise import Measured
+from rawaug.evaluation.trials import Measured
 from rawaug.experiment.recipe import HELD_OUT, DataConfig, Recipe
 from rawaug.experiment.run_folder import require_free
 from rawaug.files import find_weights

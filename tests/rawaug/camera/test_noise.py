@@ -15,8 +15,7 @@ import torch
 from denoisers import build, save
 from rawaug import bayer
 from rawaug.bayer import CFA
-from rawaug.camera.fit import fit
-from rawaug.camera.noise import measure_camera_noise
+from rawaug.camera.fit import fit, measure_camera_noise
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
 from rawaug.denoise.levels import levels_of, stored_noise
@@ -91,7 +90,7 @@ def test_the_limits_are_a_slope_above_0_and_half_the_variance_explained(
 
     assert noisy_pair.noisy is not None
     found = estimate_noise(noisy_pair.noisy, noisy_pair.cfa)
-    monkeypatch.setattr("rawaug.camera.noise.estimate_noise", estimate)
+    monkeypatch.setattr("rawaug.camera.fit.estimate_noise", estimate)
     if accepted:
         assert measure_camera_noise([noisy_pair]).law.at(None)[0] == shot_var
     else:

@@ -15,7 +15,7 @@ from rawaug.bayer import CFA, noise_variance
 from rawaug.cli import main
 from rawaug.commands.export import errors_only, export
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.denoise.onnx import session_of
+from rawaug.denoise.foreign import session_of
 from rawaug.errors import MissingExtra
 from rawaug.io import RawFrame
 

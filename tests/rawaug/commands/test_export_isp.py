@@ -14,7 +14,7 @@ from rawaug.bayer import pack_rgb
 from rawaug.cli import main
 from rawaug.commands.export import ReversePass, export_isp
 from rawaug.commands.info import as_json
-from rawaug.denoise.onnx import session_of
+from rawaug.denoise.foreign import session_of
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading
 

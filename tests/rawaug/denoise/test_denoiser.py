@@ -15,7 +15,7 @@ import denoisers
 from rawaug.bayer import CFA
 from rawaug.commands.benchmark import named
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
-from rawaug.denoise.published import BiasFreeDnCNN
+from rawaug.denoise.foreign import BiasFreeDnCNN
 from rawaug.experiment.demosaicing import JointRecipe
 from rawaug.experiment.recipe import ArmConfig, DataConfig
 from rawaug.registry import EXPERIMENTS

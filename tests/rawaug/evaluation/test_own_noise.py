@@ -12,9 +12,8 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.data.pairs import Binned, Middles, Pair
 from rawaug.denoise.denoiser import RawDenoiser
-from rawaug.evaluation.own_noise import Measured, added_noise_note, own_noise_note
 from rawaug.evaluation.scores import Row, score, summary
-from rawaug.evaluation.trials import Trial, trial_of
+from rawaug.evaluation.trials import Measured, Trial, added_noise_note, own_noise_note, trial_of
 from rawaug.noise import noise_model
 
 SHOT, READ = 1e-4, 2e-6

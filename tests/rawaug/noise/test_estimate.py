@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate
 
 from rawaug.bayer import CFA, binned_variance, unpack
 from rawaug.data import Binned, Pair
-from rawaug.evaluation.own_noise import Measured
+from rawaug.evaluation.trials import Measured
 from rawaug.noise import (
     DefectPixels,
     FixedLevels,

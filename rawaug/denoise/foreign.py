@@ -1,20 +1,24 @@
-"""Networks in ONNX files, run by ONNX Runtime on the CPU.
+"""Networks of others: ONNX files, and PMRID and bias-free DnCNN with the weights that their authors published.
 
-``rawaug export`` writes such a file, which states the CFA and the stride; any will do that takes noisy packed RAW
+``rawaug export`` writes ONNX that states the CFA and the stride; any will do that takes noisy packed RAW
 ``(1, 4, h, w)``, and its variance or not. What anybody's file does wrong is one line that names it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
+import denoisers
+from denoisers.domains import levels_of
 from rawaug.errors import extra
-from rawaug.files import parse_object
+from rawaug.files import parse_object, read_tensors
+from rawaug.noise import anscombe
 
 STRIDE = 32
 """Of a network that states none."""
@@ -70,3 +74,50 @@ def session_of(path: Path) -> Any:
 def feeds(names: Sequence[str], images: Sequence[Tensor]) -> dict[str, Any]:
     """The inputs of a session by name, of ``images`` as many as it takes."""
     return {name: image.numpy() for name, image in zip(names, images, strict=False)}
+
+
+AGAIN = "download or convert it again"
+
+
+def published_pmrid(path: str | Path) -> denoisers.PMRID:
+    """PMRID with the weights of its authors, from a ``.safetensors`` file."""
+    model = denoisers.PMRID()
+    try:
+        model.load_state_dict(read_tensors(path, AGAIN)[1])
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit PMRID's network: {str(error).splitlines()[-1].strip()}") from None
+    return model.eval()
+
+
+class BiasFreeDnCNN(nn.Module):
+    r"""Bias-free DnCNN for white noise, on each plane of RAW in Anscombe's domain.
+
+    .. math:: u = (z - z(0)) / (z(1) - z(0)), \qquad u' = u - f(u), \qquad y' = z^{-1}(u' (z(1) - z(0)) + z(0))
+
+    with twenty 3 x 3 convolutions f without biases, normalisations folded in, and the exact unbiased inverse. Source:
+    S. Mohan, Z. Kadkhodaie, E. P. Simoncelli, C. Fernandez-Granda, "Robust and interpretable blind image denoising via
+    bias-free convolutional neural networks", ICLR 2020.
+
+    Args:
+        weights: of the convolutions, by names that are in order.
+    """
+
+    def __init__(self, weights: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.layers = nn.ParameterList([weights[name] for name in sorted(weights)])
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        """Packed RAW ``(B, 4, h, w)`` denoised; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
+        shot, read = (level.flatten() for level in levels_of(noisy, variance))
+        black, white = (anscombe.forward(noisy.new_full((1, 1, 1, 1), y), shot, read) for y in (0.0, 1.0))
+        u = (anscombe.forward(noisy, shot, read) - black) / (white - black)
+        planes = self._grey(u.flatten(0, 1)[:, None]).reshape(noisy.shape)
+        return anscombe.inverse(planes * (white - black) + black, shot, read)
+
+    @torch.no_grad()
+    def _grey(self, u: Tensor) -> Tensor:
+        *layers, last = self.layers
+        features = u
+        for layer in layers:
+            features = F.conv2d(features, layer, padding=1).relu_()
+        return u - F.conv2d(features, last, padding=1)
