@@ -89,8 +89,6 @@ def run(
         isp, images = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
         scores = ((pair.name, _finite(pair.name, psnr_r(isp, pair))) for pair in images)
         result = written(summary(Row("ISP", name, "", "", "raw", psnr) for name, psnr in scores))
-        scores = ((pair.name, _finite(pair.name, psnr_r(isp, pair))) for pair in images)
-        result = written(summary(Row("ISP", name, "", "", "raw", psnr) for name, psnr in scores))
     else:
         test = _Test(file, pairs, noise, seed, device, classical or ())
         result = written(test.result(views or (8 if self_ensemble else 1), written))
