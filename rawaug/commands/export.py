@@ -169,6 +169,7 @@ def run(
     /,
     *,
     frame: str | None = None,
+    time: bool = False,
     white_balance: Annotated[tuple[float, float, float] | None, YAML] = None,
 ) -> None:
     """Write a denoiser as ONNX, or an ISP as JSON, .cube and ONNX.
@@ -177,6 +178,7 @@ def run(
         weights: a .safetensors file written by rawaug run or rawaug fit, or the name of a shipped denoiser or ISP.
         out: the .onnx file of a denoiser; of an ISP .json, .cube, .onnx, or a folder for all three.
         frame: RAW file whose middle is used to compare a denoiser with its ONNX; by default a generated frame.
+        time: also time a denoiser and its ONNX on that frame.
         white_balance: as-shot multipliers R, G, B for which an ISP is exported; by default those typical of the fit.
     """
     if read_header(find_weights(weights, FOLDER))["kind"] == "isp":
@@ -187,11 +189,11 @@ def run(
         return
     if white_balance is not None:
         raise ValueError(f"--white-balance: is for ISPs, and {weights} is a denoiser")
-    print(export(weights, out, frame))
+    print(export(weights, out, frame, time))
 
 
-def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None) -> str:
-    """Write a denoiser as ONNX; a line on its size, its difference from PyTorch and its time."""
+def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = None, time: bool = False) -> str:
+    """Write a denoiser as ONNX; what is said of its size, its difference from PyTorch and, with ``time``, its time."""
     out = Path(out)
     if out.suffix != ".onnx":
         raise ValueError(f"{out}: give a name that ends in .onnx")
@@ -205,16 +207,17 @@ def export(denoiser: str | Path, out: str | Path, frame: str | Path | None = Non
         session = write_onnx(model, examples, "denoised", partial, stated)
         with torch.inference_mode():
             expected = model(*inputs.values())
-            seconds_torch = min(timeit.repeat(lambda: model(*inputs.values()), number=1, repeat=3))
+            seconds_torch = 0.0 if not time else min(timeit.repeat(lambda: model(*inputs.values()), number=1, repeat=3))
         difference = difference_from(expected, session, inputs, out)
         values = feeds(names, list(inputs.values()))
-        seconds_onnx = min(timeit.repeat(lambda: session.run(None, values), number=1, repeat=3))
-    megapixels = inputs["noisy"].numel() / 1e6
-    return (
-        f"{out}: {out.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.1e}\n"
-        f"ONNX Runtime {seconds_onnx / megapixels:.2f} s a megapixel, PyTorch {seconds_torch / megapixels:.2f} s "
-        f"({torch.get_num_threads()} threads)"
-    )
+        seconds_onnx = 0.0 if not time else min(timeit.repeat(lambda: session.run(None, values), number=1, repeat=3))
+    size = f"{out}: {out.stat().st_size / 1e6:.1f} MB, of any height and width, a batch of 1"
+    line = f"{size}; largest difference from PyTorch {difference:.1e}"
+    if not time:
+        return line
+    pace = [seconds / inputs["noisy"].numel() * 1e6 for seconds in (seconds_onnx, seconds_torch)]
+    threads = torch.get_num_threads()
+    return f"{line}\nnow, on {threads} threads: ONNX Runtime {pace[0]:.2f} s a megapixel, PyTorch {pace[1]:.2f} s"
 
 
 def comparison_frame(frame: str | Path | None) -> tuple[Tensor, Tensor]:
