@@ -1,5 +1,6 @@
 """Mosaics: colour filter arrays, geometry that keeps their pattern, demosaicing."""
 
+from rawaug.bayer.binning import Halving, bayer_variance, to_bayer
 from rawaug.bayer.cfa import (
     CFA,
     N_VIEWS,
@@ -17,7 +18,7 @@ from rawaug.bayer.cfa import (
     unpack,
 )
 from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, require_method, stencils_of
-from rawaug.bayer.patterns import PATTERNS, Pattern, pattern
+from rawaug.bayer.patterns import PATTERNS, Pattern, layout, named, pattern, sites
 from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
 
 __all__ = [
@@ -27,22 +28,28 @@ __all__ = [
     "N_VIEWS",
     "PATTERNS",
     "STENCILS",
+    "Halving",
     "Pack",
     "Pattern",
     "RandomCrop",
     "RandomTurn",
     "aligned",
+    "bayer_variance",
     "bin_mosaic",
     "binned_variance",
     "crop",
     "demosaic",
+    "layout",
     "mosaic",
+    "named",
     "noise_variance",
     "pack",
     "pack_rgb",
     "pattern",
     "require_method",
+    "sites",
     "stencils_of",
+    "to_bayer",
     "turn",
     "turn_back",
     "turn_keeping_cfa",

@@ -7,8 +7,10 @@ one-hot planes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -39,6 +41,19 @@ class Pattern:
     def period(self) -> int:
         """Side of the cell."""
         return len(self.rows)
+
+    def shifted(self, rows: int, columns: int) -> Pattern:
+        """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right; it has a name again.
+
+        Example:
+            >>> pattern("QUAD-RGGB").shifted(1, 3).name, pattern("RGGB").shifted(0, 1).name
+            ('QUAD-RGGB+1+3', 'GRBG')
+        """
+        size = self.period
+        moved = tuple(
+            "".join(self.rows[(i + rows) % size][(j + columns) % size] for j in range(size)) for i in range(size)
+        )
+        return _BY_ROWS[moved]
 
     def channels(self, height: int, width: int) -> Tensor:
         """The colour of each site as an index into RGB, int64 ``(H, W)``."""
@@ -133,13 +148,62 @@ PATTERNS: dict[str, Pattern] = {
 """The patterns by name."""
 
 
+def _phases() -> Iterator[Pattern]:
+    """Every known pattern and, of those of larger cells, what it is from other origins: ``XTRANS+1+2`` and the like."""
+    yield from PATTERNS.values()
+    for known in PATTERNS.values():
+        for i, j in product(range(known.period), repeat=2):
+            size = known.period
+            rows = tuple("".join(known.rows[(i + k) % size][(j + m) % size] for m in range(size)) for k in range(size))
+            yield Pattern(f"{known.name}+{i}+{j}", rows)
+
+
+_BY_ROWS: dict[tuple[str, ...], Pattern] = {}
+_BY_NAME = {phase.name: _BY_ROWS.setdefault(phase.rows, phase) for phase in _phases()}
+
+
+def named(rows: Sequence[str]) -> str | None:
+    """The name of the pattern whose cell is read as ``rows`` from its top left, or None if it is unknown.
+
+    Example:
+        >>> named(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
+        'XTRANS+2+1'
+    """
+    found = _BY_ROWS.get(tuple(rows))
+    return None if found is None else found.name
+
+
+def layout(cfa: str) -> str:
+    """The :class:`CFA` of a Bayer pattern's name, the name of another; ValueError if there is no such pattern."""
+    name = pattern(cfa).name
+    return CFA(name) if name in CFA.__members__ else name
+
+
+def sites(cfa: str) -> Tensor:
+    """Which of R, Gr, Gb, B (0 to 3) each site of a pattern's cell is, int64 ``(n, n)``; if not Bayer's, greens are 1.
+
+    Example:
+        >>> sites("GRBG").tolist(), sites("XTRANS").shape
+        ([[1, 0], [3, 2]], torch.Size([6, 6]))
+    """
+    known = pattern(cfa)
+    if known.name not in CFA.__members__:
+        return torch.tensor((0, 1, 3))[known.channels(known.period, known.period)]
+    cell = torch.zeros(2, 2, dtype=torch.int64)
+    for number, place in enumerate(CFA(known.name).sites):
+        cell[place] = number
+    return cell
+
+
 def pattern(name: str) -> Pattern:
     """The pattern of this name: a Bayer one, the same with ``QUAD-`` before it, or ``XTRANS``.
+
+    Those of larger cells may begin at another origin: ``XTRANS+1+2`` begins a row lower and two columns to the right.
 
     Example:
         >>> pattern("QUAD-RGGB").rows
         ('RRGG', 'RRGG', 'GGBB', 'GGBB')
     """
-    if str(name) not in PATTERNS:
+    if str(name) not in _BY_NAME:
         raise ValueError(f"CFA {name!r} is unknown; use one of {', '.join(PATTERNS)}")
-    return PATTERNS[str(name)]
+    return _BY_NAME[str(name)]

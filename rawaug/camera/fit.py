@@ -241,9 +241,13 @@ def _frame(pairs: Sequence[Pair], index: int) -> RawFrame:
     return RawFrame(pair.raw if pair.noisy is None else pair.noisy, pair.cfa, camera=pair.camera, iso=pair.iso)
 
 
-def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], CFA]:
-    cfa = frames[0].cfa
-    return [aligned(frame.mosaic, frame.cfa, cfa) for frame in frames], cfa
+def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
+    cfa, patterns = frames[0].cfa, {frame.cfa for frame in frames}
+    if patterns <= set(CFA):
+        return [aligned(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
+    if len(patterns) > 1:
+        raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
+    return [frame.mosaic for frame in frames], cfa
 
 
 def noise_figures(path: str | Path, law: MeasuredLevels) -> list[Path]:

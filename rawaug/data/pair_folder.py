@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rawaug.bayer import CFA
 from rawaug.data.development import UNKNOWN_COLOUR, developed_pair
 from rawaug.data.folders import RawFolder
 from rawaug.data.formats import READABLE, TWO_IN_ONE, parsed, read_mosaic
@@ -110,12 +111,16 @@ class PairFolder(LazyPairs):
         ):
             if one != other:
                 raise ValueError(f"{files[0]}: the clean and the noisy frame differ in {what}, {other} and {one}")
+        if noisy.cfa not in CFA.__members__:
+            raise ValueError(
+                f"{files[0]}: is a mosaic of {noisy.cfa}, and pairs are of Bayer's; check it as a RAW file"
+            )
         stated = [(frame.white_balance, frame.color_matrix) for frame in (clean, noisy) if frame.color_known]
         colour = stated[0] if stated else UNKNOWN_COLOUR
         shot_var, read_var = noisy.noise_profile or (None, None)
         known: dict[str, Any] = {"noisy": noisy.mosaic, "shot_var": shot_var, "read_var": read_var}
         known |= {"color_known": bool(stated), "camera": noisy.camera, "iso": noisy.iso}
-        return developed_pair(name, clean.mosaic, clean.cfa, *colour, **known)
+        return developed_pair(name, clean.mosaic, CFA(clean.cfa), *colour, **known)
 
 
 def require_no_pairs(folder: RawFolder, spec: str, as_clean: bool) -> None:

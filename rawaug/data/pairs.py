@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA, bin_mosaic, binned_variance
+from rawaug.bayer import CFA, bin_mosaic, binned_variance, to_bayer
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
@@ -99,8 +99,16 @@ class Pair:
 
     @classmethod
     def of_frame(cls, name: str, frame: RawFrame, srgb: Tensor, **known: Any) -> Pair:
-        """What a RAW file states and its picture, with further attributes that are ``known``."""
-        stated = (frame.mosaic, frame.cfa, frame.white_balance, frame.color_matrix)
+        """What a RAW file states and its picture, with further attributes that are ``known``.
+
+        A mosaic of another pattern than Bayer's becomes one of RGGB at half its sides.
+        """
+        mosaic, cfa = frame.mosaic, frame.cfa
+        if cfa not in CFA.__members__:
+            mosaic, cfa = to_bayer(mosaic, cfa), CFA.RGGB
+            height, width = mosaic.shape[-2:]
+            srgb = _bin_picture(srgb[:, : 2 * height, : 2 * width], 2)
+        stated = (mosaic, CFA(cfa), frame.white_balance, frame.color_matrix)
         return cls(name, srgb, *stated, camera=frame.camera, iso=frame.iso, **known)
 
     @property

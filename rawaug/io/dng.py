@@ -1,4 +1,4 @@
-r"""Bayer mosaics and linear RGB out, as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
+r"""Mosaics and linear RGB out, as DNG: ``d = round(y (white - black) + black)``, 16 bits a site or sample.
 
 ``AsShotNeutral`` is the colour of grey to the camera, ``1 / white_balance``. ``ColorMatrix1`` takes XYZ to the camera
 under D65, ``X = diag(1 / daylight) M^-1 S^-1``, from the frame's ``color_matrix`` M (white-balanced camera to linear
@@ -19,6 +19,7 @@ import math
 import struct
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
+from itertools import product
 from os import SEEK_END
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -28,7 +29,7 @@ import torch
 from torch import Tensor
 
 from rawaug import __version__
-from rawaug.bayer import CFA
+from rawaug.bayer import pattern, sites
 from rawaug.errors import extra
 from rawaug.files import replacing
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
@@ -148,13 +149,15 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
         raise ValueError(f"{path}: levels must be 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
     numbers = np.empty((height, width), np.uint16)
-    for (i, j), black in zip(CFA(frame.cfa).sites, frame.black, strict=True):
-        plane = frame.mosaic[0, i::2, j::2].double().mul_(frame.white - black).add_(black).round_()
+    cell = sites(frame.cfa)
+    for i, j in product(range(len(cell)), repeat=2):
+        black, site = frame.black[cell[i, j]], (slice(i, None, len(cell)), slice(j, None, len(cell)))
+        plane = frame.mosaic[0][site].double().mul_(frame.white - black).add_(black).round_()
         low, high = (extreme.item() for extreme in torch.aminmax(plane))
         if not (low >= 0 and high < _BEYOND_16_BITS):
             need = f"digital numbers from {low:g} to {high:g} at black {black:g}, white {frame.white:g}"
             raise ValueError(f"{path}: 16 bits cannot hold {need}; raise the black level, or clip the mosaic")
-        numbers[i::2, j::2] = plane.numpy().astype(np.uint16)
+        numbers[site] = plane.numpy().astype(np.uint16)
     return numbers
 
 
@@ -194,14 +197,17 @@ def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
 
 
 def _tags_of_the_mosaic(frame: RawFrame) -> Tags:
-    levels = [frame.black[CFA(frame.cfa).sites.index((i, j))] for i in (0, 1) for j in (0, 1)]
+    known, kinds = pattern(frame.cfa), sites(frame.cfa).flatten().tolist()
+    size = known.period
+    repeats = size if size == 2 or len(set(frame.black)) > 1 else 1  # LibRaw states one level of X-Trans, if it is one
+    levels = [frame.black[kind] for kind in kinds[: repeats**2]]
     tags: Tags = {
-        33421: (SHORT, 2, (2, 2)),
-        33422: (BYTE, 4, bytes("RGB".index(colour) for colour in CFA(frame.cfa).value)),
+        33421: (SHORT, 2, (size, size)),
+        33422: (BYTE, size**2, bytes("RGB".index(colour) for colour in "".join(known.rows))),
         50710: (BYTE, 3, bytes((0, 1, 2))),
         50711: (SHORT, 1, 1),
-        50713: (SHORT, 2, (2, 2)),
-        50714: (RATIONAL, 4, _rationals(levels, 2**14)),
+        50713: (SHORT, 2, (repeats, repeats)),
+        50714: (RATIONAL, repeats**2, _rationals(levels, 2**14)),
         50717: (LONG, 1, round(frame.white)),
     }
     return tags | {51041: (DOUBLE, 2, frame.noise_profile)} if frame.noise_profile is not None else tags

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, pattern
 
 _GAIN_MAP = 9
 _OPCODE = struct.Struct(">4I")  # id, version, flags, bytes that follow
@@ -115,7 +115,7 @@ def gains_at_sites(maps: Iterable[GainMap], cfa: CFA | str, height: int, width: 
             if first == 0 and count:
                 _multiply(product, m, 0, None)
             continue
-        colours = torch.tensor(CFA(cfa).channels).repeat(-(-height // 2), -(-width // 2))[:height, :width]
+        colours = pattern(cfa).channels(height, width)
         for plane in range(first, min(first + count, 3)):
             _multiply(product, m, min(plane - first, len(m.gains) - 1), colours == plane)
     return product[None]

@@ -28,7 +28,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, named, sites
 from rawaug.errors import extra
 from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.pictures import require_utf8
@@ -108,8 +108,10 @@ class RawFrame:
 
     Attributes:
         mosaic: float32 ``(1, H, W)``, sides even (of an odd side the last line is left out).
-        cfa: the pattern of ``mosaic``.
-        black: levels of the sites R, Gr, Gb, B, in digital numbers, with a DNG's fractions.
+        cfa: the pattern of ``mosaic``: a :class:`rawaug.bayer.CFA`, or the name of another of
+            :func:`rawaug.bayer.pattern`, X-Trans or Quad-Bayer from any origin.
+        black: levels of the sites R, Gr, Gb, B, in digital numbers, with a DNG's fractions; other patterns have one
+            for all greens.
         white: the saturated level, in digital numbers.
         white_balance: as-shot multipliers of R, G, B, green being 1; LibRaw's daylight ones where the file has none.
         daylight: the multipliers for the white of sRGB (D65), green being 1.
@@ -127,7 +129,7 @@ class RawFrame:
     """
 
     mosaic: Tensor
-    cfa: CFA
+    cfa: str
     black: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     white: float = 1.0
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -157,12 +159,12 @@ class RawFrame:
 
 
 def read_raw(path: str | Path) -> RawFrame:
-    """Read a RAW file with a Bayer mosaic.
+    """Read a RAW file with a mosaic of Bayer's, X-Trans or Quad-Bayer.
 
     Raises:
         FileNotFoundError: if there is no such file.
         OSError: if LibRaw cannot read it, or it is truncated.
-        ValueError: if it has no Bayer mosaic (X-Trans, Foveon, linear or monochrome RAW).
+        ValueError: if it has no such mosaic (Foveon, linear or monochrome RAW, other colours).
     """
     with _opened(Path(path)) as (raw, tags):
         return _frame(Path(path), raw, tags)
@@ -234,14 +236,13 @@ def _opened(path: Path) -> Iterator[tuple[Any, TiffTags]]:
         advice = "check that it is complete and from a supported camera"
         raise OSError(f"{path}: cannot be read as RAW (LibRaw: {reason}); {advice}") from error
     except NotImplementedError as error:  # rawpy's, of a mosaic without a repeating cell
-        raise ValueError(f"{path}: has no Bayer mosaic ({error}); only Bayer RAW is supported") from error
+        raise ValueError(f"{path}: has no mosaic of a known pattern ({error}); {_KNOWN}") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         raise OSError(f"{path}: its white balance or colour matrix is damaged ({error}); copy it again") from error
 
 
 def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
-    cell = _bayer_cell(path, raw)
-    cfa = CFA("".join(raw.color_desc.decode()[k] for k in cell.flatten()))
+    cell, cfa = _cell(path, raw, tags)
     black, white = _black(raw, cell, tags), float(raw.white_level)
     if white <= black.max():
         raise ValueError(f"{path}: white level {white:g} is not above black level {black.max():g}")
@@ -252,7 +253,7 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
     return RawFrame(
         mosaic=_normalised(raw.raw_image_visible, _black_of_sites(path, raw, black, tags), white),
         cfa=cfa,
-        black=tuple(float(black[site]) for site in cfa.sites),  # type: ignore[arg-type]
+        black=_of_planes(black, cfa),
         white=white,
         white_balance=white_balance,
         daylight=_green_is_1(raw.daylight_whitebalance if color_known else white_balance),
@@ -269,16 +270,17 @@ def _frame(path: Path, raw: Any, tags: TiffTags) -> RawFrame:
 
 
 def _black(raw: Any, cell: np.ndarray, tags: TiffTags) -> np.ndarray:
-    """Levels of the cell, ``(2, 2)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
+    """Levels of the cell, ``(n, n)``: LibRaw's, which are whole numbers, with a DNG's fractions."""
     # where a DNG's active area begins at an odd row or column, LibRaw leaves that one out, and gives the remaining
     # sites the levels of their neighbours
     levels = raw.black_level_per_channel
     black = np.array([[levels[k] for k in row] for row in cell], np.float32)
-    if tags.black is None:
+    if tags.black is None or any(len(cell) % side for side in tags.black.shape):
         return black
-    exact = np.array(tags.black, np.float32).reshape(2, 2)
+    repeats = [len(cell) // side for side in tags.black.shape]
+    exact = np.tile(tags.black.astype(np.float32), repeats)
     allowed = 2 if tags.black_rows or tags.black_columns else 1  # LibRaw rounds the means of rows and columns as well
-    if np.abs(exact - black).max() >= allowed:
+    if len(cell) == 2 and np.abs(exact - black).max() >= allowed:
         return black
     rows, columns = _left_out(raw, tags)
     return np.roll(exact, (-rows, -columns), axis=(0, 1))
@@ -301,14 +303,28 @@ def _black_of_sites(path: Path, raw: Any, black: np.ndarray, tags: TiffTags) -> 
             lengths = f"black levels of {len(above)} lines, not {start + length}"
             raise OSError(f"{path}: its TIFF tags are damaged ({lengths})")
         lines.append(np.array(above or (0.0,) * (start + length), np.float32)[start:])
-    cells = np.tile(black, (-(-height // 2), -(-width // 2)))[:height, :width]
-    return np.asarray(cells + lines[0][:, None] + lines[1])
+    return np.asarray(_tiled(black, height, width) + lines[0][:, None] + lines[1])
+
+
+def _tiled(cell: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A cell ``(n, n)`` again and again, ``(H, W)``."""
+    return np.tile(cell, (-(-height // len(cell)), -(-width // len(cell))))[:height, :width]
+
+
+def _of_planes(black: np.ndarray, cfa: str) -> tuple[float, float, float, float]:
+    """Levels of R, Gr, Gb, B from those of the cell; where all greens are one, its mean twice."""
+    kinds = sites(cfa).numpy()
+    means = [float(black[kinds == kind].mean()) if (kinds == kind).any() else None for kind in range(4)]
+    red, green, other, blue = (means[1] if level is None else level for level in means)
+    assert red is not None and green is not None and other is not None and blue is not None
+    return red, green, other, blue
 
 
 def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
-    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(2, 2)`` or ``(H, W)``."""
+    """Digital numbers ``(H, W)`` to RAW float32 ``(1, H, W)``, a copy; ``black`` is ``(n, n)`` or ``(H, W)``."""
     height, width = (side // 2 * 2 for side in numbers.shape)
     if black.shape != (2, 2):
+        black = black if black.shape == numbers.shape else _tiled(black, *numbers.shape)
         numbers, black = numbers[:height, :width], black[:height, :width]
         return torch.from_numpy(np.minimum((numbers - black) / (white - black), 1, dtype=np.float32)[None])
     cells = numbers[:height, :width].astype(np.float32).reshape(height // 2, 2, width // 2, 2)
@@ -318,26 +334,44 @@ def _normalised(numbers: np.ndarray, black: np.ndarray, white: float) -> Tensor:
     return torch.from_numpy(cells.reshape(1, height, width))
 
 
-def _bayer_cell(path: Path, raw: Any) -> np.ndarray:
-    """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(2, 2)``: 0 to 3 are R, G, B, G."""
-    pattern = raw.raw_pattern
-    if pattern is None or pattern.shape != (2, 2) or raw.color_desc != b"RGBG" or set(pattern.flat) != {0, 1, 2, 3}:
-        raise ValueError(f"{path}: has no Bayer mosaic but {_kind(raw)}; only Bayer RAW is supported")
-    return np.asarray(raw.raw_colors_visible[:2, :2])
+_KNOWN = "Bayer, X-Trans and Quad-Bayer RAW is supported"
 
 
-def _kind(raw: Any) -> str:
-    """Describe what a file holds instead of a Bayer mosaic."""
+def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
+    """LibRaw's colour indices of the cell at the top left of the visible mosaic, ``(n, n)``, and the pattern's name.
+
+    0 to 3 are R, G, B, G; LibRaw knows no cells of 4 x 4, so that those of Quad-Bayer are the tags'.
+    """
+    shape = None if raw.raw_pattern is None else raw.raw_pattern.shape
+    cell = np.empty((0, 0), int)
+    if tags.cfa is not None and len(tags.cfa) == 4 and raw.raw_type != _stack():
+        stated = np.array([["RGB".index(colour) for colour in row] for row in tags.cfa])
+        first = raw.sizes.top_margin - tags.area[0], raw.sizes.left_margin - tags.area[1]
+        cell = np.roll(stated, (-first[0], -first[1]), axis=(0, 1))
+    elif shape in ((2, 2), (6, 6)) and raw.raw_type != _stack():
+        cell = np.asarray(raw.raw_colors_visible[: shape[0], : shape[1]])
+    colours = raw.color_desc.decode("ascii", "replace")
+    name = named(["".join(colours[k] for k in row) for row in cell]) if colours == "RGBG" else None
+    if name is None or (len(cell) == 2 and set(cell.flat) != {0, 1, 2, 3}):
+        raise ValueError(f"{path}: has no mosaic of a known pattern but {_kind(raw)}; {_KNOWN}")
+    return cell, CFA(name) if len(cell) == 2 else name
+
+
+def _stack() -> Any:
+    """LibRaw's type of RAW that has all colours at every pixel."""
     with extra("raw"):
         import rawpy
 
-    if raw.raw_type == rawpy.RawType.Stack:
+    return rawpy.RawType.Stack
+
+
+def _kind(raw: Any) -> str:
+    """Describe what a file holds instead of a mosaic that is known."""
+    if raw.raw_type == _stack():
         return "full colour at every pixel (linear DNG, small RAW, Foveon)"
     pattern = raw.raw_pattern
     if pattern is None or len(set(pattern.flat)) == 1:
         return "a monochrome picture"
-    if pattern.shape == (6, 6):
-        return "an X-Trans mosaic"
     return f"a mosaic of other colours ({raw.color_desc.decode()}, cell {pattern.shape[0]} x {pattern.shape[1]})"
 
 

@@ -23,6 +23,7 @@ MOST_PAGES = 64
 """More than any RAW file has. Damaged offsets make circles of directories, in which a reader never ends."""
 
 MAKE, MODEL, DNG_VERSION, _NOISE_PROFILE = 271, 272, 50706, 51041
+_CFA_REPEATS, _CFA_PATTERN = 33421, 33422
 _BLACK_REPEATS, _BLACK, _BLACK_DELTAS = 50713, 50714, (50716, 50715)
 ACTIVE_AREA = 50829
 OPCODE_LIST_2, OPCODE_LIST_3 = 51009, 51022
@@ -38,11 +39,12 @@ class TiffTags:
     model: str | None = None
     noise_profile: tuple[float, float] | None = None
     mosaic_end: int | None = None
-    black: tuple[float, float, float, float] | None = None
+    black: np.ndarray | None = None
     gain_maps: tuple[GainMap, ...] = ()
     black_rows: Sequence[float] = ()
     black_columns: Sequence[float] = ()
     area: tuple[int, int] = (0, 0)
+    cfa: tuple[str, ...] | None = None
 
 
 def read_tiff_tags(path: Path) -> TiffTags:
@@ -64,7 +66,7 @@ def read_tiff_tags(path: Path) -> TiffTags:
             black, maps = _black(mosaic, above + beside), _gain_maps(mosaic)
             end = max(map(sum, zip(mosaic.dataoffsets, mosaic.databytecounts, strict=True)), default=None)
             area = mosaic.tags.valueof(ACTIVE_AREA) or (0, 0)
-            return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2])
+            return TiffTags(make, model, profile, end, black, maps, rows, columns, area[:2], _cfa(mosaic))
     except tifffile.TiffFileError:
         return TiffTags()
 
@@ -138,16 +140,23 @@ def _deltas(mosaic: Any, code: int) -> tuple[float, list[float]]:
     return mean, left if any(left) else []
 
 
-def _black(mosaic: Any, more: float) -> tuple[float, float, float, float] | None:
+def _black(mosaic: Any, more: float) -> np.ndarray | None:
+    """Levels of a cell, of any size that the tags give."""
     tag = mosaic.tags.get(_BLACK)
     if tag is None:
-        return (more, more, more, more) if more else None
+        return np.full((1, 1), more) if more else None
     levels = _numbers(tag) + more
     rows, columns = mosaic.tags.valueof(_BLACK_REPEATS) or (1, 1)
-    if len(levels) != rows * columns or 2 % rows or 2 % columns:
+    return levels.reshape(rows, columns) if len(levels) == rows * columns else None
+
+
+def _cfa(mosaic: Any) -> tuple[str, ...] | None:
+    """The rows of the pattern's cell, of the colours R, G and B; None if it has others."""
+    size, colours = (mosaic.tags.valueof(code) for code in (_CFA_REPEATS, _CFA_PATTERN))
+    if size is None or colours is None or len(colours) != size[0] * size[1] or not set(colours) <= {0, 1, 2}:
         return None
-    a, b, c, d = np.tile(levels.reshape(rows, columns), (2 // rows, 2 // columns)).ravel().tolist()
-    return a, b, c, d
+    text = "".join("RGB"[colour] for colour in colours)
+    return tuple(text[start : start + size[1]] for start in range(0, len(text), size[1]))
 
 
 def _gain_maps(mosaic: Any) -> tuple[GainMap, ...]:

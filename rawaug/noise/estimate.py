@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from rawaug.bayer import CFA, pack
+from rawaug.bayer import CFA, pack, pattern, sites
 from rawaug.errors import escape, extra
 
 if TYPE_CHECKING:
@@ -105,7 +106,8 @@ def estimate_noise(
     Args:
         mosaics: one or several ``(1, H, W)`` or ``(1, 1, H, W)``, black-subtracted, white = 1. Signals near white are
             left out, and those near another level of clipping, where the file's lowest or highest value piles up.
-        cfa: the pattern, of all of them.
+        cfa: the pattern, of all of them: Bayer's, or X-Trans or Quad-Bayer, of which each site of the cell is a plane
+            of its own, so that flat regions must be three or two times as wide.
         read_var: known from dark frames (:func:`from_dark_frames`); fitted too if omitted.
 
     Raises:
@@ -146,19 +148,28 @@ def _measure(frame: Tensor, cfa: CFA | str) -> _Blocks:
 
     if frame.shape[:-3].numel() != 1 or frame.ndim < 3 or frame.shape[-3] != 1:
         raise ValueError(f"a mosaic must have shape (1, H, W) or (1, 1, H, W), got {tuple(frame.shape)}")
-    if min(frame.shape[-2:]) < 2 * BLOCK:
+    if min(frame.shape[-2:]) < pattern(cfa).period * BLOCK:
         raise ValueError(f"a mosaic of {tuple(frame.shape[-2:])} is too small to estimate noise from")
     floor = float(frame.min()) if _piles_up(frame) else -math.inf
     ceiling = min(float(frame.max()) if _piles_up(-frame) else 1.0, 1.0)
-    planes = pack(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
-    tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(4, -1, BLOCK, BLOCK)
+    planes, kinds = _planes(frame.reshape(1, *frame.shape[-2:]).float(), cfa)
+    tiles = planes.unfold(-2, BLOCK, BLOCK).unfold(-2, BLOCK, BLOCK).reshape(len(kinds), -1, BLOCK, BLOCK)
     energy = torch.from_numpy(dctn(tiles.cpu().numpy(), axes=(-2, -1), norm="ortho")).square_()
     bands = [energy[..., torch.from_numpy(band)].mean(-1) for band in (_LOW, _HIGH, _MIDDLE, _TOP)]
     signal = tiles.mean((-2, -1)).flatten()
-    channel = torch.arange(4, device=tiles.device).repeat_interleave(tiles.shape[1])
+    channel = kinds.to(tiles.device).repeat_interleave(tiles.shape[1])
     inside = ((tiles > floor) & (tiles < ceiling)).all(-1).all(-1).flatten()
     room = signal - floor, ceiling - signal
     return _Blocks(*(t.flatten()[inside].double().cpu() for t in (channel, signal, *bands, *room)))
+
+
+def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
+    """A mosaic ``(1, H, W)`` as planes of a site of the cell each, ``(n, h, w)``, and their R, Gr, Gb or B."""
+    if cfa in CFA.__members__:
+        return pack(mosaic, cfa), torch.arange(4)
+    size = pattern(cfa).period
+    height, width = (side // size * size for side in mosaic.shape[-2:])
+    return F.pixel_unshuffle(mosaic[:, :height, :width], size), sites(cfa).flatten()
 
 
 def _piles_up(frame: Tensor) -> bool:

@@ -152,7 +152,7 @@ def camera_frames(pair: RawPair, augment: RawAugment) -> tuple[dict[str, RawFram
     """A RAW pair as camera frames by the ends of their files' names, and the stops of underexposure."""
     white_balance, color_matrix, stops = _color(pair, augment)
     metadata: dict[str, Any] = {
-        "cfa": augment.isp.cfa,
+        "cfa": augment.cfa,
         "black": (_black(float(pair.noisy.min())),) * 4,
         "white": float(_WHITE),
         "white_balance": white_balance,

@@ -22,7 +22,6 @@ from typing import Any, get_args
 
 import torch
 
-from rawaug.bayer import CFA
 from rawaug.data.folders import PICTURE_EXTENSIONS
 from rawaug.files import LOCK, files_in, find_weights, locked, require_same_settings, sha256
 from rawaug.io.pictures import MAX_PIXELS
@@ -97,9 +96,7 @@ def synth(
     if workers is not None and workers < 0:
         raise ValueError(f"workers must be at least 0, got {workers}")
     part, parts = part_of(shard)
-    cfa = PairMaker(settings, max_pixels).augment.cfa  # raises for a wrong name here, not in a worker
-    if format == "dng" and cfa not in CFA.__members__:
-        raise ValueError(f"format dng holds Bayer mosaics, not {cfa}; use npz, tiff or webdataset")
+    PairMaker(settings, max_pixels)  # raises for a wrong name here, not in a worker
     stored, tasks = settings.stored(), list[Task]()
     with locked(out / (LOCK if parts == 1 else f"rawaug-{part}-of-{parts}.lock")):
         if format == "webdataset":

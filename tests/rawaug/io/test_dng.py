@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rawaug.bayer import CFA, mosaic
+from rawaug.bayer import CFA, mosaic, pattern, sites
 from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.gain_map import parse_gain_maps
 from rawaug.io.raw import Exposure
@@ -253,3 +253,31 @@ def test_a_real_dng_written_again_is_the_same(tmp_path: Path, camera_files: Path
         assert (back.camera, back.iso, back.orientation) == (frame.camera, frame.iso, frame.orientation)
         assert back.noise_profile == frame.noise_profile and len(back.gain_maps) == len(frame.gain_maps)
         assert torch.allclose(back.color_matrix, frame.color_matrix, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", ["XTRANS", "XTRANS+1+2", "QUAD-RGGB", "QUAD-RGGB+1+3"])
+@pytest.mark.parametrize("black", [(64.0,) * 4, (64.0, 70.25, 70.25, 80.0)])
+def test_other_patterns_go_there_and_back(tmp_path: Path, name: str, black: tuple[float, ...]) -> None:
+    cell = sites(name)
+    levels = torch.tensor(black)[cell].repeat(12, 12)[:36, :46].double()
+    numbers = torch.randint(0, 1024, (36, 46), generator=torch.Generator().manual_seed(0)).double()
+    raw = ((numbers - levels) / (1023 - levels)).float()[None]
+    frame = RawFrame(raw, name, black, 1023.0, camera="Maker X", color_matrix=MATRIX)  # type: ignore[arg-type]
+    write_dng(tmp_path / "a.dng", frame)
+    assert np.array_equal(numbers_in(tmp_path / "a.dng"), numbers.numpy())
+    back = read_raw(tmp_path / "a.dng")
+    assert (back.cfa, back.black, back.white) == (name, black, 1023.0)
+    torch.testing.assert_close(back.mosaic, raw, rtol=0, atol=1e-7)
+    with rawpy.imread(str(tmp_path / "a.dng")) as file:
+        if len(cell) == 6:  # LibRaw knows no cells of 4 x 4
+            assert np.array_equal(file.raw_colors_visible[:6, :6], (cell - (cell == 3).long()).numpy())
+
+
+def test_libraw_demosaics_xtrans_in_its_colours(tmp_path: Path) -> None:
+    scene = torch.tensor([0.5, 0.3, 0.2])[:, None, None].expand(3, 516, 520)  # LibRaw's least for X-Trans is 512
+    frame = RawFrame(pattern("XTRANS+2+1").mosaic(scene), "XTRANS+2+1", (64.0,) * 4, 16383.0, color_matrix=MATRIX)
+    write_dng(tmp_path / "a.dng", frame)
+    settings = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
+    with rawpy.imread(str(tmp_path / "a.dng")) as file:
+        rgb = file.postprocess(user_wb=[1, 1, 1, 1], adjust_maximum_thr=0, **settings) / 65535
+    assert np.abs(rgb[6:-6, 6:-6] - [0.5, 0.3, 0.2]).max() < 2e-3
