@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from denoisers.files import build, from_pretrained, load, save
     from denoisers.inference import SelfEnsemble, tiled
     from denoisers.joint import JointDRUNet
+    from denoisers.mosaic import MosaicDRUNet
     from denoisers.network import Denoiser
     from denoisers.networks import DHDN, DnCNN, DRUNet, NAFNet, UNet
     from denoisers.pmrid import PMRID
@@ -26,6 +27,7 @@ _MODULES = {
     "denoisers.files": "build from_pretrained load save",
     "denoisers.inference": "SelfEnsemble tiled",
     "denoisers.joint": "JointDRUNet",
+    "denoisers.mosaic": "MosaicDRUNet",
     "denoisers.network": "Denoiser",
     "denoisers.networks": "DHDN DRUNet DnCNN NAFNet UNet",
     "denoisers.pmrid": "PMRID",
@@ -34,9 +36,9 @@ _MODULES = {
 """Modules, and the public names that each defines."""
 
 __all__ = [
-    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "JointDRUNet", "NAFNet",
-    "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation", "UNet", "Wavelet", "build", "from_pretrained",
-    "load", "save", "tiled",
+    "BM3D", "DENOISERS", "DHDN", "PMRID", "CycleISPDenoiser", "DRUNet", "Denoiser", "DnCNN", "JointDRUNet",
+    "MosaicDRUNet", "NAFNet", "NonLocalMeans", "SelfEnsemble", "Stabilised", "TotalVariation", "UNet", "Wavelet",
+    "build", "from_pretrained", "load", "save", "tiled",
 ]  # fmt: skip
 
 

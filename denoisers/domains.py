@@ -31,8 +31,11 @@ _LEAST_RATIO = 1e-3
 
 
 def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """shot_var and read_var ``(B, 1, 1, 1)`` of a noise map ``(B, C, h, w)``, by least squares; neither is negative."""
-    light, axes = noisy.clamp_min(0.0), (1, 2, 3)
+    """shot_var and read_var ``(B, 1, 1, 1)`` of a noise map ``(B, C, h, w)``, by least squares; neither is negative.
+
+    What ``noisy`` has beyond C channels, such as planes of colours, does not count.
+    """
+    light, axes = noisy[:, : variance.shape[1]].clamp_min(0.0), (1, 2, 3)
     mean, level = light.mean(axes, keepdim=True), variance.mean(axes, keepdim=True)
     spread = (light - mean).square().mean(axes, keepdim=True)
     slope = ((light - mean) * (variance - level)).mean(axes, keepdim=True) / spread.clamp_min(1e-20)

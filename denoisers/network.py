@@ -291,6 +291,10 @@ class Denoiser(nn.Module, ABC):
         if image.dtype != self._dtype and not torch.is_autocast_enabled(image.device.type):
             raise ValueError(f"{what} is {image.dtype} but the network is {self._dtype}; convert one of them")
 
+    def start_from(self, model: Denoiser) -> None:
+        """Take the weights of a network of this class, or of one of its bases: what it has beyond them is kept."""
+        self.load_state_dict(model.state_dict(), strict=type(self) is type(model))
+
     @torch.no_grad()
     def initialise(self, seed: int, *zeros: nn.Conv2d, gain: float = HE_GAIN) -> None:
         """Draw all convolutions anew (He et al. 2015), deviation ``gain / sqrt(fan in)``, biases and ``zeros`` zero.

@@ -421,10 +421,14 @@ class DRUNet(Denoiser):
         mean = F.avg_pool2d(signal, self.cell)
         light = F.interpolate(mean, signal.shape[-2:], mode="bilinear")
         seen = [signal - light, maps, light] if self.light else [signal - light, maps]
-        x, skips = self.head(torch.cat(seen, dim=1)), []
+        x = self.head(torch.cat(seen, dim=1))
         # The mean over a cell has noise of deviation 1 / cell.
         wide = F.interpolate(F.avg_pool2d(mean, CONTEXT), mean.shape[-2:], mode="bilinear")
-        coarse = self.coarse(self.cell * (mean - wide))
+        return self.trunk(x, self.coarse(self.cell * (mean - wide)))
+
+    def trunk(self, x: Tensor, coarse: Tensor) -> Tensor:
+        """The pyramid, from the first layer's features and those that join at the last scale."""
+        skips = []
         for k, blocks in enumerate(self.encoder):
             x = self.downs[k - 1](x) if k else x
             x = blocks(x + coarse if k == len(self.encoder) - 1 else x)

@@ -23,6 +23,7 @@ from torch.nn import functional as F
 import denoisers
 from denoisers.classical import Stabilised
 from denoisers.files import find, shipped
+from denoisers.mosaic import MosaicDRUNet, OfBayer, of_pattern
 from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned, noise_variance
@@ -47,21 +48,22 @@ class Noisy(NamedTuple):
     """What a denoiser is given: an image, and what it may know of its noise.
 
     Attributes:
-        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; or developed sRGB ``(1, 3, H, W)``.
+        image: packed RAW ``(1, 4, h, w)``, white at 1, not clipped at black; of other patterns than Bayer's the mosaic
+            ``(1, 1, H, W)``; or developed sRGB ``(1, 3, H, W)``.
         variance: of the noise of each value, shape of ``image``; None where it is not known.
         levels: (shot_var, read_var) where the variance is ``shot_var max(image, 0) + read_var``.
-        cfa: the pattern of packed RAW.
+        cfa: the pattern of packed RAW or of the mosaic.
     """
 
     image: Tensor
     variance: Tensor | None = None
     levels: Levels | None = None
-    cfa: CFA = CFA.RGGB
+    cfa: str = CFA.RGGB
 
     @classmethod
     def told(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
-        """Packed RAW ``(1, 4, h, w)`` with the variance of these levels."""
-        return cls(image, noise_variance(image, *levels), levels, CFA(cfa))
+        """Packed RAW ``(1, 4, h, w)``, or a mosaic, with the variance of these levels."""
+        return cls(image, noise_variance(image, *levels), levels, bayer.layout(cfa))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +73,8 @@ class RawDenoiser:
     Attributes:
         name: in tables.
         model: what denoises a piece of packed RAW once the levels, or None, are given: ``model(levels) -> f``.
-        cfa: the pattern that it was trained for; None if it works on any.
+        cfa: the pattern that it was trained for; None if it works on any of Bayer's.
+        of_any: a network that takes mosaics of every pattern, with the planes of their colours.
         info: what its file says of it.
         reads_levels: whether noise levels make a difference.
         upscale: 2 if it demosaics as well: the result is linear camera RGB ``(1, 3, 2h, 2w)``.
@@ -89,6 +92,7 @@ class RawDenoiser:
     name: str
     model: Callable[[Levels | None], Model]
     cfa: CFA | None = None
+    of_any: MosaicDRUNet | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
     reads_levels: bool = True
     upscale: int = 1
@@ -160,10 +164,14 @@ class RawDenoiser:
     def __call__(self, given: Noisy) -> Tensor:
         """Packed RAW ``(1, 4, h, w)`` denoised, on the CPU; linear camera RGB ``(1, 3, 2h, 2w)`` if it demosaics.
 
-        ValueError if the result has another shape, or is not finite where ``checked``.
+        A mosaic ``(1, 1, H, W)`` of another pattern than Bayer's remains one. ValueError if this denoiser takes none,
+        the result has another shape, or is not finite where ``checked``.
         """
-        own = self.cfa or given.cfa
-        image, variance = (x if x is None else _continued(x, given.cfa, own) for x in given[:2])
+        if given.image.shape[1] == 1:
+            return self._mixed_in(given, self._of_mosaic(given))
+        cfa = CFA(given.cfa)
+        own = self.cfa or cfa
+        image, variance = (x if x is None else _continued(x, cfa, own) for x in given[:2])
         run = self._around(self.model(given.levels), own)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
             denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
@@ -172,10 +180,29 @@ class RawDenoiser:
         if tuple(denoised.shape) != expected or (self.checked and not denoised.isfinite().all()):
             got = f"{tuple(denoised.shape)} for {tuple(image.shape)}"
             raise ValueError(f"{self.name}: the result is not finite, or of another shape: {got}")
-        denoised = _cropped(denoised, own, given.cfa)
+        return self._mixed_in(given, _cropped(denoised, own, cfa))
+
+    def _mixed_in(self, given: Noisy, denoised: Tensor) -> Tensor:
         if self.strength == 1.0:
             return denoised.to(given.image.dtype)
         return given.image.lerp(denoised.clamp(max=1.0), self.strength)
+
+    def _of_mosaic(self, given: Noisy) -> Tensor:
+        if self.of_any is None or self.views > 1 or self.tiles is None:
+            what = self.name if self.of_any is None else "the self-ensemble"
+            how = "give --denoiser the weights of a network of every mosaic, as rawaug run any trains it"
+            raise ValueError(
+                f"{what}: is for Bayer mosaics, not {given.cfa}; {how if self.of_any is None else 'omit it'}"
+            )
+        if given.variance is None:
+            raise ValueError(f"{self.name}: needs the variance of the noise")
+        run = partial(denoisers.tiled, self.of_any, tile=2 * self.tiles[0], each=counted("tile"))
+        image, variance = (x.to(self.device) for x in (given.image, given.variance))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
+            denoised = of_pattern(run, image, variance, given.cfa).cpu()
+        if self.checked and not denoised.isfinite().all():
+            raise ValueError(f"{self.name}: the result is not finite")
+        return denoised
 
     def _around(self, model: Model, cfa: CFA) -> Model:
         """The model in tiles, within what its training puts around it, within the self-ensemble."""
@@ -192,6 +219,10 @@ class RawDenoiser:
         """The mosaic ``(1, H, W)`` of a camera's frame denoised, at most 1; linear camera RGB ``(3, H, W)`` if it
         demosaics. ``levels`` may be None where :attr:`reads_levels` is False.
         """
+        if frame.cfa not in CFA.__members__:
+            told = Noisy(frame.mosaic[None], cfa=frame.cfa)
+            told = told if levels is None else Noisy.told(frame.mosaic[None], levels, frame.cfa)
+            return self(told)[0].clamp(max=1.0)
         packed = bayer.pack(frame.mosaic[None], frame.cfa)
         denoised = self(Noisy(packed, cfa=frame.cfa) if levels is None else Noisy.told(packed, levels, frame.cfa))
         image = bayer.unpack(denoised, frame.cfa) if self.upscale == 1 else denoised
@@ -277,15 +308,16 @@ def _of_weights(path: Path) -> RawDenoiser:
 
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> RawDenoiser:
     """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
+    of_any = network if isinstance(network, MosaicDRUNet) else None
+    network = network if of_any is None else OfBayer(of_any)
     reads = getattr(network, "reads_variance", None)
     reads = _takes_two(network.forward) if reads is None else reads
-    if not isinstance(network, (denoisers.Denoiser, OnnxNetwork, BiasFreeDnCNN)):
+    if not isinstance(network, (denoisers.Denoiser, OfBayer, OnnxNetwork, BiasFreeDnCNN)):
         network = _Foreign(network, bool(reads))
     made = network.eval()
     upscale, own = getattr(made, "upscale", 1), CFA(info.get("cfa", "RGGB"))
-    return RawDenoiser(
-        name=name, model=lambda levels: made, cfa=own, info=info, reads_levels=bool(reads), upscale=upscale
-    )
+    about: dict[str, Any] = {"info": info, "reads_levels": bool(reads), "upscale": upscale, "of_any": of_any}
+    return RawDenoiser(name=name, model=lambda levels: made, cfa=own, **about)
 
 
 class _Foreign(nn.Module):

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -210,8 +211,9 @@ def _file_denoised(
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     """Clip, in place, what a digital number cannot hold; its share of the sites."""
     below = 0
-    for (i, j), black in zip(frame.cfa.sites, frame.black, strict=True):
-        plane = mosaic[0, i::2, j::2]
+    cell = bayer.sites(frame.cfa)
+    for i, j in product(range(len(cell)), repeat=2):
+        plane, black = mosaic[0, i :: len(cell), j :: len(cell)], frame.black[cell[i, j]]
         lowest = -black / (frame.white - black)
         below += int((plane < lowest - 0.5 / (frame.white - black)).sum())
         plane.clamp_(min=lowest)

@@ -138,7 +138,7 @@ def compared(image: Tensor, trial: Trial) -> tuple[float, float, float | None, f
 
 def _as_compared(image: Tensor, trial: Trial) -> Tensor:
     if trial.domain == "raw":
-        return bayer.unpack(image, trial.cfa)
+        return image if image.shape[1] == 1 else bayer.unpack(image, trial.cfa)
     return image.clamp(0.0, 1.0) if trial.domain == "srgb" else image
 
 

@@ -47,7 +47,7 @@ class Trial:
         condition: what the denoiser is told, or what the sensor does; rows carry it.
         strength: the name of the noise's strength; rows carry it.
         levels: (shot_var, read_var) that the denoiser is told, if the noise has any.
-        cfa: the pattern of packed RAW.
+        cfa: the pattern of packed RAW, or of a mosaic ``(1, 1, H, W)`` in its place.
         develop: makes sRGB ``(3, H, W)`` of an image like ``noisy`` or ``clean``, the same way for both.
         raw: of developed pictures, the RAW that they were developed from, as a denoiser of RAW gets it.
         ways: from denoised RAW to ``domain``, by name; a denoiser that gives RAW is scored once for each.
@@ -63,7 +63,7 @@ class Trial:
     condition: str = ""
     strength: str = ""
     levels: Levels | None = None
-    cfa: CFA = CFA.RGGB
+    cfa: str = CFA.RGGB
     develop: Callable[[Tensor], Tensor] | None = None
     raw: Noisy | None = None
     ways: Mapping[str, Callable[[Tensor], Tensor]] = field(default_factory=dict)

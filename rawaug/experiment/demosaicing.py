@@ -44,6 +44,8 @@ from rawaug.seeding import keyed_generator
 
 LIBRAW = ("VNG", "PPG", "AHD", "DCB", "DHT", "AAHD")
 """LibRaw's demosaicings by its names."""
+LEAST = 512
+"""Sides that LibRaw's interpolation of X-Trans needs."""
 BLACK, WHITE = 1024, 65535
 """Of the DNGs that LibRaw demosaics."""
 
@@ -60,6 +62,7 @@ class JointRecipe(Recipe):
     """
 
     target: ClassVar[Target] = "rgb"
+    together: ClassVar[bool] = True
     test_noise: tuple[float, float] | str = "cycleisp_sidd"
     rivals: list[str] = field(default_factory=lambda: ["NonLocalMeans", DEFAULT])
     demosaicing: list[str] = field(default_factory=lambda: ["malvar", "AHD", "DCB"])
@@ -125,18 +128,24 @@ def developed(image: Tensor, pair: Pair, exposure: float) -> Tensor:
 def demosaiced(packed: Tensor, pair: Pair, method: str) -> Tensor:
     """Packed RGGB RAW ``(1, 4, h, w)`` of a frame as linear camera RGB ``(1, 3, 2h, 2w)``."""
     mosaic = bayer.unpack(packed, CFA.RGGB)
-    return _by_libraw(mosaic, pair, method) if method in LIBRAW else bayer.demosaic(mosaic, CFA.RGGB, method)
+    return by_libraw(mosaic, pair, method) if method in LIBRAW else bayer.demosaic(mosaic, CFA.RGGB, method)
 
 
-def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
+def by_libraw(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
+    """A mosaic ``(1, 1, H, W)`` as LibRaw demosaics it, as linear camera RGB ``(1, 3, H, W)``.
+
+    X-Trans has Markesteijn's interpolation, whatever ``method`` is; a small mosaic is continued by its whole cells.
+    """
     with extra("raw"):
         import rawpy
 
     gains = torch.tensor(pair.white_balance).reshape(3, 1, 1) / min(pair.white_balance)
     room = gains.max()  # LibRaw clips at white what the gains lift beyond it
-    mosaic = (mosaic[0] / room).clamp(-BLACK / (WHITE - BLACK), 1.0)
+    height, width = mosaic.shape[-2:]
+    rows, columns = (_repeated(side, bayer.pattern(cfa).period) for side in (height, width))
+    mosaic = (mosaic[0][:, rows][..., columns] / room).clamp(-BLACK / (WHITE - BLACK), 1.0)
     colour = pair.white_balance, pair.white_balance, pair.color_matrix
-    frame = RawFrame(mosaic, CFA.RGGB, (BLACK,) * 4, WHITE, *colour, pair.camera, name=pair.name)
+    frame = RawFrame(mosaic, cfa, (BLACK,) * 4, WHITE, *colour, pair.camera, name=pair.name)
     settings = {"output_color": rawpy.ColorSpace.raw, "gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
     settings |= {"adjust_maximum_thr": 0, "user_flip": 0, "user_wb": [*gains.flatten().tolist(), gains[1].item()]}
     with TemporaryDirectory() as folder:
@@ -144,7 +153,13 @@ def _by_libraw(mosaic: Tensor, pair: Pair, method: str) -> Tensor:
         write_dng(path, frame)
         with rawpy.imread(str(path)) as raw:
             rgb = raw.postprocess(demosaic_algorithm=rawpy.DemosaicAlgorithm[method], **settings)
-    return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None]
+    return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None, :, :height, :width]
+
+
+def _repeated(side: int, period: int) -> Tensor:
+    """Lines of a side; where LibRaw would find it too small, its whole cells again."""
+    lines = torch.arange(side if period == 2 else max(side, LEAST))
+    return torch.where(lines < side, lines, lines % (side // period * period))
 
 
 class Demosaiced:

@@ -48,6 +48,7 @@ from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import faintness_note, noisy_only
 from rawaug.training.state import first_network, start_of
+from rawaug.training.stream import TrainingStream
 
 SHOWN = 3
 """Test frames in the picture."""
@@ -86,8 +87,8 @@ def run(
 class TrainingRun:
     """One recipe on its data; what could be missing or wrong is opened or tried before anything is fitted.
 
-    A kind of experiment with another target overrides :meth:`watched`, :meth:`trial`, :meth:`evaluated` or
-    :meth:`reported`.
+    A kind of experiment with another target overrides :meth:`stream`, :meth:`watched`, :meth:`trial`,
+    :meth:`evaluated` or :meth:`reported`.
     """
 
     input: Any = NOISY
@@ -196,7 +197,7 @@ class TrainingRun:
             if info.get("key") == key:
                 print(f"already trained: {path}")
                 return model
-        stream = training_stream(recipe, recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed)
+        stream = self.stream(arm, isp, noise, seed)
         model = train(
             stream,
             self.watched(isp, noise),
@@ -221,6 +222,12 @@ class TrainingRun:
         denoisers.save(model, path, info)
         (place / "last.pt").unlink(missing_ok=True)
         return model
+
+    def stream(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> TrainingStream:
+        """The training samples of an arm."""
+        return training_stream(
+            self.recipe, self.recipe.arms[arm], self.frames["pairs"], self.pictures, isp, noise, seed
+        )
 
     def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
         """The frozen samples by which the weights of every arm are chosen."""

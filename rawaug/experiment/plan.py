@@ -124,7 +124,7 @@ def planned(recipe: Recipe, given: Mapping[str, Sequence[Pair]]) -> Plan:
     pictures: Any = PairPictures(chosen) if data.pictures == OWN_PICTURES else None
     if pictures is None:
         pictures = open_pictures(data.pictures, recipe.train.crop + 6, data.max_pixels)
-    together = recipe.target == "rgb"
+    together = recipe.together
     return Plan(
         pairs=chosen,
         validation=some(validation, data.validation_count, data.validation_crop, data.bin, together),

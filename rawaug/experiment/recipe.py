@@ -192,6 +192,8 @@ class Recipe:
     """
 
     target: ClassVar[Target] = "raw"
+    together: ClassVar[bool] = False
+    """Whether frames are binned so that the four sites of a cell make a pixel of full colour."""
     name: str = "experiment"
     data: DataConfig = field(default_factory=DataConfig)
     isp: FitConfig = field(default_factory=FitConfig)

@@ -54,7 +54,7 @@ def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
             f"denoiser.start: {config.start} is a {type(model).__name__} with {model.config}, not a "
             f"{config.name} with {wanted.config}; leave denoiser.name and denoiser.settings out to take the file's"
         )
-    wanted.load_state_dict(model.state_dict(), strict=type(wanted) is type(model))
+    wanted.start_from(model)
     return wanted.train()
 
 

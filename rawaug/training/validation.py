@@ -26,7 +26,7 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     """Mean PSNR in dB, large frames in tiles.
 
     Returns ``psnr`` over all frames; of three or more ``psnr_low``, ``psnr_middle`` and ``psnr_high`` over the thirds;
-    and the same as ``psnr_srgb``, ... where every frame can be developed.
+    and the same as ``psnr_srgb``, ... where every frame can be developed; ``psnr_CONDITION`` over those of each.
     """
     net.eval()
     raw, srgb = [], []
@@ -39,6 +39,9 @@ def validate(net: nn.Module, frames: Sequence[Trial], device: torch.device) -> d
     net.train()
     noise = [frame.amount for frame in frames]
     scores = _by_part("psnr", raw, noise)
+    for kind in dict.fromkeys(frame.condition for frame in frames if frame.condition):
+        of_kind = [score for score, frame in zip(raw, frames, strict=True) if frame.condition == kind]
+        scores[f"psnr_{kind}"] = fmean(of_kind)
     return scores | (_by_part("psnr_srgb", srgb, noise) if len(srgb) == len(frames) else {})
 
 
@@ -61,6 +64,7 @@ def panels(net: nn.Module, frame: Trial) -> Tensor:
     told = None if variance is None else variance.to(device)
     denoised = net(noisy.to(device), told).cpu().nan_to_num()  # black where the training has diverged
     net.train()
+    noisy = noisy[:, :1] if clean.shape[1] == 1 else noisy  # without the planes of its colours
     shown = [(frame.develop or _shown)(image) for image in (noisy, denoised, clean)]
     return torch.cat([F.interpolate(image[None], shown[-1].shape[-2:])[0] for image in shown], dim=-1)
 
@@ -68,7 +72,7 @@ def panels(net: nn.Module, frame: Trial) -> Tensor:
 def _shown(image: Tensor) -> Tensor:
     if image.shape[1] == 3:
         return image[0].clamp(0.0, 1.0)
-    return image[0, 1:3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
+    return image[0, image.shape[1] // 4 : 3].mean(0).clamp(0.0, 1.0).pow(1 / 2.2).expand(3, -1, -1)
 
 
 def _by_part(name: str, scores: Sequence[float], noise: Sequence[float]) -> dict[str, float]:

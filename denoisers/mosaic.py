@@ -1,0 +1,241 @@
+r"""One network for mosaics of every pattern: it sees the mosaic, and which colour each of its pixels has.
+
+Domain: ``(B, 4, H, W)``, the mosaic, white = 1, and planes that are 1 at the sites of a colour (:func:`with_planes`),
+to the mosaic ``(B, 1, H, W)``. A site's values enter the first layer by place and colour,
+
+.. math:: u_{c s} = m_{c s} \, (z_s - \bar z_c), \qquad z'_s = z_s + \sum_c m_{c s} \, r_{c s},
+
+with s one of the four pixels of a 2 x 2 square, m the planes, z the transformed signal, :math:`\bar z_c` the mean of a
+colour over a cell of the last scale and r the last layer's result. For RGGB these are packed RAW's planes, with zeros
+between them, so that a network may begin as a :class:`denoisers.DRUNet` of packed RAW; of X-Trans eight squares of nine
+hold a red, two greens and a blue as well. At half its sides every mosaic becomes one of RGGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from denoisers.domains import DOMAINS, levels_of
+from denoisers.network import BLIND, DEFECT, NEAR, PACKED, Denoiser, conv, pad_to_multiple
+from denoisers.networks import CONTEXT, DRUNet, ResidualBlock
+from rawaug import bayer
+from rawaug.registry import DENOISERS
+
+RGB = 3
+SITES = 4
+"""Pixels of a 2 x 2 square."""
+SPREAD = RGB * SITES
+
+Levels = tuple[Tensor, Tensor]
+"""shot_var and read_var, ``(B, 1, 1, 1)``, or of every pixel ``(B, 1, H, W)``."""
+
+
+_MET = ("RGGB", "XTRANS", "QUAD-RGGB+1+1")
+"""Where every 2 x 2 square has all colours, as far as the pattern lets it."""
+
+
+def entered(pattern: bayer.Pattern) -> bayer.Pattern:
+    """The pattern from where a network is trained to meet it: its origin, or one line before it either way."""
+    places = {known.shifted(i, j) for known in map(bayer.pattern, _MET) for i in range(0, 6, 2) for j in range(0, 6, 2)}
+    return next(moved for i in (0, 1) for j in (0, 1) if (moved := pattern.shifted(-i, -j)) in places)
+
+
+def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
+    """A mosaic ``(B, 1, H, W)`` and the planes of its colours, ``(B, 4, H, W)``."""
+    planes = pattern.planes(*mosaic.shape[-2:]).to(mosaic)
+    return torch.cat([mosaic, planes.expand(len(mosaic), -1, -1, -1)], dim=1)
+
+
+def of_pattern(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, variance: Tensor, cfa: str) -> Tensor:
+    """A mosaic ``(1, 1, H, W)`` of any pattern denoised by ``run``, such as a :class:`MosaicDRUNet`, or its tiles.
+
+    It gets a mirrored line above or on the left where the network is trained to meet the pattern one line earlier.
+    """
+    known = bayer.pattern(cfa)
+    top, left = next((i, j) for i in (0, 1) for j in (0, 1) if known.shifted(-i, -j) == entered(known))
+    noisy, told = (F.pad(x, (left, 0, top, 0), mode="reflect") for x in (with_planes(mosaic, known), variance))
+    return run(noisy, told)[..., top:, left:]
+
+
+def mended(signal: Tensor, planes: Tensor) -> Tensor:
+    """A mosaic ``(B, 1, H, W)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
+
+    A defect lies beyond all pixels of its colour within two of it by :data:`denoisers.network.DEFECT`; the pixels that
+    touch it do not depart from theirs as much.
+    """
+    near = _neighbours(torch.cat([signal, planes.argmax(1, keepdim=True).to(signal)], dim=1), 2)
+    colour = planes.argmax(1, keepdim=True)
+    infinity = torch.full_like(signal, torch.inf)
+    low, high = infinity, -infinity
+    total, count = torch.zeros_like(signal), torch.zeros_like(signal)
+    for value, other in (pixel.split(1, dim=1) for pixel in near):
+        same = other == colour
+        low, high = torch.where(same, value.minimum(low), low), torch.where(same, value.maximum(high), high)
+        total, count = total + value * same, count + same
+    mean = (total - low - high) / (count - 2).clamp_min(1)
+    deviations, share = DEFECT
+    beyond = (signal > high + share * high.abs() + deviations) | (signal < low - share * low.abs() - deviations)
+    departure = (signal - mean).abs()
+    others = torch.cat(_neighbours(departure, 1), dim=1).amax(1, keepdim=True)
+    return torch.where(beyond & (count > 2) & (departure > 4.0 * others), mean, signal)
+
+
+def _neighbours(image: Tensor, reach: int) -> list[Tensor]:
+    """The pictures ``(B, C, H, W)`` of all neighbours within ``reach``, mirrored at the edges."""
+    height, width = image.shape[-2:]
+    padded, side = F.pad(image, (reach,) * 4, mode="reflect"), range(2 * reach + 1)
+    places = [(i, j) for i in side for j in side if (i, j) != (reach, reach)]
+    return [padded[..., i : i + height, j : j + width] for i, j in places]
+
+
+@DENOISERS.register("MosaicDRUNet")
+class MosaicDRUNet(DRUNet):
+    """:class:`denoisers.DRUNet` for mosaics of every pattern: Bayer's in all phases, X-Trans, Quad-Bayer.
+
+    It starts from the weights of a DRUNet of packed RAW with the same settings, if asked to: on RGGB it is then that
+    network, but for the borders and a mean over both greens.
+
+    Args:
+        width, scales, blocks, limits, mend, domain, pyramid, seed: see :class:`denoisers.DRUNet`.
+
+    Example:
+        >>> planes = bayer.pattern("XTRANS").planes(30, 36).expand(2, -1, -1, -1)
+        >>> noisy = torch.cat([torch.rand(2, 1, 30, 36), planes], dim=1)
+        >>> MosaicDRUNet(width=4)(noisy, torch.full((2, 1, 30, 36), 1e-4)).shape
+        torch.Size([2, 1, 30, 36])
+    """
+
+    tiny: ClassVar[dict[str, Any]] = {"width": 4, "scales": 2}
+
+    def __init__(
+        self,
+        width: int = 32,
+        scales: int = 4,
+        blocks: int = 1,
+        limits: bool = True,
+        mend: bool = True,
+        domain: str = "anscombe",
+        pyramid: int = 0,
+        seed: int = 0,
+    ) -> None:
+        if domain == "linear":
+            raise ValueError("domain linear is for networks of packed RAW; choose ksigma or anscombe")
+        super().__init__(width, scales, blocks, limits, mend, PACKED, False, True, domain, seed, 1, pyramid)
+        own = {"width": width, "scales": scales, "blocks": blocks, "limits": limits, "mend": mend}
+        self.config = {**own, "domain": domain} | ({"pyramid": pyramid} if pyramid else {})
+        self.multiple, self.stride = 2 * self.multiple, 2 * self.stride
+        self.head = conv(SPREAD * (2 + 2 * limits), width, bias=False)
+        self.coarse = conv(RGB, self.coarse.out_channels, bias=False)
+        self.tail = conv(width, SPREAD, bias=False)
+        ends = [module.conv2 for module in self.modules() if isinstance(module, ResidualBlock)]
+        self.initialise(seed, self.tail, *ends, gain=1.0)
+
+    @torch.no_grad()
+    def start_from(self, model: Denoiser) -> None:
+        """Take the weights of another of this class, or of a DRUNet of packed RAW, each of whose planes is spread."""
+        state = model.state_dict()
+        if not isinstance(model, MosaicDRUNet):
+            head = state["head.weight"].unflatten(1, (-1, PACKED))
+            spread = torch.stack([_by_site(planes) for planes in head.unbind(1)], dim=1).flatten(1, 2)
+            colours = torch.zeros_like(spread[:, :SPREAD])
+            state["head.weight"] = torch.cat([spread, colours], dim=1)
+            state["tail.weight"] = _by_site(state["tail.weight"].transpose(0, 1)).transpose(0, 1)
+            red, green, other, blue = state["coarse.weight"].unbind(1)
+            state["coarse.weight"] = torch.stack([red, green + other, blue], dim=1)
+        self.load_state_dict(state)
+
+    def forward(self, noisy: Tensor, variance: Tensor | None = None) -> Tensor:
+        """Denoise a mosaic with its planes, ``(B, 4, H, W)``; ``variance`` and the result are ``(B, 1, H, W)``."""
+        name = type(self).__name__
+        if noisy.ndim != 4 or noisy.shape[1] != 1 + RGB or min(noisy.shape[-2:]) < 4:
+            raise ValueError(f"{name} takes a mosaic and its planes, (B, 4, H >= 4, W >= 4), got {tuple(noisy.shape)}")
+        self._require_type(noisy, "noisy")
+        raw, planes = noisy[:, :1], noisy[:, 1:]
+        variance = self._required(raw, variance)
+        levels = levels_of(raw.float(), variance.float())
+        whole = self._repaired(raw, planes, levels) if self.mend else raw
+        denoised = self._at_halves(whole, planes, levels, (whole >= 1.0).to(raw), self.pyramid)
+        return torch.where(variance > 0, denoised, raw)
+
+    def _repaired(self, raw: Tensor, planes: Tensor, levels: Levels) -> Tensor:
+        domain = DOMAINS[self.domain]
+        signal = domain.forward(raw.float(), *levels)
+        repaired = mended(signal, planes)
+        return torch.where(repaired == signal, raw, domain.inverse(repaired, *levels).to(raw.dtype))
+
+    def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:
+        """As a network of packed RAW has it: ``g(y) = f(y) + U k(g(B y) - B f(y))``; B y is a mosaic of RGGB."""
+        denoised = self._of_mosaic(raw, planes, levels)
+        if not halvings:
+            return denoised
+        even = pad_to_multiple(torch.cat([raw, denoised, clipped, planes], dim=1), 4)
+        halving = bayer.Halving(even[:, 3:])
+        small, seen, share = (halving(even[:, k : k + 1]) for k in range(3))
+        half, clipped = (F.pixel_shuffle(x, 2) for x in (small, share))
+        told = tuple(F.pixel_shuffle(halving.variance(_padded(level)), 2) for level in levels)
+        colours = bayer.pattern("RGGB").planes(*half.shape[-2:]).to(half).expand(len(half), -1, -1, -1)
+        found = self._at_halves(half, colours, told, clipped, halvings - 1)
+        wide, near = (
+            F.avg_pool2d(x, 3, 1, 1, count_include_pad=False) for x in (F.pixel_unshuffle(found, 2) - seen, share)
+        )
+        height, width = raw.shape[-2:]
+        added = halving.back((1.0 - near / BLIND).clamp_min(0.0) * wide)[..., :height, :width]
+        return denoised + (added * planes).sum(1, keepdim=True)
+
+    def _of_mosaic(self, raw: Tensor, planes: Tensor, levels: Levels) -> Tensor:
+        domain = DOMAINS[self.domain]
+        signal = domain.forward(raw.float(), *levels)
+        maps = [signal]
+        if self.limits:
+            white = domain.forward(torch.ones_like(levels[0]), *levels).expand_as(signal)
+            maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
+        features = pad_to_multiple(torch.cat([planes, *maps], dim=1).to(self._dtype), self.multiple)
+        correction = self.residual(features)[..., : raw.shape[-2], : raw.shape[-1]]
+        return domain.inverse(signal + correction, *levels).to(raw.dtype)
+
+    def residual(self, features: Tensor) -> Tensor:
+        """Planes, signal and limits ``(B, 4 or 6, H, W)`` to the correction ``(B, 1, H, W)``."""
+        planes, maps = features[:, :RGB], features[:, RGB:]
+        sites = F.pixel_unshuffle(planes, 2)
+        spread = [F.pixel_unshuffle(planes * one, 2) for one in maps.split(1, dim=1)]
+        cell = 2 * self.cell
+        mean = F.avg_pool2d(planes * maps[:, :1], cell) / F.avg_pool2d(planes, cell).clamp_min(1e-6)
+        light = F.interpolate(mean, sites.shape[-2:], mode="bilinear").repeat_interleave(SITES, dim=1)
+        spread[0] = spread[0] - light * sites
+        wide = F.interpolate(F.avg_pool2d(mean, CONTEXT), mean.shape[-2:], mode="bilinear")
+        x = self.trunk(self.head(torch.cat([*spread, sites], dim=1)), self.coarse(self.cell * (mean - wide)))
+        correction = (self.tail(x) * sites).unflatten(1, (RGB, SITES)).sum(1)
+        return F.pixel_shuffle(correction, 2)
+
+
+class OfBayer(nn.Module):
+    """A :class:`MosaicDRUNet` as a network of packed RAW, ``(B, 4, h, w)`` of RGGB, like the others."""
+
+    reads_variance = True
+
+    def __init__(self, network: MosaicDRUNet) -> None:
+        super().__init__()
+        self.network = network
+        self.stride = network.stride // 2
+        self.mixed = network.mixed
+
+    def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
+        """Packed RAW and its variance to packed RAW, as any :class:`denoisers.Denoiser`."""
+        raw, told = (bayer.unpack(x, bayer.CFA.RGGB) for x in (noisy, variance))
+        return bayer.pack(self.network(with_planes(raw, bayer.pattern("RGGB")), told), bayer.CFA.RGGB)
+
+
+def _padded(level: Tensor) -> Tensor:
+    return pad_to_multiple(level, 4) if level.shape[-1] > 1 else level
+
+
+def _by_site(packed: Tensor) -> Tensor:
+    """Weights of R, Gr, Gb, B, ``(n, 4, 3, 3)``, for every colour at every site of a square, ``(n, 12, 3, 3)``."""
+    red, green, other, blue = packed.unbind(1)
+    mean = (green + other) / 2
+    return torch.stack([*[red] * SITES, mean, green, other, mean, *[blue] * SITES], dim=1)

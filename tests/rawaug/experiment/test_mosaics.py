@@ -1,0 +1,83 @@
+"""One network for every pattern: its test cases, its samples, and the recipe from end to end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from denoisers import MosaicDRUNet, save
+from rawaug import RawAugment, bayer
+from rawaug.bayer import pattern
+from rawaug.data import demo_pairs
+from rawaug.data.pairs import Pair
+from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.evaluation.scores import NOISY, score
+from rawaug.experiment.demosaicing import by_libraw, full_colour
+from rawaug.experiment.mosaics import MosaicRecipe, mosaic_trial, watched_trial
+from rawaug.experiment.recipe import ArmConfig
+from rawaug.isp.model import DictionaryISP
+from rawaug.noise import noise_model
+from rawaug.seeding import keyed_generator
+from rawaug.training.mosaics import MosaicCrops
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    return demo_pairs("test", count=1)[0].middle(192)
+
+
+def test_a_frame_has_the_same_light_in_every_pattern(pair: Pair) -> None:
+    noise = noise_model((1e-3, 1e-5))
+    for name in ("GRBG", "XTRANS", "QUAD-BGGR"):
+        trial, own = mosaic_trial(pair, name, noise), watched_trial(pair, name, noise)
+        assert torch.equal(trial.clean, full_colour(pair)) and torch.equal(own.clean, pattern(name).mosaic(trial.clean))
+        raw = trial.noisy if name != "GRBG" else bayer.unpack(trial.noisy, name)
+        assert torch.equal(raw, own.noisy[:, :1])
+        assert own.variance is not None
+        deviation = ((own.noisy[:, :1] - own.clean) / own.variance.sqrt()).std().item()
+        assert deviation == pytest.approx(1.0, rel=0.03)
+
+
+def test_libraw_demosaics_small_frames_of_every_pattern(pair: Pair) -> None:
+    scene = torch.tensor([0.5, 0.4, 0.3])[:, None, None] * torch.linspace(0.5, 1.0, 70)
+    for name in ("RGGB", "XTRANS"):
+        rgb = by_libraw(pattern(name).mosaic(scene.expand(1, 3, 62, 70)), pair, "AHD", name)
+        assert rgb.shape == (1, 3, 62, 70)
+        assert (rgb - scene)[..., 8:-8, 8:-8].abs().max() < 0.02
+
+
+def test_samples_are_of_all_patterns_and_say_which(pair: Pair) -> None:
+    augment = RawAugment(DictionaryISP(), noise=(1e-9, 0.0))
+    picture = torch.tensor([200, 120, 60], dtype=torch.uint8)[:, None, None].expand(3, 96, 96)
+    crops = MosaicCrops([picture], augment, 32, 1.0, {"RGGB": 0.4, "XTRANS": 0.4, "QUAD-RGGB": 0.2})
+    seen = set()
+    for number in range(40):
+        sample = crops.draw(keyed_generator(0, number))
+        assert sample.noisy.shape == (4, 32, 32) and sample.clean.shape == sample.variance.shape == (1, 32, 32)
+        planes = sample.noisy[1:]
+        assert torch.equal(planes.sum(0), torch.ones(32, 32))
+        seen.add(tuple(planes.argmax(0)[:6, :6].flatten().tolist()))
+        for plane in planes.bool():
+            assert sample.clean[0][plane].std() < 1e-4, "a colour of a plain picture has one value"
+    assert 6 < len(seen) <= 1 + 9 + 4  # RGGB; X-Trans and Quad-Bayer from every other line either way
+    again = crops.draw(keyed_generator(0, 3))
+    assert torch.equal(again.noisy, crops.draw(keyed_generator(0, 3)).noisy)
+
+
+def test_a_network_of_mosaics_is_scored_in_every_pattern_and_others_in_bayer(tmp_path: Path, pair: Pair) -> None:
+    save(MosaicDRUNet(width=4, scales=2, mend=False), tmp_path / "own.safetensors", {})
+    own = RawDenoiser.of(tmp_path / "own.safetensors")
+    for name in ("BGGR", "XTRANS", "QUAD-RGGB"):
+        noisy, same = score([NOISY, own], [mosaic_trial(pair, name, noise_model((1e-3, 1e-5)))])
+        assert same.condition == name and same.psnr == pytest.approx(noisy.psnr, abs=0.01)  # untrained: the identity
+    with pytest.raises(ValueError, match=r"NonLocalMeans: is for Bayer mosaics, not XTRANS; give --denoiser"):
+        RawDenoiser.of("NonLocalMeans")(mosaic_trial(pair, "XTRANS", noise_model((1e-3, 1e-5))).given)
+
+
+def test_a_recipe_without_shares_or_with_unknown_patterns_is_refused() -> None:
+    arms = {"any": ArmConfig(augmented=1.0)}
+    for patterns, said in (({"X": 1.0}, "CFA 'X' is unknown"), ({"RGGB": 0.0}, "patterns: shares must be")):
+        with pytest.raises(ValueError, match=said):
+            MosaicRecipe(camera="universal", patterns=patterns, arms=arms)  # type: ignore[arg-type]
