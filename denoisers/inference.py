@@ -74,7 +74,10 @@ def tiled(
     (tops, height), (lefts, width) = (_pieces(side, tile, overlap, stride) for side in noisy.shape[-2:])
     for top, left in each([(top, left) for top in tops for left in lefts]):
         window = (..., slice(top, top + height), slice(left, left + width))
-        piece = model(noisy[window], None if variance is None else variance[window])
+        given = noisy[window]
+        piece = model(given, None if variance is None else variance[window])
+        if piece.shape[-2:] != tuple(scale * side for side in given.shape[-2:]):
+            raise ValueError(f"the model made {tuple(piece.shape)} of {tuple(given.shape)}")
         if denoised is None:
             denoised = piece.new_empty(*piece.shape[:2], *(scale * side for side in noisy.shape[-2:]))
         above, before = (scale * overlap if start else 0 for start in (top, left))

@@ -147,7 +147,7 @@ class RawDenoiser:
         found = spec if isinstance(spec, cls) else _found(spec, changes.get("name"))
         network = found.model(None)
         if isinstance(network, nn.Module) and not isinstance(network, OnnxNetwork):
-            where = find_device(device)
+            where = find_device(str(device))
             network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
             mixed = precision == "auto" and getattr(network, "mixed", False) and fast_in_bfloat16(where)
             changes = {"device": where, "mixed": mixed, **changes}
@@ -171,7 +171,8 @@ class RawDenoiser:
             return self._mixed_in(given, self._of_mosaic(given))
         cfa = CFA(given.cfa)
         own = self.cfa or cfa
-        image, variance = (x if x is None else _continued(x, cfa, own) for x in given[:2])
+        image = _continued(given.image, cfa, own)
+        variance = None if given.variance is None else _continued(given.variance, cfa, own)
         run = self._around(self.model(given.levels), own)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
             denoised = run(image.to(self.device), None if variance is None else variance.to(self.device)).cpu()
@@ -346,7 +347,7 @@ def _of_filter(spec: Spec) -> RawDenoiser:
 
 
 def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:
-    name = name or getattr(function, "__name__", type(function).__name__)
+    name = name or str(getattr(function, "__name__", type(function).__name__))
     reads = _takes_two(function)
 
     def run(noisy: Tensor, variance: Tensor | None) -> Tensor:

@@ -53,7 +53,12 @@ class OnnxNetwork(nn.Module):
             found = [self.session.run(None, feeds(self.names, one))[0] for one in ones]
         except Exception as error:  # ONNX Runtime has a class of its own for each reason
             raise ValueError(f"{self.path}: {' '.join(str(error).split())}") from None
-        return torch.cat([torch.as_tensor(one) for one in found])
+        denoised = torch.cat([torch.as_tensor(one) for one in found])
+        sides = [self.upscale * side for side in noisy.shape[-2:]]
+        if denoised.ndim != 4 or list(denoised.shape[-2:]) != sides:
+            got = f"{tuple(denoised.shape)} for {tuple(noisy.shape)}"
+            raise ValueError(f"{self.path}: the result is of another shape: {got}")
+        return denoised
 
 
 def session_of(path: Path) -> Any:

@@ -155,11 +155,11 @@ def _made(denoiser: Any) -> RawDenoiser:
 
 
 def _require_new(path: Path, overwrite: bool, *suffixes: str) -> None:
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
     if path.suffix.lower() not in (suffixes or (".dng",)):
         kind = "preview is a .jpg or .png" if suffixes else "output is a DNG; give a name ending in .dng"
         raise ValueError(f"{path}: the {kind}")
-    if path.exists() and not overwrite:
-        raise ValueError(f"{path}: exists; give another name, or --overwrite to replace it")
     require_writable(path)
 
 

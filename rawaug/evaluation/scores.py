@@ -110,11 +110,11 @@ def _rows(denoiser: Denoiser, trial: Trial) -> Iterator[Row]:
     found = denoiser(given)
     seconds = (time.perf_counter() - start) / (given.image.numel() / 1e6)
     for name, image in results(denoiser.name, found, trial):
-        values = compared(image, trial)
-        error = 10.0 ** (-values[0] / 10.0)
+        figures = compared(image, trial)
+        error = 10.0 ** (-figures[0] / 10.0)
         share = None if trial.own is None or not error > 0 else trial.own / error
-        about = (trial.condition, trial.strength, trial.domain)
-        yield Row(name, trial.frame, *about, *values, share, given.levels, trial.levels_from_clean, seconds)
+        row = Row(name, trial.frame, trial.condition, trial.strength, trial.domain, *figures, share, given.levels)
+        yield row._replace(levels_from_clean=trial.levels_from_clean, seconds=seconds)
 
 
 def results(name: str, found: Tensor, trial: Trial) -> Iterator[tuple[str, Tensor]]:

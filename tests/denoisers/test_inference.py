@@ -194,3 +194,8 @@ def test_it_is_the_same_in_every_call_and_refuses_nonsense() -> None:
     assert torch.equal(average(noisy, variance), average(noisy, variance))
     with pytest.raises(ValueError, match=r"draws must be at least 1 and alpha positive, got 0 and 0\.5"):
         Recorrupted(lambda z, _: z, ALPHA, 0)
+
+
+def test_a_model_that_changes_the_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"the model made \(1, 4, 16, 16\) of \(1, 4, 32, 32\)"):
+        tiled(lambda noisy, variance: noisy[..., ::2, ::2], torch.zeros(1, 4, 32, 32))
