@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks import augment, binning, crops, denoise, measure, sensors, synth
+from benchmarks import augment, binning, crops, denoise, measure, patterns, sensors, synth
 from benchmarks.noisy_pairs import write_pair
 from rawaug.bayer import CFA
 from rawaug.data import open_pairs
@@ -113,3 +113,13 @@ def test_binning_scores_the_same_noise_on_both_kinds_of_reference(tmp_path: Path
     squares, around = (figures[way] for way in binning.WAYS)
     assert squares["noisy"] == pytest.approx(around["noisy"], abs=0.1)
     assert around["rawaug-small"] > squares["rawaug-small"] + 0.1
+
+
+def test_patterns_are_compared_in_full_colour(tmp_path: Path) -> None:
+    out = tmp_path / "figures.json"
+    common = ["--data", "demo:test", "--bin", "1", "--quick", "--json", str(out)]
+    patterns.main(["NonLocalMeans", *common, "--patterns", "GRBG", "XTRANS"])
+    figures = json.loads(out.read_text())
+    assert "NonLocalMeans" in figures["GRBG"] and "NonLocalMeans" not in figures["XTRANS"], "filters are for Bayer"
+    for rows in (figures["GRBG"], figures["XTRANS"]):
+        assert rows["NonLocalMeans of the picture, 1"][0] > rows["noisy"][0] + 2

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -131,10 +131,11 @@ def demosaiced(packed: Tensor, pair: Pair, method: str) -> Tensor:
     return by_libraw(mosaic, pair, method) if method in LIBRAW else bayer.demosaic(mosaic, CFA.RGGB, method)
 
 
-def by_libraw(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> Tensor:
+def by_libraw(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB, **more: Any) -> Tensor:
     """A mosaic ``(1, 1, H, W)`` as LibRaw demosaics it, as linear camera RGB ``(1, 3, H, W)``.
 
     X-Trans has Markesteijn's interpolation, whatever ``method`` is; a small mosaic is continued by its whole cells.
+    ``more`` goes to rawpy's ``postprocess``.
     """
     with extra("raw"):
         import rawpy
@@ -152,7 +153,7 @@ def by_libraw(mosaic: Tensor, pair: Pair, method: str, cfa: str = CFA.RGGB) -> T
         path = Path(folder) / "frame.dng"
         write_dng(path, frame)
         with rawpy.imread(str(path)) as raw:
-            rgb = raw.postprocess(demosaic_algorithm=rawpy.DemosaicAlgorithm[method], **settings)
+            rgb = raw.postprocess(demosaic_algorithm=rawpy.DemosaicAlgorithm[method], **settings | more)
     return (torch.from_numpy(rgb).permute(2, 0, 1).float() / 65535 * room / gains)[None, :, :height, :width]
 
 
