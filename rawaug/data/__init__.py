@@ -6,19 +6,13 @@ clean version, the benchmarks of SIDD and DND, comes as noisy blocks with a writ
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
-
-from torch.utils.data import ConcatDataset
-
 from rawaug.data.check import check
 from rawaug.data.demo import DemoCamera, demo_pairs, demo_photographs, demo_pictures
 from rawaug.data.drawn import Shapes, dead_leaves
 from rawaug.data.folders import PictureFolder, RawFolder
-from rawaug.data.pair_folder import PairFolder, require_no_pairs
-from rawaug.data.pairs import Binned, LazyPairs, Pair
+from rawaug.data.opening import open_pairs, open_pictures
+from rawaug.data.pair_folder import PairFolder
+from rawaug.data.pairs import Binned, Pair
 from rawaug.data.submissions import (
     Dnd,
     SiddBenchmark,
@@ -27,123 +21,9 @@ from rawaug.data.submissions import (
     write_dnd_submission,
     write_submission,
 )
-from rawaug.io.pictures import MAX_PIXELS
-from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
 
 __all__ = [
     "Binned", "DemoCamera", "Dnd", "Pair", "PairFolder", "PictureFolder", "RawFolder", "Shapes", "SiddBenchmark",
     "check", "check_dnd_submission", "check_submission", "dead_leaves", "demo_pairs", "demo_photographs",
     "demo_pictures", "open_pairs", "open_pictures", "write_dnd_submission", "write_submission",
 ]  # fmt: skip
-
-_SPLITS = ("train", "validation", "test")
-
-
-def open_pairs(
-    spec: str | Path | Sequence[Pair],
-    split: str = "test",
-    as_clean: bool = True,
-    max_pixels: int | None = None,
-    bin: int = 1,
-    **settings: Any,
-) -> Sequence[Pair]:
-    """Open RAW-sRGB pairs.
-
-    Args:
-        spec: a RAW file, a folder of RAW files, or ``kind:path`` for a known dataset: ``"pairs:MY_PAIRS"``,
-            ``"demo:"``, ``"demo:train"``, ``"sidd:SIDD_Medium_Raw"``, ``"zurich:Zurich-RAW-to-DSLR:test"`` (with the
-            split last). A sequence of pairs is taken as it is.
-        split: of a dataset that has splits, unless ``spec`` names one. A folder has none. ``sidd`` has ``train`` (the
-            full frames) and ``test`` (the validation blocks), ``fivek`` and ``zurich`` have ``train`` and ``test``.
-        as_clean: the frames of a bare folder are taken for clean ones, so that ``NAME_noisy.dng`` is refused.
-        max_pixels: of the sRGB pictures, and of mosaics in PNG files; larger ones are an error of their pair. None
-            for :data:`rawaug.io.pictures.MAX_PIXELS`. Pairs given as a sequence keep theirs.
-        bin: K makes each site the mean of K x K sites of its colour around it: a reference with about 1 / K^2 of its
-            own noise.
-        settings: of the reader of ``kind``, such as ``cfa="RGGB"`` of ``pairs:``; None leaves it at its default.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such kind, split, file, folder or setting, or noisy/clean pairs
-            are opened as a bare folder.
-
-    Example:
-        >>> len(open_pairs("demo:validation"))
-        4
-    """
-    if bin != 1:
-        return Binned(open_pairs(spec, split, as_clean, max_pixels, **settings), bin)
-    settings = {key: value for key, value in settings.items() if value is not None}
-    if not isinstance(spec, (str, Path)):
-        return _as_they_are(spec, settings)
-    kind, path = _kind_and_path(str(spec))
-    if kind is None:
-        _require_none(settings, spec)
-        folder = RawFolder(path, max_pixels=max_pixels or MAX_PIXELS)
-        require_no_pairs(folder, str(spec), as_clean)
-        return folder
-    reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
-    path, named = _path_and_split(path)
-    chosen = checked_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
-    pairs: Sequence[Pair] = reader(path, named or split, **chosen)
-    if max_pixels is not None and isinstance(pairs, LazyPairs):
-        pairs.max_pixels = max_pixels
-    return pairs
-
-
-def _as_they_are(pairs: Sequence[Pair], settings: Mapping[str, Any]) -> Sequence[Pair]:
-    _require_none(settings, "a sequence of pairs")
-    if isinstance(pairs, LazyPairs):
-        return pairs
-    if not isinstance(pairs, Sequence) or not pairs or not all(isinstance(pair, Pair) for pair in pairs):
-        raise ValueError(f"data must be a path, kind:path or a non-empty list of Pair, got {type(pairs).__name__}")
-    return pairs
-
-
-def _require_none(settings: Mapping[str, Any], spec: object) -> None:
-    if settings:
-        raise ValueError(f"{spec}: {', '.join(settings)} can only be given for pairs:PATH")
-
-
-def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int | None = None) -> Any:
-    """Open sRGB pictures, a map-style dataset of uint8 ``(3, H, W)``: a folder, ``"demo:"``, ``"shapes:100"``.
-
-    Args:
-        spec: the path of a folder, ``"demo:"``, ``"shapes:COUNT"``, or several of these, one after the other.
-        min_side: smaller pictures of a folder are skipped and reported; use the side of your crops.
-        max_pixels: larger ones likewise; None for :data:`rawaug.io.pictures.MAX_PIXELS`.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such kind or folder, or it holds no picture.
-
-    Example:
-        >>> len(open_pictures(["demo:", "shapes:10"]))
-        42
-    """
-    if not isinstance(spec, str):
-        return ConcatDataset([open_pictures(one, min_side, max_pixels) for one in spec])
-    kind, path = _kind_and_path(spec)
-    if kind is None:
-        return PictureFolder(path, min_side, max_pixels or MAX_PIXELS)
-    return _reader(PICTURES, spec, kind, path, "a folder")(path, min_side)
-
-
-def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:
-    if kind not in kinds:
-        known = ", ".join(f"{name}:" for name in kinds)
-        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{nearest(kind, kinds)}")
-    reader: Callable[[str, Any], Any] = kinds[kind]
-    if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
-        raise ValueError(f"{spec}: has no path; write {kind}:PATH")
-    return reader
-
-
-def _kind_and_path(spec: str) -> tuple[str | None, str]:
-    """Split ``"kind:path"``; the kind is None for a plain path, including ``C:\\shots``."""
-    kind, colon, path = spec.partition(":")
-    return (kind, path) if colon and len(kind) > 1 and kind.replace("-", "").isidentifier() else (None, spec)
-
-
-def _path_and_split(path: str) -> tuple[str, str | None]:
-    """Split ``"path:split"``; the split is None if not given."""
-    folder, colon, split = path.rpartition(":")
-    return (folder, split) if colon and split in _SPLITS else (path, None)

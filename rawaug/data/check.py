@@ -19,6 +19,7 @@ from typing import Any
 from torch import Tensor
 
 from rawaug.data.folders import PICTURE_EXTENSIONS, PictureFolder
+from rawaug.data.opening import open_pairs, open_pictures
 from rawaug.data.pair_folder import PairFolder, looks_like_pairs
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.published import CAMERAS, FIVEK_DNG, RAWIR_FOLDERS, Rawir, Zurich, fivek_numbers
@@ -115,10 +116,10 @@ def check(path: str | Path, first: int | None = None, **settings: Any) -> DataRe
 
 def _of_kind(kind: str, spec: str) -> list[tuple[str, Callable[[], Any]]]:
     """What ``kind:path`` opens everywhere else, as pairs, as pictures, or as both."""
-    from rawaug.data import open_pairs, open_pictures  # late: they are made of what is checked
-
     openers = ((DATASETS, "pairs", open_pairs), (PICTURES, "pictures", open_pictures))
-    found = [(f"{what} of {spec}", partial(opener, spec)) for kinds, what, opener in openers if kind in kinds]
+    found: list[tuple[str, Callable[[], Any]]] = [
+        (f"{what} of {spec}", partial(opener, spec)) for kinds, what, opener in openers if kind in kinds
+    ]
     if not found:
         open_pairs(spec)  # raises for an unknown kind
     return found
