@@ -53,11 +53,12 @@ def without_network(trial: Trial, pair: Pair) -> Iterator[tuple[str, Callable[[]
         full = FBDDNoiseReductionMode.Full
         yield "LibRaw, FBDD", lambda: by_libraw(mosaic, pair, "AHD", cfa, fbdd_noise_reduction=full)
     assert trial.levels is not None
-    white = anscombe.forward(noisy, *trial.levels)
+    shot_var, read_var = trial.levels
+    white = anscombe.forward(noisy, shot_var, read_var)
     for strength in STRENGTHS:
 
         def smoothed(strength: float = strength) -> Tensor:
-            return anscombe.inverse(_Colours(strength).of(white), *trial.levels)
+            return anscombe.inverse(_Colours(strength).of(white), shot_var, read_var)
 
         yield f"NonLocalMeans of the picture, {strength:g}", smoothed
 

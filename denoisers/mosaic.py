@@ -177,9 +177,9 @@ class MosaicDRUNet(DRUNet):
         halving = bayer.Halving(even[:, 3:])
         small, seen, share = (halving(even[:, k : k + 1]) for k in range(3))
         half, clipped = (F.pixel_shuffle(x, 2) for x in (small, share))
-        told = tuple(F.pixel_shuffle(halving.variance(_padded(level)), 2) for level in levels)
+        shot, read = (F.pixel_shuffle(halving.variance(_padded(level)), 2) for level in levels)
         colours = bayer.pattern("RGGB").planes(*half.shape[-2:]).to(half).expand(len(half), -1, -1, -1)
-        found = self._at_halves(half, colours, told, clipped, halvings - 1)
+        found = self._at_halves(half, colours, (shot, read), clipped, halvings - 1)
         wide, near = (
             F.avg_pool2d(x, 3, 1, 1, count_include_pad=False) for x in (F.pixel_unshuffle(found, 2) - seen, share)
         )

@@ -251,7 +251,7 @@ class RawBench(LazyPairs):
         whole = (noisy.mosaic < _UNCLIPPED) & (dark < _UNCLIPPED)
         ratio = noisy.mosaic[whole].mean() / dark[whole].mean().clamp_min(1e-6)
         raw = (dark * ratio).clamp(max=1.0)
-        srgb = develop_mosaic(raw, noisy.cfa, noisy.white_balance, noisy.color_matrix)
+        srgb = develop_mosaic(raw, CFA(noisy.cfa), noisy.white_balance, noisy.color_matrix)
         clean_frame = replace(noisy, mosaic=raw)
         known = {"noisy": noisy.mosaic, "color_known": noisy.color_known}
         return Pair.of_frame(self.names[index], clean_frame, srgb, **known)

@@ -67,7 +67,7 @@ def test_a_recipe_starts_it_from_shipped_weights_and_goes_on_from_its_own(tmp_pa
     assert isinstance(started, MosaicDRUNet) and started.tail.weight.abs().max() > 0
     save(started, tmp_path / "own.safetensors", {})
     again = first_network(DenoiserConfig(start=str(tmp_path / "own.safetensors")), seed=0)
-    assert torch.equal(again.tail.weight, started.tail.weight)
+    assert isinstance(again, MosaicDRUNet) and torch.equal(again.tail.weight, started.tail.weight)
     with pytest.raises(ValueError, match="rawaug-base is a DRUNet with"):
         first_network(DenoiserConfig("MosaicDRUNet", {"width": 16}, "rawaug-base"), seed=0)
 

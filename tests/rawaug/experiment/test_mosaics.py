@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from denoisers import MosaicDRUNet, save
 from rawaug import RawAugment, bayer
 from rawaug.bayer import pattern
+from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
@@ -80,4 +82,20 @@ def test_a_recipe_without_shares_or_with_unknown_patterns_is_refused() -> None:
     arms = {"any": ArmConfig(augmented=1.0)}
     for patterns, said in (({"X": 1.0}, "CFA 'X' is unknown"), ({"RGGB": 0.0}, "patterns: shares must be")):
         with pytest.raises(ValueError, match=said):
-            MosaicRecipe(camera="universal", patterns=patterns, arms=arms)  # type: ignore[arg-type]
+            MosaicRecipe(camera="universal", patterns=patterns, arms=arms)
+
+
+def test_the_recipe_trains_and_scores_by_pattern(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = {"width": 4, "scales": 2, "blocks": 1, "pyramid": 1}
+    keys = {"denoiser.start": None, "denoiser.settings": small, "steps": 2, "train.crop": 32, "train.batch": 2}
+    keys |= {"data.validation": "demo:validation", "data.test": "demo:test", "rivals": ["NonLocalMeans"]}
+    keys |= {"data.validation_crop": 64, "data.test_crop": 64, "data.validation_count": 1, "data.test_count": 1}
+    given = [word for key, value in keys.items() for word in (f"--{key.replace('_', '-')}", json.dumps(value))]
+    assert main(["run", "any", *given, "--out", str(tmp_path), "--device", "cpu"]) == 0
+    results = json.loads((tmp_path / "any" / "results.json").read_text())
+    for name in ("RGGB", "XTRANS", "QUAD-RGGB"):
+        assert 10.0 < results[name]["results"]["any"][0]["plain"]["psnr_srgb"] < 60.0
+        assert ("NonLocalMeans" in results[name]["rivals"]) == (name == "RGGB")
+    head, *rows = (tmp_path / "any" / "seed0" / "any" / "log.csv").read_text().splitlines()
+    assert rows and {"psnr_RGGB", "psnr_XTRANS", "psnr_QUAD-RGGB"} <= set(head.split(","))
+    assert "XTRANS" in capsys.readouterr().out
