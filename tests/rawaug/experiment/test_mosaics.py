@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -87,7 +88,13 @@ def test_a_recipe_without_shares_or_with_unknown_patterns_is_refused() -> None:
 
 def test_the_recipe_trains_and_scores_by_pattern(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = {"width": 4, "scales": 2, "blocks": 1, "pyramid": 1}
-    keys = {"denoiser.start": None, "denoiser.settings": small, "steps": 2, "train.crop": 32, "train.batch": 2}
+    keys: dict[str, Any] = {
+        "denoiser.start": None,
+        "denoiser.settings": small,
+        "steps": 2,
+        "train.crop": 32,
+        "train.batch": 2,
+    }
     keys |= {"data.validation": "demo:validation", "data.test": "demo:test", "rivals": ["NonLocalMeans"]}
     keys |= {"data.validation_crop": 64, "data.test_crop": 64, "data.validation_count": 1, "data.test_count": 1}
     given = [word for key, value in keys.items() for word in (f"--{key.replace('_', '-')}", json.dumps(value))]
