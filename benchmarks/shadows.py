@@ -1,0 +1,67 @@
+"""The picture of the front page: the shadows of a photograph, made brighter, before and after; its noise is its own.
+
+    python -m benchmarks.shadows s40_0117.crw --place 780 330 --out docs/shadows.jpg
+
+From the left: the frame as shot, with a square; the square at 100 %, ``--stops`` brighter; the same denoised with the
+levels that ``rawaug denoise`` reads. All are developed alike, and nothing but the denoiser removes noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from benchmarks.measure import parser
+from rawaug import bayer
+from rawaug.data.development import developed
+from rawaug.denoise.denoiser import Noisy, RawDenoiser
+from rawaug.denoise.levels import levels_of
+from rawaug.io import RawFrame, read_raw, write_picture
+
+SIDE, MARGIN, GAP = 384, 128, 6
+
+
+def picture(frame: RawFrame, mosaic: Tensor, stops: float) -> Tensor:
+    """A mosaic ``(1, H, W)`` developed with the frame's colours, sRGB ``(3, H, W)``."""
+    return developed(mosaic, frame.cfa, frame.white_balance, frame.color_matrix, "ahd", 2.0**stops, None)
+
+
+def framed(frame: RawFrame, top: int, left: int) -> Tensor:
+    """The whole frame as shot, ``SIDE`` high, with the square drawn in."""
+    whole = picture(frame, frame.mosaic, 0.0)
+    outer = 8
+    edge = torch.zeros_like(whole[:1], dtype=torch.bool)
+    edge[:, top - outer : top + SIDE + outer, left - outer : left + SIDE + outer] = True
+    edge[:, top : top + SIDE, left : left + SIDE] = False
+    whole = torch.where(edge, 1.0, whole)
+    return interpolate(whole[None], scale_factor=SIDE / whole.shape[-2], mode="bilinear", antialias=True)[0]
+
+
+def main(command: Sequence[str] | None = None) -> None:
+    cli = parser(__doc__)
+    cli.add_argument("frame", type=Path)
+    cli.add_argument("--place", type=int, nargs=2, required=True, metavar=("TOP", "LEFT"))
+    cli.add_argument("--stops", type=float, default=3.0)
+    cli.add_argument("--denoiser", default="rawaug-base")
+    cli.add_argument("--out", type=Path, required=True)
+    args = cli.parse_args(command)
+    frame = read_raw(args.frame)
+    shot_var, read_var, source = levels_of(frame)
+    print(f"{frame.name}: {frame.camera}, shot_var {shot_var:.3g}, read_var {read_var:.3g} ({source})")
+    top, left = (at // 2 * 2 for at in args.place)
+    rows, columns = (slice(at - MARGIN, at + SIDE + MARGIN) for at in (top, left))
+    noisy = bayer.pack(frame.mosaic[None, :, rows, columns], frame.cfa)
+    clean = RawDenoiser.of(args.denoiser)(Noisy.told(noisy, (shot_var, read_var), frame.cfa)).clamp(max=1.0)
+    pieces = [picture(frame, bayer.unpack(x, frame.cfa)[0], args.stops) for x in (noisy, clean)]
+    inner = [piece[:, MARGIN:-MARGIN, MARGIN:-MARGIN] for piece in pieces]
+    gap = torch.ones(3, SIDE, GAP)
+    shown = torch.cat([framed(frame, top, left), gap, inner[0], gap, inner[1]], dim=2)
+    write_picture(args.out, (shown.clamp(0, 1) * 255).round().to(torch.uint8))
+
+
+if __name__ == "__main__":
+    main()
