@@ -73,6 +73,7 @@ def run(
     if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
         options = "--self-ensemble, --views, --noise, --bin, --classical and --report"
         raise ValueError(f"{weights}: is an ISP; {options} are for denoisers")
+    test = None if kind == "isp" else _Test(file, noise, seed, device, classical or ())
     frames = open_pairs(data, split="test", **vars(settings or PairSettings()))
     pairs = Readable(frames if kind == "isp" else Kept(Binned(Measured(frames), bin)))
     about: dict[str, Any] = {"kind": kind, "data": data, "weights_sha256": sha256(file), "version": __version__}
@@ -85,13 +86,12 @@ def run(
             write_json(result, json)
         return result
 
-    if kind == "isp":
+    if test is None:
         isp, images = DictionaryISP.from_pretrained(file), progress(pairs, label="evaluate", unit="image")
         scores = ((pair.name, _finite(pair.name, psnr_r(isp, pair))) for pair in images)
         result = written(summary(Row("ISP", name, "", "", "raw", psnr) for name, psnr in scores))
     else:
-        test = _Test(file, pairs, noise, seed, device, classical or ())
-        result = written(test.result(views or (8 if self_ensemble else 1), written))
+        result = written(test.result(pairs, views or (8 if self_ensemble else 1), written))
         if note := own_noise_note({"the denoiser": result, **result.get("classical", {})}):
             print(note)
         if report:
@@ -104,22 +104,19 @@ def run(
 class _Test:
     """A denoiser on frames, beside classical filters."""
 
-    def __init__(
-        self, weights: Path, pairs: Readable, noise: NoiseSpec | None, seed: int, device: str, filters: Sequence[Spec]
-    ) -> None:
+    def __init__(self, weights: Path, noise: NoiseSpec | None, seed: int, device: str, filters: Sequence[Spec]) -> None:
         found = RawDenoiser.of(weights, device).require_mosaic()
         around = ESTIMATORS.make(found.info.get("estimator", "supervised")).at_test
         self.denoiser = replace(found, around=around, checked=False)
-        self.pairs, self.seed = pairs, seed
-        self.noise = noise or found.info.get("noise", "cycleisp_sidd")
+        self.seed, self.noise = seed, noise or found.info.get("noise", "cycleisp_sidd")
         self.filters = [RawDenoiser.of(spec) for spec in filters]
         self.trials: Sequence[Trial] = []
 
-    def result(self, views: int, first: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    def result(self, pairs: Readable, views: int, first: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
         """The scores; of several views, with those of a single one as ``plain``."""
         levels, cfa = noise_model(self.noise), self.denoiser.cfa
-        deque(self.pairs, maxlen=0)  # finds those that cannot be read
-        self.trials = trials_of(self.pairs.kept(), lambda pair: trial_of(pair, levels, cfa, self.seed))
+        deque(pairs, maxlen=0)  # finds those that cannot be read
+        self.trials = trials_of(pairs.kept(), lambda pair: trial_of(pair, levels, cfa, self.seed))
         noisy, plain = by_denoiser(self.scored([NOISY, self.denoiser], "evaluate")).values()
         result = {"self_ensemble": False, "seed": self.seed, **summary(plain, noisy)}
         if views > 1 or self.filters:

@@ -37,7 +37,7 @@ def test_a_target_that_an_arm_cannot_have_is_refused() -> None:
     class Srgb(Recipe):
         target: Target = "srgb"  # type: ignore[misc]
 
-    with pytest.raises(ValueError, match=r"arms\.one: demosaicing and jpeg are for target 'srgb', not 'raw'"):
+    with pytest.raises(ValueError, match=r"arms\.one: demosaicing, jpeg and finish are for target 'srgb', not 'raw'"):
         Recipe(arms={"one": ArmConfig(1.0, jpeg=(40, 95))})
     with pytest.raises(ValueError, match=r"arms\.one: jpeg must be .* within 1 to 100"):
         Srgb(arms={"one": ArmConfig(1.0, jpeg=(40, 101))})

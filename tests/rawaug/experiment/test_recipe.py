@@ -24,7 +24,7 @@ from rawaug.training.config import TrainConfig, Weighing
 
 FOLDER = find_recipe("fewshot").parent
 NAMES = [file.relative_to(FOLDER).with_suffix("").as_posix() for file in sorted(FOLDER.rglob("*.yaml"))]
-OTHERS = {"rgb2raw": "reconstruction"}
+OTHERS = {"rgb2raw": "reconstruction", "any": "mosaics"}
 """Recipes that neither train nor are named after their kind."""
 HEAD = "camera: universal\ndata: {pairs: null, pictures: 'demo:'}\narms: {augmented: {augmented: 1.0}}\n"
 LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
@@ -38,7 +38,7 @@ def header(name: str) -> str:
 
 
 def test_every_kind_has_settings_that_name_it() -> None:
-    assert set(EXPERIMENTS) - {"training", "srgb", "demosaic"} == {"reconstruction", "ablation", "learned"}
+    assert set(EXPERIMENTS) - {"training", "srgb", "demosaic", "mosaics"} == {"reconstruction", "ablation", "learned"}
     for name in ("reconstruction", "ablation", "learned"):
         assert settings_of(name)().experiment == settings_of(name)().name == name
 
