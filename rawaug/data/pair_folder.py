@@ -148,7 +148,7 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
         raise FileNotFoundError(f"{path}: no such folder of noisy/clean pairs")
     top = path if path.is_dir() else path.parent
     readable = sorted(files_below(top, READABLE))
-    by_pattern = _by_pattern(top, readable, noisy or NOISY, clean or _clean_pattern(noisy or NOISY))
+    by_pattern = pairs_by_pattern(top, readable, noisy or NOISY, clean or clean_pattern(noisy or NOISY))
     found = list(by_pattern)
     if noisy is None:
         known = {file for pair in found for file in pair[1:]}
@@ -167,7 +167,7 @@ def _pairs_below(path: Path, noisy: str | None, clean: str | None) -> list[PairF
     return sorted(named, key=lambda pair: pair.noisy)
 
 
-def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> list[PairFiles]:
+def pairs_by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> list[PairFiles]:
     """Match every noisy file with its clean one."""
     if len(_WILD.findall(noisy)) != len(_WILD.findall(clean)):
         raise ValueError(f"the patterns {noisy} and {clean} must have the same number of * and ?")
@@ -195,7 +195,7 @@ def _by_pattern(top: Path, files: Sequence[Path], noisy: str, clean: str) -> lis
     return found
 
 
-def _clean_pattern(noisy: str) -> str:
+def clean_pattern(noisy: str) -> str:
     """Replace the word noisy by clean, keeping its case."""
     words = {"noisy": "clean", "Noisy": "Clean", "NOISY": "CLEAN"}
     clean, count = re.subn("|".join(words), lambda found: words[found[0]], noisy)
