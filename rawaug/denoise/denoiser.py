@@ -28,7 +28,7 @@ from denoisers.network import PACKED
 from rawaug import bayer
 from rawaug.bayer import CFA, aligned, noise_variance
 from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, published_pmrid
-from rawaug.files import read_header, read_tensors, sha256
+from rawaug.files import parse_object, read_header, read_tensors, sha256
 from rawaug.io import RawFrame
 from rawaug.kernels.runtime import fast_in_bfloat16, find_device
 from rawaug.noise import anscombe
@@ -258,7 +258,12 @@ def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 def shipped_of_mosaics() -> list[str]:
     """The shipped networks that denoise the mosaic and leave demosaicing to others."""
-    return [name for name in shipped() if DENOISERS[read_header(find(name))["model"]].upscale == 1]
+    return [name for name in shipped() if _denoises_mosaics(read_header(find(name)))]
+
+
+def _denoises_mosaics(header: Mapping[str, str]) -> bool:
+    channels = parse_object(header["config"]).get("channels", PACKED)
+    return channels == PACKED and DENOISERS[header["model"]].upscale == 1
 
 
 def require_classical(specs: Sequence[Spec]) -> None:
@@ -301,6 +306,8 @@ def _of_weights(path: Path) -> RawDenoiser:
         return replace(_of_network("BF-DnCNN", BiasFreeDnCNN(tensors), {}), cfa=None)
     if "conv0.conv.weight" in tensors and metadata.get("format") != "rawaug":
         return _of_network("PMRID, published weights", published_pmrid(path), {})
+    if "conv00.weight" in tensors or str(parse_object(metadata.get("config", "{}")).get("channels", PACKED)) == "3":
+        raise ValueError(f"{path}: denoises developed pictures, not RAW; give it a .jpg, .png or .tif")
     if metadata.get("format") != "rawaug":
         raise ValueError(f"{path}: weights of no known denoiser; give a network or a function from Python")
     arm = path.resolve().parent.name  # rawaug run writes ARM/denoiser.safetensors

@@ -94,6 +94,16 @@ def published_pmrid(path: str | Path) -> denoisers.PMRID:
     return model.eval()
 
 
+def published_ffdnet(path: str | Path) -> denoisers.Denoiser:
+    """FFDNet for colour with the weights of its authors, normalisations folded in, from a ``.safetensors`` file."""
+    model = denoisers.build("FFDNet")
+    try:
+        model.load_state_dict(read_tensors(path, AGAIN)[1])
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit FFDNet's network: {str(error).splitlines()[-1].strip()}") from None
+    return model.eval()
+
+
 class BiasFreeDnCNN(nn.Module):
     r"""Bias-free DnCNN for white noise, on each plane of RAW in Anscombe's domain.
 

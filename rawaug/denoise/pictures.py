@@ -1,17 +1,41 @@
-"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW."""
+r"""What denoises developed pictures, sRGB ``(1, 3, H, W)`` in [0, 1], beside :class:`rawaug.RawDenoiser` for RAW.
+
+    d = f(x, sigma),    sigma = s K rms(x - f(x, 0))
+
+A network f that is told the level of the noise, its standard deviation sigma, also works where it is not known, sigma
+being 0. What it takes away then is an estimate of the level, too low by a factor K on real pictures, where noise and
+detail are alike; K is chosen on validation pictures. The strength s is 1 unless the user says otherwise. FFDNet, which
+needs a level, is told scikit-image's estimate.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 import denoisers
+from denoisers.files import find, shipped
 from rawaug.denoise.denoiser import CPU, Noisy, counted
+from rawaug.denoise.foreign import AGAIN, published_ffdnet
+from rawaug.errors import extra
+from rawaug.files import files_in, read_tensors, require_writable
+from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device
+from rawaug.progress import progress
+from rawaug.registry import nearest
+
+PICTURES = "rawaug-srgb"
+"""What denoises pictures where no denoiser is named."""
+UNDERESTIMATE = 2.0
+"""K, as found on CC15 and on Canon frames that LibRaw developed."""
+_SAMPLED, _SIDE = 3, 256
+"""The level is estimated on this many squares of this side in both directions."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +49,170 @@ class PictureDenoiser:
     takes: ClassVar[str] = "srgb"
 
     @classmethod
-    def of_network(cls, name: str, network: nn.Module, device: str = "cpu") -> PictureDenoiser:
-        """A network of sRGB, which is moved to the device, in tiles."""
+    def of(cls, spec: str | Path, device: str = "cpu", strength: float = 1.0) -> PictureDenoiser:
+        """The denoiser that a name or a file stands for.
+
+        Args:
+            spec: the name of a shipped denoiser of pictures, or a ``.safetensors`` of rawaug or of FFDNet's authors;
+                with ``@15`` behind it the network is told this level, in units of 1/255, for every picture.
+            device: auto, cpu, cuda, ...
+            strength: factor on the estimated level: 2 removes more, 0.5 less, 0 nothing.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is no denoiser of pictures, or strength or level is negative.
+
+        Example:
+            >>> denoiser = PictureDenoiser.of("rawaug-srgb@10")  # doctest: +SKIP
+        """
+        path, at, told = str(spec).rpartition("@")
+        path = path if at else told
+        level = _level(str(spec), told) if at else None
+        if not 0.0 <= strength <= 10.0:
+            raise ValueError(f"strength must be between 0 and 10, got {strength}")
+        name, network = _network(path)
+        made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
+        return made if level is None else replace(made, run=lambda srgb: _told(network, srgb, level))
+
+    @classmethod
+    def of_network(
+        cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0
+    ) -> PictureDenoiser:
+        """A network of sRGB, which is moved to the device, in tiles; one that reads levels is told the picture's."""
         where = find_device(device)
         network = network.to(where).eval()
-        return cls(name, lambda srgb: denoisers.tiled(network, srgb, each=counted("tile")), where)
+
+        def run(srgb: Tensor) -> Tensor:
+            if not getattr(network, "reads_variance", False):
+                return denoisers.tiled(network, srgb, each=counted("tile"))
+            return _told(network, srgb, strength * estimated_level(network, srgb)) if strength else srgb
+
+        return cls(name, run, where)
 
     @torch.inference_mode()
     def __call__(self, given: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
         return self.run(given.image.to(self.device)).cpu().clamp(0.0, 1.0)
+
+
+def is_picture_denoiser(spec: str | Path) -> bool:
+    """Whether a name or file stands for a network of pictures, of three channels."""
+    try:
+        return _network(str(spec).rpartition("@")[0] or str(spec)) is not None
+    except (OSError, ValueError):
+        return False
+
+
+def _level(spec: str, told: str) -> float:
+    try:
+        level = float(told) / 255.0
+    except ValueError:
+        level = -1.0
+    if not 0.0 <= level <= 1.0:
+        raise ValueError(f"{spec}: behind @ stands a level from 0 to 255, got {told}")
+    return level
+
+
+def _network(spec: str) -> tuple[str, nn.Module]:
+    """The name and the network of a file, which has three channels."""
+    if not Path(spec).suffix and spec not in shipped():
+        raise ValueError(f"{spec}: no such denoiser of pictures{nearest(spec, shipped())}; give one of {PICTURES}, or "
+                         "a .safetensors of rawaug run srgb or of FFDNet's authors")  # fmt: skip
+    path = find(spec)
+    metadata, tensors = read_tensors(path, AGAIN)
+    if "conv00.weight" in tensors and metadata.get("format") != "rawaug":
+        return "FFDNet, published weights", published_ffdnet(path)
+    network = denoisers.load(path)[0]
+    if network.channels != 3:
+        raise ValueError(f"{spec}: denoises RAW, not pictures; use {PICTURES}")
+    arm = path.resolve().parent.name
+    return arm if path.stem == "denoiser" else path.stem, network
+
+
+def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
+    """The picture denoised by a network that is told the deviation of its noise, 0 for unknown."""
+    variance = srgb.new_full((1, 1, 1, 1), level**2).expand_as(srgb)
+    return denoisers.tiled(network, srgb, variance, each=counted("tile"))
+
+
+def estimated_level(network: Any, srgb: Tensor) -> float:
+    """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
+    if not getattr(network, "light", False):  # it cannot do without a level
+        with extra("raw"):
+            from skimage.restoration import estimate_sigma
+
+        return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
+    removed = [(part - network(part, torch.zeros_like(part))).square().mean() for part in _sampled(srgb)]
+    return UNDERESTIMATE * float(torch.stack(removed).mean().sqrt())
+
+
+def _sampled(srgb: Tensor) -> Iterator[Tensor]:
+    """Squares that are spread over a picture, or the whole of a small one."""
+    height, width = srgb.shape[-2:]
+    tops, lefts = (sorted({(side - _SIDE) * k // (_SAMPLED - 1) for k in range(_SAMPLED)}) if side > _SIDE else [0]
+                   for side in (height, width))  # fmt: skip
+    for top in tops:
+        for left in lefts:
+            yield srgb[..., top : top + _SIDE, left : left + _SIDE].contiguous()
+
+
+@dataclass(frozen=True)
+class DenoisedPicture:
+    """What was done to a file; ``removed`` is the deviation of what was taken away, in units of 1/255."""
+
+    source: Path
+    out: Path
+    removed: float
+    seconds: float
+
+
+def denoise_picture(source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False) -> DenoisedPicture:
+    """Denoise a JPEG, PNG or TIFF of 8 or 16 bits to another, with its EXIF, its ICC profile and its orientation.
+
+    Raises:
+        FileNotFoundError, OSError: if a file is missing, damaged, or cannot be written.
+        ValueError: if ``out`` is the source, is there already, or has another extension, or the picture cannot be
+            denoised: it is too large or too small, CMYK, animated, or holds floating-point numbers.
+    """
+    source, out = Path(source), Path(out)
+    if out.suffix.lower() not in PICTURE_FORMATS:
+        raise ValueError(f"{out}: {source} is a developed picture; its output is one of {', '.join(PICTURE_FORMATS)}")
+    if out.exists() and out.resolve() == source.resolve():
+        raise ValueError(f"{out}: is the input file; give another name")
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out}: exists; give another name, or --overwrite to replace it")
+    require_writable(out)
+    start = time.perf_counter()
+    stored: StoredPicture = read_stored(source)
+    if min(stored.srgb.shape[-2:]) < 2:
+        raise ValueError(f"{source}: is {stored.srgb.shape[-1]} x {stored.srgb.shape[-2]} pixels; at least 2 x 2 needed")
+    denoised = denoiser(Noisy(stored.srgb[None]))[0]
+    removed = 255.0 * (denoised - stored.srgb).square().mean().sqrt().item()
+    write_stored(out, denoised, stored)
+    return DenoisedPicture(source, out, removed, time.perf_counter() - start)
+
+
+def denoise_pictures(
+    source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False
+) -> tuple[list[DenoisedPicture], dict[str, str]]:
+    """Denoise the pictures of a folder and its subfolders under the same names; those that are there are left.
+
+    Returns what was done, and the reason for each file that failed.
+    """
+    source, out = Path(source), Path(out)
+    if out.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"{out}: is inside the source folder {source}; choose an output folder outside it")
+    done: list[DenoisedPicture] = []
+    broken: dict[str, str] = {}
+    for file in progress(files_in(source, "picture", PICTURE_FORMATS), label="denoise", unit="file", leave=True):
+        target = out / file.relative_to(source)
+        if target.exists() and not overwrite:
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            done.append(denoise_picture(file, target, denoiser, overwrite))
+        except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.filename in (str(target), str(target.parent)):
+                raise  # what cannot be written, such as to a full disk, is no fault of the file
+            broken[str(file)] = str(error)
+    return done, broken
