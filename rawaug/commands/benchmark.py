@@ -11,9 +11,12 @@ from typing import Annotated
 from rawaug.commands import YAML
 from rawaug.data import open_pairs
 from rawaug.data.pairs import Binned, SomePairs
+from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, shipped_of_mosaics
+from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.benchmark import TOLD, benchmark, costs_of, crops, shown_of, strengths_of, tables, trials
 from rawaug.evaluation.page import Figure, Page, Part, draw_costs
+from rawaug.evaluation.picture_trials import picture_scores, print_pictures
 from rawaug.evaluation.tables import print_rows
 from rawaug.evaluation.trials import Measured, own_noise_note
 from rawaug.files import require_writable, write_json
@@ -41,7 +44,9 @@ def run(
     Args:
         denoisers: names of shipped denoisers or filters, .safetensors files (also the published weights of PMRID and
             BF-DnCNN), .onnx files, or package.module:function, called with noisy packed RAW and its variance.
-        data: clean RAW frames: a folder, a file, or kind:path.
+        data: clean RAW frames: a folder, a file, or kind:path; of developed pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR
+            or pictures:DIR, for which the denoisers are rawaug-srgb, a .safetensors of pictures (FFDNet's weights too)
+            or a filter, with @15 behind it if told a level of 15/255.
         bin: average this many sites of a colour in both directions, to leave less of the frames' own noise.
         count: number of frames.
         crop: side of the middle of each frame that is used, in pixels of the mosaic.
@@ -54,6 +59,12 @@ def run(
     """
     for path in filter(None, (json, report)):
         require_writable(path)
+    if is_picture_pairs(data):
+        found_on = picture_scores([PictureDenoiser.of(spec, device) for spec in denoisers], open_picture_pairs(data))
+        print_pictures(data, found_on)
+        if json:
+            write_json({"data": data, **found_on}, json)
+        return
     strengths = strengths_of(noise, iso)
     known: dict[str, RawDenoiser] = {}
     for spec in dict.fromkeys(("NonLocalMeans", *shipped_of_mosaics(), *denoisers)):

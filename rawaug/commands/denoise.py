@@ -1,4 +1,4 @@
-"""``rawaug denoise``: RAW files to denoised DNGs; in Python :func:`rawaug.denoise`."""
+"""``rawaug denoise``: RAW files to denoised DNGs, pictures to pictures; in Python :func:`rawaug.denoise`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from denoisers.files import DEFAULT, JOINT
 from rawaug.commands import YAML
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
 from rawaug.denoise.frames import DenoisedFolder, denoise_file, denoise_folder
+from rawaug.denoise.pictures import PICTURES, PictureDenoiser, denoise_picture, denoise_pictures
 from rawaug.errors import escape
+from rawaug.files import files_below
+from rawaug.io.picture_files import PICTURE_FORMATS
+from rawaug.io.raw import RAW_EXTENSIONS
 from rawaug.registry import Spec
 
 
@@ -28,25 +32,33 @@ def run(
     preview: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Denoise a RAW file, or a folder of them, to DNG.
+    """Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either.
 
     Args:
-        source: a RAW file, or a folder of them.
-        out: output DNG, or output folder.
+        source: a RAW file, a developed picture, or a folder of either.
+        out: output DNG or picture, or output folder.
         denoiser: .safetensors file written by rawaug run, .onnx file written by rawaug export (faster on a CPU), or
-            the name of a shipped denoiser; by default rawaug-small.
+            the name of a shipped denoiser; by default rawaug-small, and rawaug-srgb for pictures.
         classical: a filter in place of a network: NonLocalMeans, Wavelet, TotalVariation, BM3D, or {name, settings}.
         noise: auto (the NoiseProfile tag where the frame bears it out, else an estimate, else the camera's published
             law, else the levels of the folder's files of the same camera and ISO), profile, estimate, camera (the law
             that the denoiser was trained for), an ISP file (uses its stored noise law), the name of a camera, or
             [shot_var, read_var].
-        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing.
+        strength: 1 removes the noise, 0.7 leaves 30% of it in the result, 0 changes nothing; of pictures, a factor on
+            the estimated level of the noise: 2 removes more, 0.5 less.
         linear: demosaic too, to a linear DNG of full colour; by default with rawaug-joint.
         self_ensemble: average eight views of a network, at eight times the cost.
         device: where a network runs: auto, cpu, cuda, cuda:1, mps.
         preview: also write the result, developed by LibRaw, as this .jpg or .png.
         overwrite: replace existing results.
     """
+    if is_picture(source):
+        given = {"classical": classical, "self_ensemble": self_ensemble, "linear": linear, "preview": preview}
+        if unfit := [name for name, value in given.items() if value] + ["noise"] * (noise != "auto"):
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in unfit)
+            raise ValueError(f"{source}: is a developed picture; {options} is for RAW")
+        denoise_all(source, out, PictureDenoiser.of(denoiser or PICTURES, device, strength), overwrite)
+        return
     made = chosen(denoiser, classical, self_ensemble, device, linear, strength)
     if not Path(source).is_dir():
         done = denoise_file(source, out, made, noise, preview=preview, overwrite=overwrite)
@@ -60,6 +72,30 @@ def run(
     print_denoised(result)
     if result.broken:
         raise ValueError(f"{source}: {len(result.broken)} of its files could not be denoised, listed above")
+
+
+def is_picture(source: str) -> bool:
+    """Whether a path is a developed picture, or a folder with such pictures and no RAW file."""
+    path = Path(source)
+    if path.is_dir():
+        kinds = {file.suffix.lower() for file in files_below(path)}
+        return not kinds.intersection(RAW_EXTENSIONS) and bool(kinds.intersection(PICTURE_FORMATS))
+    return path.suffix.lower() in PICTURE_FORMATS
+
+
+def denoise_all(source: str, out: str, denoiser: PictureDenoiser, overwrite: bool) -> None:
+    """Denoise a picture or a folder of them, and print what was done."""
+    broken: dict[str, str] = {}
+    if Path(source).is_dir():
+        done, broken = denoise_pictures(source, out, denoiser, overwrite)
+    else:
+        done = [denoise_picture(source, out, denoiser, overwrite)]
+    for one in done:
+        print(f"{escape(one.out)}: noise of {one.removed:.1f} in 255 removed, {one.seconds:.1f} s")
+    for reason in broken.values():
+        print(escape(reason))
+    if broken:
+        raise ValueError(f"{source}: {len(broken)} of its files could not be denoised, listed above")
 
 
 def chosen(

@@ -17,8 +17,11 @@ from rawaug.data import open_pairs
 from rawaug.data.folders import Kept, Readable
 from rawaug.data.pair_folder import PairSettings
 from rawaug.data.pairs import Binned
+from rawaug.data.picture_pairs import is_picture_pairs, open_picture_pairs
 from rawaug.denoise.denoiser import RawDenoiser, require_classical
+from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.page import Page, shown_on_page
+from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, print_pictures
 from rawaug.evaluation.scores import NOISY, Row, by_denoiser, panels_of, require_numbers, score, summary
 from rawaug.evaluation.tables import print_scores
 from rawaug.evaluation.trials import Measured, Trial, own_noise_note, trial_of, trials_of
@@ -49,7 +52,8 @@ def run(
 
     Args:
         weights: a .safetensors file of rawaug fit or rawaug run, or a shipped name.
-        data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs.
+        data: folder of clean RAW files, one file, or kind:path; pairs:PATH for noisy/clean pairs; of developed
+            pictures cc15:DIR, polyu:DIR, sidd-srgb:DIR or pictures:DIR.
         self_ensemble: also score the average over eight views (denoisers).
         views: also score the average over 4 views, the flips, or 8, with quarter turns.
         noise: noise added to frames without a noisy capture: a preset, a measured camera, [shot_var, read_var], or
@@ -68,6 +72,11 @@ def run(
     for path in filter(None, (json, report)):
         require_writable(path)
     require_classical(classical or ())
+    if is_picture_pairs(data):
+        if self_ensemble or views or noise is not None or bin != 1 or report:
+            options = "--self-ensemble, --views, --noise, --bin and --report"
+            raise ValueError(f"{data}: has developed pictures; {options} are for RAW")
+        return _pictures(weights, data, [str(spec) for spec in classical or ()], device, json, settings)
     file = find_weights(weights, FOLDER)
     kind = read_header(file)["kind"]
     if kind == "isp" and (self_ensemble or views or noise is not None or bin != 1 or classical or report):
@@ -99,6 +108,22 @@ def run(
             print(f"page: {test.page(data, result).write(Path(report), about_page)}")
     require_numbers([result, result.get("plain", {}), *result.get("classical", {}).values()])
     return result
+
+
+def _pictures(
+    weights: str, data: str, classical: Sequence[str], device: str, json: str | None, settings: PairSettings | None
+) -> dict[str, Any]:
+    """The result of a denoiser of pictures, beside classical filters, as published and registered."""
+    given = settings or PairSettings()
+    denoisers = [PictureDenoiser.of(spec, device) for spec in (weights, *classical)]
+    result = picture_scores(denoisers, open_picture_pairs(data, given.noisy, given.clean))
+    print_pictures(data, result)
+    own = result["rows"][denoisers[0].name]
+    found = {"kind": "denoiser", "data": data, "version": __version__, **own[PUBLISHED], "registered": own[REGISTERED]}
+    found |= {"classical": {one.name: result["rows"][one.name] for one in denoisers[1:]}} if classical else {}
+    if json:
+        write_json(found, json)
+    return found
 
 
 class _Test:

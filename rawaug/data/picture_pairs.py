@@ -1,13 +1,12 @@
 """Pairs of developed pictures: a noisy shot, and what it would be without noise, as real test sets have them.
 
-=============== ====================================================================================================
-``cc15:DIR``    ``*_real.*`` beside ``*_mean.*``, the mean of 500 shots: Nam, Hwang, Matsushita and Kim, "A Holistic
-                Approach to Cross-Channel Image Noise Modeling and Its Application to Image Denoising", CVPR 2016
-``polyu:DIR``   the same names: Xu, Li, Liang, Zhang and Zhang, "Real-world Noisy Image Denoising: A New Benchmark", 2018
-``sidd-srgb:DIR``  ``ValidationNoisyBlocksSrgb.mat`` and ``ValidationGtBlocksSrgb.mat``: Abdelhamed, Lin and Brown, CVPR
-                2018
-``pictures:DIR``   ``*_noisy.*`` beside ``*_clean.*``, or other patterns
-=============== ====================================================================================================
+- ``cc15:DIR``: ``*_real.*`` beside ``*_mean.*``, the mean of 500 shots. Nam, Hwang, Matsushita and Kim, "A Holistic
+  Approach to Cross-Channel Image Noise Modeling and Its Application to Image Denoising", CVPR 2016.
+- ``polyu:DIR``: the same names. Xu, Li, Liang, Zhang and Zhang, "Real-world Noisy Image Denoising: A New Benchmark",
+  2018.
+- ``sidd-srgb:DIR``: ``ValidationNoisyBlocksSrgb.mat`` and ``ValidationGtBlocksSrgb.mat``. Abdelhamed, Lin and Brown, "A
+  High-Quality Denoising Dataset for Smartphone Cameras", CVPR 2018.
+- ``pictures:DIR``: ``*_noisy.*`` beside ``*_clean.*``, or other patterns.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rawaug.data.folders import files_below
 from rawaug.data.mat import read_array
 from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
 from rawaug.data.sidd import find_file
+from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
 from rawaug.registry import nearest
 
@@ -100,7 +99,9 @@ def _blocks(folder: Path) -> PicturePairs:
         file = find_file(folder, f"Validation{kind}BlocksSrgb.mat")
         array = read_array(file, file.stem)
         if array.dtype.name != "uint8" or array.ndim != 5 or array.shape[-1] != 3:
-            raise ValueError(f"{file}: holds {array.dtype} {array.shape}; the published file uint8 (40, 32, 256, 256, 3)")
+            raise ValueError(
+                f"{file}: holds {array.dtype} {array.shape}; the published file uint8 (40, 32, 256, 256, 3)"
+            )
         arrays.append(torch.from_numpy(array).flatten(0, 1).movedim(-1, 1))
     noisy, clean = arrays
     names = [f"block {number:04d}" for number in range(len(noisy))]

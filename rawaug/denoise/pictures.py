@@ -28,7 +28,7 @@ from rawaug.files import files_in, read_tensors, require_writable
 from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
-from rawaug.registry import nearest
+from rawaug.registry import FILTERS, Spec, label_of, nearest
 
 PICTURES = "rawaug-srgb"
 """What denoises pictures where no denoiser is named."""
@@ -53,8 +53,8 @@ class PictureDenoiser:
         """The denoiser that a name or a file stands for.
 
         Args:
-            spec: the name of a shipped denoiser of pictures, or a ``.safetensors`` of rawaug or of FFDNet's authors;
-                with ``@15`` behind it the network is told this level, in units of 1/255, for every picture.
+            spec: the name of a shipped denoiser of pictures or of a classical filter, or a ``.safetensors`` of rawaug
+                or of FFDNet's authors; with ``@15`` behind it, it is told this level, in units of 1/255, every time.
             device: auto, cpu, cuda, ...
             strength: factor on the estimated level: 2 removes more, 0.5 less, 0 nothing.
 
@@ -70,14 +70,26 @@ class PictureDenoiser:
         level = _level(str(spec), told) if at else None
         if not 0.0 <= strength <= 10.0:
             raise ValueError(f"strength must be between 0 and 10, got {strength}")
+        if path in FILTERS:
+            return cls.of_filter(path, level, strength)
         name, network = _network(path)
         made = cls.of_network(f"{name}, told {told}" if at else name, network, device, strength)
         return made if level is None else replace(made, run=lambda srgb: _told(network, srgb, level))
 
     @classmethod
-    def of_network(
-        cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0
-    ) -> PictureDenoiser:
+    def of_filter(cls, spec: Spec, level: float | None = None, strength: float = 1.0) -> PictureDenoiser:
+        """A classical filter of white noise on the three colours; without a level it is told scikit-image's."""
+        denoiser = FILTERS.make(spec)
+
+        def run(srgb: Tensor) -> Tensor:
+            deviation = max(1e-4, strength * _white_level(srgb) if level is None else level)
+            planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
+            return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
+
+        return cls(label_of(spec) if level is None else f"{label_of(spec)}, told {255.0 * level:.3g}", run)
+
+    @classmethod
+    def of_network(cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0) -> PictureDenoiser:
         """A network of sRGB, which is moved to the device, in tiles; one that reads levels is told the picture's."""
         where = find_device(device)
         network = network.to(where).eval()
@@ -93,14 +105,6 @@ class PictureDenoiser:
     def __call__(self, given: Noisy) -> Tensor:
         """sRGB ``(1, 3, H, W)`` denoised, on the CPU, cut to [0, 1]."""
         return self.run(given.image.to(self.device)).cpu().clamp(0.0, 1.0)
-
-
-def is_picture_denoiser(spec: str | Path) -> bool:
-    """Whether a name or file stands for a network of pictures, of three channels."""
-    try:
-        return _network(str(spec).rpartition("@")[0] or str(spec)) is not None
-    except (OSError, ValueError):
-        return False
 
 
 def _level(spec: str, told: str) -> float:
@@ -138,12 +142,16 @@ def _told(network: Any, srgb: Tensor, level: float) -> Tensor:
 def estimated_level(network: Any, srgb: Tensor) -> float:
     """The deviation that a network of pictures is told for ``(1, 3, H, W)``: see the module."""
     if not getattr(network, "light", False):  # it cannot do without a level
-        with extra("raw"):
-            from skimage.restoration import estimate_sigma
-
-        return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
+        return _white_level(srgb)
     removed = [(part - network(part, torch.zeros_like(part))).square().mean() for part in _sampled(srgb)]
     return UNDERESTIMATE * float(torch.stack(removed).mean().sqrt())
+
+
+def _white_level(srgb: Tensor) -> float:
+    with extra("raw"):
+        from skimage.restoration import estimate_sigma
+
+    return float(estimate_sigma(srgb[0].cpu().numpy(), channel_axis=0, average_sigmas=True))
 
 
 def _sampled(srgb: Tensor) -> Iterator[Tensor]:
@@ -166,7 +174,9 @@ class DenoisedPicture:
     seconds: float
 
 
-def denoise_picture(source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False) -> DenoisedPicture:
+def denoise_picture(
+    source: str | Path, out: str | Path, denoiser: PictureDenoiser, overwrite: bool = False
+) -> DenoisedPicture:
     """Denoise a JPEG, PNG or TIFF of 8 or 16 bits to another, with its EXIF, its ICC profile and its orientation.
 
     Raises:
@@ -185,7 +195,9 @@ def denoise_picture(source: str | Path, out: str | Path, denoiser: PictureDenois
     start = time.perf_counter()
     stored: StoredPicture = read_stored(source)
     if min(stored.srgb.shape[-2:]) < 2:
-        raise ValueError(f"{source}: is {stored.srgb.shape[-1]} x {stored.srgb.shape[-2]} pixels; at least 2 x 2 needed")
+        raise ValueError(
+            f"{source}: is {stored.srgb.shape[-1]} x {stored.srgb.shape[-2]} pixels; at least 2 x 2 needed"
+        )
     denoised = denoiser(Noisy(stored.srgb[None]))[0]
     removed = 255.0 * (denoised - stored.srgb).square().mean().sqrt().item()
     write_stored(out, denoised, stored)

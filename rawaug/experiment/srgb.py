@@ -11,7 +11,7 @@ for each level, and trained RAW denoisers, which are given the levels and develo
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import fmean
@@ -41,7 +41,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, FILTERS, Spec, label_of, name_and_settings
+from rawaug.registry import EXPERIMENTS, Spec, label_of, name_and_settings
 from rawaug.seeding import keyed_generator
 
 BLACK, WHITE = 8192.0, 65535.0
@@ -222,20 +222,9 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
         return develop(path)[None] / 255.0
 
 
-def filtered(spec: Spec, deviation: float) -> PictureDenoiser:
-    """A classical filter of white noise of this deviation, on the three colours."""
-    denoiser = FILTERS.make(spec)
-
-    def run(srgb: Tensor) -> Tensor:
-        planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
-        return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
-
-    return PictureDenoiser(label_of(spec), run)
-
-
 def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
     """The filter of the deviation with the highest mean PSNR on these trials."""
-    filters = [filtered(spec, deviation) for deviation in DEVIATIONS]
+    filters = [replace(PictureDenoiser.of_filter(spec, level), name=label_of(spec)) for level in DEVIATIONS]
     return max(filters, key=lambda one: fmean(row.psnr for row in score([one], trials)))
 
 

@@ -1,0 +1,78 @@
+r"""Real pairs of developed pictures as trials, as they are published and with the truth registered to the shot.
+
+.. math:: c'_k = a_k\, c_k(p - t) + b_k
+
+The mean of many shots lies up to half a pixel from the one that is scored, and differs from it by codes in brightness,
+which no denoiser can know. t is found by phase correlation, a and b of each colour by least squares, all of them
+between the noisy picture and the clean one, so that they do not depend on the denoiser. A border is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rawaug.data.picture_pairs import PicturePair
+from rawaug.errors import extra
+from rawaug.evaluation.scores import NOISY, Denoiser, by_denoiser, score, summary
+from rawaug.evaluation.tables import print_rows
+from rawaug.evaluation.trials import Trial, trials_of
+
+PUBLISHED, REGISTERED = "as published", "registered"
+BORDER = 4
+"""Pixels on every side, which a shift may reach."""
+
+
+def picture_trials(pairs: Sequence[PicturePair], registered: bool = False) -> Sequence[Trial]:
+    """A trial in the domain ``srgb`` of every pair."""
+
+    def make(pair: PicturePair) -> Trial:
+        noisy, clean = pair.noisy[None] / 255.0, pair.clean[None] / 255.0
+        if not registered:
+            return Trial(noisy, clean, frame=pair.name, domain="srgb", condition=PUBLISHED)
+        inner = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+        moved = register(noisy[0], clean[0])[None]
+        return Trial(noisy[inner], moved[inner], frame=pair.name, domain="srgb", condition=REGISTERED)
+
+    return trials_of(pairs, make)
+
+
+def register(noisy: Tensor, clean: Tensor) -> Tensor:
+    """The clean picture ``(3, H, W)`` moved onto the noisy one, with its gain and offset in each colour."""
+    with extra("raw"):
+        from skimage.registration import phase_cross_correlation
+    from scipy.ndimage import shift
+
+    found = phase_cross_correlation(noisy.mean(0).numpy(), clean.mean(0).numpy(), upsample_factor=50)[0]
+    step = np.clip(found, -BORDER + 1.0, BORDER - 1.0)
+    planes = []
+    for shot, truth in zip(noisy.double().numpy(), clean.double().numpy(), strict=True):
+        moved = shift(truth, step, order=3, mode="nearest")
+        inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
+        gain, offset = np.polyfit(moved[inner].ravel(), shot[inner].ravel(), 1) if np.ptp(moved) > 0.02 else (1.0, 0.0)
+        planes.append(gain * moved + offset)
+    return torch.from_numpy(np.stack(planes)).float().clamp(0.0, 1.0)
+
+
+def picture_scores(denoisers: Sequence[Denoiser], pairs: Sequence[PicturePair]) -> dict[str, Any]:
+    """Every denoiser on pairs of pictures: ``rows`` by its name and by condition, as of ``rawaug evaluate --json``."""
+    rows: dict[str, dict[str, Any]] = {}
+    for condition in (PUBLISHED, REGISTERED):
+        trials = picture_trials(pairs, registered=condition == REGISTERED)
+        found = by_denoiser(score([NOISY, *denoisers], trials, condition))
+        for name, of_one in found.items():
+            rows.setdefault(name, {})[condition] = summary(of_one, found[NOISY.name])
+    return {"pictures": len(pairs), "rows": rows}
+
+
+def print_pictures(data: str, result: Mapping[str, Any]) -> None:
+    """The table of :func:`picture_scores`."""
+    cells = [
+        [name, *(f"{by[c]['psnr']:.2f} / {by[c]['ssim']:.4f}" for c in (PUBLISHED, REGISTERED))]
+        for name, by in result["rows"].items()
+    ]
+    print_rows(f"PSNR in dB / SSIM, {data}, {result['pictures']} pictures", ["denoiser", PUBLISHED, REGISTERED], cells)
