@@ -14,10 +14,11 @@ from rawaug.cli import main
 from rawaug.data import demo_pairs
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import RawDenoiser
+from rawaug.denoise.pictures import PictureDenoiser
 from rawaug.evaluation.scores import results, score
 from rawaug.evaluation.trials import Trial
 from rawaug.experiment.recipe import ArmConfig, DataConfig
-from rawaug.experiment.srgb import SrgbRecipe, SrgbRun, best_filter, developed, filtered, srgb_trials
+from rawaug.experiment.srgb import SrgbRecipe, SrgbRun, best_filter, developed, srgb_trials
 from rawaug.metrics import psnr
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
@@ -79,9 +80,9 @@ def test_the_filter_is_as_strong_as_the_noise_of_its_shots(trials: list[Trial]) 
     weak, strong, spec = trials[::2], trials[1::2], "NonLocalMeans"
     chosen = [row.psnr for row in score([best_filter(spec, strong)], strong)]
     for deviation in (0.01, 0.16):
-        assert sum(row.psnr for row in score([filtered(spec, deviation)], strong)) < sum(chosen)
+        assert sum(row.psnr for row in score([PictureDenoiser.of_filter(spec, deviation)], strong)) < sum(chosen)
     gentle = best_filter(spec, weak)
-    assert torch.equal(gentle(weak[0].given), filtered(spec, 0.01)(weak[0].given))
+    assert torch.equal(gentle(weak[0].given), PictureDenoiser.of_filter(spec, 0.01)(weak[0].given))
 
 
 @pytest.mark.usefixtures("tiny")
