@@ -1,0 +1,105 @@
+"""Pictures: files through a denoiser, the level that it is told, and pairs of real pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import denoisers
+from rawaug.commands.denoise import is_picture
+from rawaug.commands.denoise import run as denoise
+from rawaug.data.picture_pairs import open_picture_pairs
+from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
+from rawaug.denoise.pictures import PictureDenoiser, denoise_pictures, estimated_level
+from rawaug.evaluation.picture_trials import PUBLISHED, REGISTERED, picture_scores, register
+from rawaug.io.pictures import read_picture, write_picture
+
+pytest.importorskip("OpenImageIO")
+
+
+def smooth(height: int = 96, width: int = 128) -> Tensor:
+    """A soft picture ``(3, height, width)``."""
+    y, x = torch.meshgrid(torch.linspace(0, 3, height), torch.linspace(0, 5, width), indexing="ij")
+    return torch.stack([0.5 + 0.3 * torch.sin(x + k) * torch.cos(y - k) for k in range(3)])
+
+
+def noisy(deviation: float = 0.04) -> Tensor:
+    return (smooth() + deviation * torch.randn(3, 96, 128, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+
+
+def error(picture: Tensor) -> float:
+    return (picture - smooth()).square().mean().item()
+
+
+def test_the_shipped_denoiser_of_pictures_removes_most_of_the_noise() -> None:
+    denoised = PictureDenoiser.of("rawaug-srgb")(Noisy(noisy()[None]))[0]
+    assert error(denoised) < 0.2 * error(noisy())
+    assert "rawaug-srgb" not in shipped_of_mosaics()
+    with pytest.raises(ValueError, match="denoises developed pictures, not RAW"):
+        RawDenoiser.of("rawaug-srgb")
+    with pytest.raises(ValueError, match="denoises RAW, not pictures"):
+        PictureDenoiser.of("rawaug-small")
+
+
+def test_a_level_that_is_told_and_the_strength_say_how_much_is_removed() -> None:
+    def removed(spec: str, strength: float = 1.0) -> float:
+        return (PictureDenoiser.of(spec, strength=strength)(Noisy(noisy()[None]))[0] - noisy()).square().mean().item()
+
+    assert removed("rawaug-srgb@2") < removed("rawaug-srgb@10") < removed("rawaug-srgb@30")
+    assert removed("rawaug-srgb", 0.0) == 0.0 < removed("rawaug-srgb", 0.3) < removed("rawaug-srgb", 1.0)
+    with pytest.raises(ValueError, match="behind @ stands a level from 0 to 255, got x"):
+        PictureDenoiser.of("rawaug-srgb@x")
+
+
+def test_the_estimated_level_grows_with_the_noise() -> None:
+    network = denoisers.from_pretrained("rawaug-srgb")
+    with torch.inference_mode():
+        weak, strong = (estimated_level(network, noisy(deviation)[None]) for deviation in (0.01, 0.05))
+    assert 0.01 < strong < 0.2
+    assert weak < 0.5 * strong
+
+
+def test_ffdnet_is_told_the_deviation_of_its_noise() -> None:
+    network = denoisers.build("FFDNet", width=8, depth=3)
+    seen: list[Tensor] = []
+    network.get_submodule("conv00").register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    network(torch.rand(1, 3, 16, 16), torch.full((1, 3, 16, 16), 0.01))
+    assert seen[0].shape == (1, 15, 8, 8)
+    assert torch.allclose(seen[0][:, :3], torch.tensor(0.1))
+
+
+def test_files_and_folders_of_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "in").mkdir()
+    write_picture(tmp_path / "in" / "a.png", noisy())
+    (tmp_path / "in" / "b.jpg").write_bytes(b"not a picture")
+    assert is_picture(str(tmp_path / "in"))
+    denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
+    assert "noise of" in capsys.readouterr().out
+    assert error(read_picture(tmp_path / "a.png") / 255.0) < 0.3 * error(noisy())
+    done, broken = denoise_pictures(tmp_path / "in", tmp_path / "out", PictureDenoiser.of("rawaug-srgb@5"))
+    assert [one.out.name for one in done] == ["a.png"]
+    assert list(broken) == [str(tmp_path / "in" / "b.jpg")]
+    with pytest.raises(ValueError, match="exists; give another name"):
+        denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "a.png"))
+    with pytest.raises(ValueError, match="is a developed picture; --linear is for RAW"):
+        denoise(str(tmp_path / "in" / "a.png"), str(tmp_path / "c.png"), linear=True)
+
+
+def test_pairs_of_pictures_are_scored_as_published_and_registered(tmp_path: Path) -> None:
+    write_picture(tmp_path / "x_real.png", noisy())
+    moved = torch.roll(smooth(), (1, 2), (1, 2)) * 0.95 + 0.02
+    write_picture(tmp_path / "x_mean.png", moved)
+    pairs = open_picture_pairs(f"cc15:{tmp_path}")
+    assert [pair.name for pair in pairs] == ["x_real"] or len(pairs) == 1
+    rows = picture_scores([PictureDenoiser.of("NonLocalMeans@10")], pairs)["rows"]
+    found = rows["noisy input"]
+    assert found[REGISTERED]["psnr"] > found[PUBLISHED]["psnr"] + 1.0
+    inner = (..., slice(8, -8), slice(8, -8))
+    assert (register(noisy(), moved)[inner] - smooth()[inner]).abs().mean() < 0.01
+    with pytest.raises(ValueError, match="no such pairs of pictures"):
+        open_picture_pairs("cc16:x")
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        open_picture_pairs("polyu:nowhere")
