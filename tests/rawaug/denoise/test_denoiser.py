@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn import functional as F
 
 import denoisers
-from rawaug.bayer import CFA
+from rawaug.bayer import CFA, pack, unpack
 from rawaug.commands.benchmark import named
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
 from rawaug.denoise.foreign import BiasFreeDnCNN
@@ -132,3 +134,16 @@ def test_bf_dncnn_takes_white_noise_out_of_the_stabilised_planes(noisy: Noisy) -
     before, after = (((x - clean)[inner]).square().mean() for x in (noisy.image, denoised))
     assert after < before / 7  # of nine sites
     assert (denoised - clean)[inner].mean().abs() < 5e-4  # the exact unbiased inverse
+
+
+@pytest.mark.parametrize("cfa", list(CFA))
+def test_the_views_of_a_self_ensemble_keep_the_frame_s_own_pattern(cfa: CFA) -> None:
+    """A mean over 3 x 3 sites of the mosaic commutes with flips and turns, unless its sites lie elsewhere."""
+
+    def mean(noisy: Tensor, variance: Tensor) -> Tensor:
+        return pack(F.avg_pool2d(unpack(noisy, cfa), 3, 1, 1, count_include_pad=False), cfa)
+
+    noisy = torch.rand(1, 4, 16, 20, generator=torch.Generator().manual_seed(0))
+    given = Noisy.told(noisy, (1e-3, 1e-5), cfa)
+    plain, views = (RawDenoiser.of(mean, views=count)(given)[..., 3:-3, 3:-3] for count in (1, 8))
+    torch.testing.assert_close(views, plain, rtol=0.0, atol=1e-6)

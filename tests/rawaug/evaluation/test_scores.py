@@ -85,19 +85,6 @@ def test_a_denoiser_that_does_nothing_scores_as_its_input(
     assert again["self_ensemble"] and again["psnr"] == pytest.approx(result["psnr"], abs=1e-4)
 
 
-@pytest.mark.parametrize("cfa", list(CFA))
-def test_the_views_of_a_self_ensemble_keep_the_frame_s_own_pattern(cfa: CFA, given: list[Pair], tmp_path: Path) -> None:
-    """What is added to each colour of its own is the same in every view, unless colours are exchanged."""
-    network = denoisers.UNet(width=4, scales=2)
-    last = [layer for layer in network.modules() if isinstance(layer, torch.nn.Conv2d)][-1]
-    assert last.bias is not None and not last.weight.any()
-    last.bias.data.copy_(torch.tensor([0.1, 0.0, 0.0, -0.05]))
-    denoisers.save(network, tmp_path / "colours.safetensors", {"cfa": str(cfa)})
-    given.append(demo_pairs("validation", count=1)[0].middle(66).in_pattern(cfa).middle(64))
-    result = evaluate(str(tmp_path / "colours.safetensors"), data="given:", self_ensemble=True)
-    assert result["psnr"] == pytest.approx(result["plain"]["psnr"], abs=1e-3)
-
-
 def test_an_isps_json_leaves_out_what_does_not_apply(tmp_path: Path, middles: list[Pair]) -> None:
     DictionaryISP(ISPConfig(cfa="GRBG")).save(tmp_path / "isp.safetensors")
     figures = tmp_path / "new" / "isp.json"
