@@ -80,8 +80,7 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
     colours = srgb if like.channels > 2 else srgb.mean(0, keepdim=True)
     pixels = (colours.clamp(0.0, 1.0) * most).round().permute(1, 2, 0).numpy().astype(stored)
     if like.alpha is not None and not jpeg:
-        alpha = like.alpha if like.alpha.dtype == stored else (like.alpha.astype(np.float64) * most / 65535)
-        pixels = np.concatenate([pixels, alpha.astype(stored)], axis=-1)
+        pixels = np.concatenate([pixels, like.alpha], axis=-1)
     spec = oiio.ImageSpec(like.spec)
     spec.set_format(str(stored))
     spec.nchannels, spec.channelnames = pixels.shape[-1], list(like.spec.channelnames)[: pixels.shape[-1]]
