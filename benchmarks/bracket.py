@@ -34,7 +34,7 @@ from torch import Tensor
 from benchmarks.measure import arguments, finish, start
 from rawaug import bayer
 from rawaug.data.development import develop_packed, exposure_of
-from rawaug.data.folders import RAW_EXTENSIONS, files_in
+from rawaug.data.folders import RAW_EXTENSIONS, files_in  # type: ignore[attr-defined]
 from rawaug.data.pairs import Pair
 from rawaug.denoise.denoiser import Noisy, RawDenoiser, shipped_of_mosaics
 from rawaug.denoise.levels import UnknownNoise, levels_of
@@ -123,7 +123,7 @@ def correlated(reference: np.ndarray, moving: np.ndarray, parts: int) -> np.ndar
 def shift_of_frames(noisy: Shot, reference: Shot) -> np.ndarray:
     """The shift of the whole frame in whole cells, both clipped where the reference is."""
     ratio = reference.seconds / noisy.seconds
-    greens = [green(shot.frame.mosaic * gain, shot.frame.cfa) for shot, gain in ((reference, 1.0), (noisy, ratio))]
+    greens = [green(shot.frame.mosaic * gain, shot.frame.cfa) for shot, gain in ((reference, 1.0), (noisy, ratio))]  # type: ignore[arg-type]
     long, short = (np.minimum(image, CLIPPED) for image in greens)
     return correlated(long, short, 1).astype(int)
 
@@ -161,12 +161,12 @@ def block_at(top: int, left: int, noisy: Shot, reference: Shot, noise: Tensor, s
     if window.max() > CLIPPED:
         return "clipped in the reference"
     shot = noisy.frame.mosaic[:, top : top + BLOCK, left : left + BLOCK]
-    shift = shift_of_block(green(window, cfa), green(shot, cfa))
+    shift = shift_of_block(green(window, cfa), green(shot, cfa))  # type: ignore[arg-type]
     if np.abs(2 * shift).max() > FARTHEST:
         return "not found in the reference"
-    (there, back), (own, own_back) = ([one := moved(m, cfa, shift), moved(one, cfa, -shift)] for m in (window, drawn))
-    errors = [inner(after - before, cfa).square().mean() for after, before in ((back, window), (own_back, drawn))]
-    t, m, y_packed = inner(there, cfa), inner(own, cfa), bayer.pack(shot[None].double(), cfa)
+    (there, back), (own, own_back) = ([one := moved(m, cfa, shift), moved(one, cfa, -shift)] for m in (window, drawn))  # type: ignore[arg-type]
+    errors = [inner(after - before, cfa).square().mean() for after, before in ((back, window), (own_back, drawn))]  # type: ignore[arg-type]
+    t, m, y_packed = inner(there, cfa), inner(own, cfa), bayer.pack(shot[None].double(), cfa)  # type: ignore[arg-type]
     means = [image.mean((-2, -1), keepdim=True) for image in (t, y_packed)]
     apart = t - means[0]
     gain = (apart * (y_packed - means[1])).mean((-2, -1), keepdim=True) / apart.square().mean((-2, -1), keepdim=True)
@@ -228,7 +228,7 @@ def errors_of(results: Iterator[Tensor], noisy: Shot, blocks: Sequence[Block]) -
     for result, block in zip(results, blocks, strict=True):
         raw = (result - block.target).square().mean() - block.own.square().mean()
         packed = (result.double(), block.target, block.target + block.own)
-        picture, truth, noisier = (develop_packed(x.float(), frame.cfa, pair, exposure).double() for x in packed)
+        picture, truth, noisier = (develop_packed(x.float(), frame.cfa, pair, exposure).double() for x in packed)  # type: ignore[arg-type]
         srgb = (picture - truth).square().mean() - (noisier - truth).square().mean()
         errors.append((raw.item(), srgb.item()))
     return errors

@@ -90,7 +90,7 @@ def drawn(pictures: Sequence[Tensor], finish: bool, noise: Sequence[str], seed: 
     """Pairs of ``target="srgb"`` of the strengths of :data:`STRENGTHS`."""
     augment = RawAugment.from_pretrained("universal", noise=noise, target="srgb", finish=finish)
     scales = [ENLARGED[0] + (ENLARGED[1] - ENLARGED[0]) * (k % 10) / 9 for k in range(len(pictures))]
-    larger = [enlarged(p, [round(s * side) for side in p.shape[1:]]) for p, s in zip(pictures, scales, strict=True)]
+    larger = [enlarged(p, [round(s * side) for side in p.shape[1:]]) for p, s in zip(pictures, scales, strict=True)]  # type: ignore[arg-type]
     pairs = RawPairs([even_sided(picture) for picture in larger], augment, SIDE, seed=seed)
     for epoch in range(1000):
         pairs.set_epoch(epoch)

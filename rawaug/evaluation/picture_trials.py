@@ -38,7 +38,7 @@ def picture_trials(pairs: Sequence[PicturePair], registered: bool = False) -> Se
         moved = register(noisy[0], clean[0])[None]
         return Trial(noisy[inner], moved[inner], frame=pair.name, domain="srgb", condition=REGISTERED)
 
-    return trials_of(pairs, make)
+    return trials_of(pairs, make)  # type: ignore[arg-type]
 
 
 def register(noisy: Tensor, clean: Tensor) -> Tensor:

@@ -89,5 +89,5 @@ def write_stored(path: str | Path, srgb: Tensor, like: StoredPicture) -> None:
         spec.attribute("jpeg:subsampling", "4:4:4")
     with replacing(path) as partial:
         output = oiio.ImageOutput.create(str(path))
-        written = output.open(str(partial), spec) and output.write_image(np.ascontiguousarray(pixels))
+        written = output.open(str(partial), spec) and output.write_image(np.ascontiguousarray(pixels))  # type: ignore[union-attr]
         require_written(output, written, path)

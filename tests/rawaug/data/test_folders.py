@@ -322,7 +322,7 @@ class Decoded:
 )
 def test_a_picture_is_decoded_once_if_there_is_room(megabytes: int, order: list[int], decoded: list[int]) -> None:
     pictures = Decoded()
-    kept = Cached(pictures, megabytes)
+    kept = Cached(pictures, megabytes)  # type: ignore[var-annotated]
     for _ in range(2):
         assert [int(kept[k][0, 0, 0]) for k in order] == order
     assert pictures.read == decoded
