@@ -131,10 +131,7 @@ def test_help_is_quick() -> None:
     )
     runs = (subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3))
     for run in runs:
-        assert (
-            "Denoise a RAW file to DNG, a JPEG, PNG or TIFF to another, or a folder of either" in run.stdout
-            and "check" not in run.stdout
-        )
+        assert "Denoise a RAW file to DNG" in run.stdout and "check" not in run.stdout
         seconds, has_torch = run.stdout.splitlines()[-1].split()
         assert has_torch == "False"
         if float(seconds) < 1.0:
