@@ -167,7 +167,7 @@ def named(rows: Sequence[str]) -> str | None:
 
     Example:
         >>> named(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
-        'XTRANS+2+1'
+        'XTRANS+1+1'
     """
     found = _BY_ROWS.get(tuple(rows))
     return None if found is None else found.name
