@@ -33,6 +33,7 @@ from rawaug.noise.sensor import (
     DarkFrames,
     DefectPixels,
     EldNoise,
+    GreenImbalance,
     Quantisation,
     RowNoise,
     SensorNoise,
@@ -41,10 +42,10 @@ from rawaug.noise.sensor import (
 
 __all__ = [
     "BlackOffset", "CalibratedNoise", "ColourBias", "ColumnNoise", "Compose", "DarkFrames", "DarkNoise",
-    "DefectPixels", "EldLevels", "EldNoise", "FixedLevels", "Iso", "IsoLevel", "MeasuredLevels", "MeasuredNoise",
-    "NoiseEstimate", "NoiseLevels", "NoiseModel", "NoisePoints", "NoiseSpec", "Params", "PmridLevels",
-    "PoissonGaussianNoise", "Preset", "Quantisation", "RowNoise", "ScaledLevels", "SensorNoise", "ShotReadModel",
-    "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise", "camera_law", "camera_names", "estimate_noise",
-    "from_dark_frames", "noise_levels", "noise_model", "noise_names", "own_noise", "own_noise_share",
-    "plot_noise",
+    "DefectPixels", "EldLevels", "EldNoise", "FixedLevels", "GreenImbalance", "Iso", "IsoLevel", "MeasuredLevels",
+    "MeasuredNoise", "NoiseEstimate", "NoiseLevels", "NoiseModel", "NoisePoints", "NoiseSpec", "Params",
+    "PmridLevels", "PoissonGaussianNoise", "Preset", "Quantisation", "RowNoise", "ScaledLevels", "SensorNoise",
+    "ShotReadModel", "ShotReadNoise", "SiddLevels", "TukeyLambdaNoise", "camera_law", "camera_names",
+    "estimate_noise", "from_dark_frames", "noise_levels", "noise_model", "noise_names", "own_noise",
+    "own_noise_share", "plot_noise",
 ]  # fmt: skip

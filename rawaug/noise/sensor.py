@@ -1,9 +1,9 @@
 r"""Sensor noise beyond shot and read noise, each effect a model that composes with the others.
 
-Row and column noise (banding), heavy-tailed read noise, errors of the black level, dead and hot pixels and rounding to
-digital numbers, after Wei et al., "A physics-based noise formation model for extreme low-light raw denoising", 2020; or
-no model but a camera's own dark frames. All of it on black-subtracted RAW with white = 1. The heavy tails are those of
-the Tukey lambda,
+Row and column noise (banding), heavy-tailed read noise, errors of the black level, greens that disagree, dead and hot
+pixels and rounding to digital numbers, after Wei et al., "A physics-based noise formation model for extreme low-light
+raw denoising", 2020; or no model but a camera's own dark frames. All of it on black-subtracted RAW with white = 1. The
+heavy tails are those of the Tukey lambda,
 
 .. math:: Q(u) = (u^\lambda - (1 - u)^\lambda) / \lambda, \qquad \lambda > -1/2,
 
@@ -139,7 +139,7 @@ class ColumnNoise(_Banding):
 
 
 class _FixedPattern(NoiseModel):
-    """What is the same over a picture: an error of its mean, without variance from pixel to pixel."""
+    """An error that is the same all over a picture: it moves the mean and adds no variance from pixel to pixel."""
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         return torch.zeros_like(clean)
@@ -170,6 +170,26 @@ class ColourBias(BlackOffset):
     stream = "colour_bias"
     by_plane = True
     colours = (4,)
+
+
+class GreenImbalance(BlackOffset):
+    r"""Greens of the red and the blue rows that differ in gain, as red and blue neighbours leak into them unequally.
+
+    .. math:: y'_{Gr} = (1 + e/2) \, y_{Gr}, \qquad y'_{Gb} = (1 - e/2) \, y_{Gb}, \qquad e \sim N(0, sd^2)
+
+    with one e a picture; the mean of both greens and the clean target stay as they are. Where a developed picture is
+    smooth, such an imbalance shows as a maze.
+
+    Args:
+        sd: standard deviation of the relative difference e, typically 0.01.
+    """
+
+    stream = "green_imbalance"
+    by_plane = True
+
+    def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
+        halves = clean.new_tensor([0.0, 0.5, -0.5, 0.0]).reshape(4, 1, 1)
+        return torch.mul(clean, 1.0 + halves * per_picture(params[self.stream], clean), out=out)
 
 
 class DefectPixels(_FixedPattern):
@@ -274,7 +294,7 @@ class Compose(NoiseModel):
 
 _ABSENT = {
     "row_var": 0.0, "column_var": 0.0, "black_offset": 0.0, "colour_bias": 0.0, "dead_share": 0.0, "hot_share": 0.0,
-    "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14,
+    "quantum": 0.0, "told": 1.0, "tukey_lambda": 0.14, "green_imbalance": 0.0,
 }  # fmt: skip
 """What the parameters of :class:`SensorNoise` are where the effect is absent; 0.14 is near the normal."""
 
@@ -290,6 +310,7 @@ class SensorNoise(Compose):
         row_var, column_var: variance of banding along rows and columns, white = 1, or a range of it.
         black_offset_sd: standard deviation of the black level's error, white = 1.
         colour_bias_sd: standard deviation of the colours' offsets, white = 1.
+        green_imbalance: standard deviation of the relative difference of the two greens; see :class:`GreenImbalance`.
         dead, hot: shares of defective pixels, or ranges of them; see :class:`DefectPixels`.
         clusters: share of the defects, 0 to 1, whose whole 2 x 2 cell is defective.
         bits, black_level: the grid of digital numbers; see :class:`Quantisation`.
@@ -315,6 +336,7 @@ class SensorNoise(Compose):
         column_var: Range = 0.0,
         black_offset_sd: float = 0.0,
         colour_bias_sd: float = 0.0,
+        green_imbalance: float = 0.0,
         dead: Range = 0.0,
         hot: Range = 0.0,
         clusters: float = 0.0,
@@ -327,9 +349,12 @@ class SensorNoise(Compose):
         require_between("share", share, 0.0, 1.0)
         self.told, self.share = told, share
         levels = noise_levels(levels) if isinstance(levels, (str, Sequence)) else levels
-        models: list[NoiseModel] = [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
+        # The greens differ in the light that they get, and photons are counted after that.
+        models: list[NoiseModel] = [GreenImbalance(green_imbalance)] if green_imbalance else []
         if tukey_lambda is not None:
-            models = [TukeyLambdaNoise(levels, tukey_lambda)]
+            models += [TukeyLambdaNoise(levels, tukey_lambda)]
+        else:
+            models += [PoissonGaussianNoise(levels) if poisson else ShotReadNoise(levels)]
         models += [RowNoise(row_var)] if row_var else []
         models += [ColumnNoise(column_var)] if column_var else []
         models += [BlackOffset(black_offset_sd)] if black_offset_sd else []

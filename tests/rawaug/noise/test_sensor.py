@@ -19,6 +19,7 @@ from rawaug.noise import (
     DarkFrames,
     DefectPixels,
     FixedLevels,
+    GreenImbalance,
     Quantisation,
     RowNoise,
     SensorNoise,
@@ -82,6 +83,25 @@ def test_offsets_are_constant_over_a_picture() -> None:
     bias = colour.apply(clean, colour.sample(500, generator())) - clean
     assert bias.flatten(2).std(2).max() < 1e-6 and bias[:, :, 0, 0].std() == pytest.approx(1e-3, rel=0.1)
     assert abs(float(torch.corrcoef(bias[:, :2, 0, 0].T)[0, 1])) < 0.15
+
+
+def test_greens_differ_in_gain_by_the_stated_deviation_and_keep_their_mean() -> None:
+    model, clean = GreenImbalance(0.01), torch.full((2000, 4, 2, 2), 0.2)
+    gains = (model.apply(clean, model.sample(2000, generator())) / clean)[:, :, 0, 0]
+    assert torch.equal(gains[:, [0, 3]], torch.ones(2000, 2))
+    assert (gains[:, 1] - gains[:, 2]).std() == pytest.approx(0.01, rel=0.05)
+    torch.testing.assert_close(gains[:, 1] + gains[:, 2], torch.full((2000,), 2.0))
+
+
+def test_photons_are_counted_after_the_greens_were_changed() -> None:
+    model, clean = SensorNoise((1e-2, 0.0), poisson=True, green_imbalance=0.5), torch.full((1, 4, 256, 256), 0.2)
+    params = model.sample(1, generator())
+    noisy, ratio = model.apply(clean, params), 0.2 * (1 + params["green_imbalance"].item() / 2)
+    assert abs(params["green_imbalance"].item()) > 0.1
+    assert noisy[0, 1].mean().item() == pytest.approx(ratio, rel=0.01)
+    assert noisy[0, 1].var().item() == pytest.approx(1e-2 * ratio, rel=0.03)
+    plain = SensorNoise((1e-2, 0.0), poisson=True)
+    assert torch.equal(noisy[0, ::3], plain.apply(clean, params)[0, ::3])  # red and blue have the light they had
 
 
 def test_defects_are_as_many_as_asked_for() -> None:
