@@ -30,17 +30,88 @@ from rawaug.plugin.pictures import even_sided, find_picture, picked, replaced, t
 from rawaug.seeding import keyed_generator
 
 
-class RawPairs(Dataset[Any]):
-    """Any Dataset of pictures as a Dataset of RAW pairs; of an iterable one it is a :class:`RawPairStream`.
+class _Pairs(Dataset[Any]):
+    """What a Dataset of pairs and a stream of them share: the settings, the epochs, and how a sample becomes a pair."""
+
+    _epochs: Visits | Passes
+
+    def __init__(
+        self,
+        dataset: Any,
+        augment: RawAugment | DictionaryISP | str | Path,
+        crop: int | tuple[int, int] | None,
+        seed: int,
+        key: str | int | None,
+        turns: bool,
+        keys: Sequence[str] | None,
+        zoom: float,
+    ) -> None:
+        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
+            raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
+        self.dataset, self.augment = dataset, augmentation(augment)
+        self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
+        self.key, self.keys = key, require_keys(keys)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Pin the epoch: from now on an index is the same pair whenever it is asked for, until the next call.
+
+        Call it before each pass to number the epochs yourself, or once for validation data. It is forwarded to the
+        dataset's own ``set_epoch``, if there is one.
+        """
+        self._epochs.pin(epoch)
+        if hasattr(self.dataset, "set_epoch"):
+            self.dataset.set_epoch(epoch)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state from which :meth:`load_state_dict` goes on with the draws that follow.
+
+        It is exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers,
+        pictures that they had fetched ahead go on with their next draw.
+        """
+        return self._epochs.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from ``state``; call this while no loader is in the middle of a pass."""
+        self._epochs.load_state_dict(state)
+        if self._epochs.pinned is not None:
+            self.set_epoch(self._epochs.pinned)
+
+    def __len__(self) -> int:
+        if not isinstance(self.dataset, Sized):
+            raise TypeError(f"{type(self.dataset).__name__} has no length, so neither have its RAW pairs")
+        return len(self.dataset)
+
+    def __repr__(self) -> str:
+        """The pictures, the crop and the seed in a line, then what the augmentation draws."""
+        count = f"{len(self.dataset)} pictures" if isinstance(self.dataset, Sized) else type(self.dataset).__name__
+        crop = "whole" if self.crop is None else f"crops of {self.crop[0]} x {self.crop[1]}"
+        return f"{type(self).__name__} of {count}, {crop}, seed {self.seed}\n{self.augment!r}"
+
+    def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
+        return keyed_generator(self.seed, "pairs", epoch, *names)
+
+    def _paired(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
+        where = find_picture(sample, self.key)
+        try:
+            patch, place = random_patch(picked(sample, where), self.crop, self.turns, generator, self.zoom)
+            batch = self.augment.make(patch[None], generator, place[None])
+        except ValueError as error:
+            raise ValueError(f"picture {name}: {error}") from error
+        pair = batch.map(lambda t: t[0])
+        return replaced(sample, where, pair if self.keys is None else pair.under(self.keys))
+
+
+class RawPairs(_Pairs):
+    """A Dataset of pictures as a Dataset of RAW pairs.
 
     Args:
-        dataset: yields pictures in any form that :mod:`rawaug.plugin.pictures` lists, or tuples or mappings that have
-            one. All other fields pass through.
+        dataset: has ``len`` and an index, and yields pictures in any form that :mod:`rawaug.plugin.pictures` lists, or
+            tuples or mappings that have one. All other fields pass through.
         augment: makes the pair, on the CPU where workers are to run it; or an ISP, its name or its path, for a
             :class:`RawAugment` of it with the default settings.
         crop: side of the square crop in pixels, or (height, width), even; None keeps whole pictures (made even by
             dropping a line).
-        seed: of all draws.
+        seed: decides all draws, together with the epoch and the index.
         key: name of the picture in samples that are mappings, its index in tuples (0 by default).
         turns: whether to draw flips and quarter turns; what is not square is only flipped.
         keys: names for the pair's noisy, clean, variance and params, in this order, as many as are wanted: the pair is
@@ -49,7 +120,7 @@ class RawPairs(Dataset[Any]):
             scaled down for the screen are sharper, pixel by pixel, than RAW of a lens and an optical low-pass filter.
 
     Raises:
-        TypeError: if ``augment`` is none of these.
+        TypeError: if ``augment`` is none of these, or ``dataset`` has no index: a :class:`RawPairStream` takes it.
         ValueError: if the crop is odd, the zoom less than 1 or without a crop, or, on access, if a picture is smaller
             than the crop or none.
 
@@ -64,60 +135,26 @@ class RawPairs(Dataset[Any]):
         torch.Size([4, 8, 16])
     """
 
-    def __new__(cls, dataset: Any = None, *args: Any, **settings: Any) -> RawPairs:
-        iterable = isinstance(dataset, IterableDataset) or (dataset is not None and not hasattr(dataset, "__getitem__"))
-        return super().__new__(RawPairStream if cls is RawPairs and iterable else cls)
+    _epochs: Visits
 
     def __init__(
         self,
         dataset: Any,
         augment: RawAugment | DictionaryISP | str | Path,
         crop: int | tuple[int, int] | None = 256,
+        *,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
         keys: Sequence[str] | None = None,
         zoom: float = 1.0,
     ) -> None:
-        if not zoom >= 1.0 or (zoom > 1.0 and crop is None):
-            raise ValueError(f"zoom must be at least 1, and 1 without a crop; got {zoom} with crop={crop}")
-        self.dataset, self.augment = dataset, augmentation(augment)
-        self.crop, self.seed, self.turns, self.zoom = crop_size(crop), seed, turns, zoom
-        self.key, self.keys = key, require_keys(keys)
-        self._epochs = self._new_epochs()
-
-    def _new_epochs(self) -> Any:
-        return Visits(len(self.dataset) if isinstance(self.dataset, Sized) else 0)
-
-    def set_epoch(self, epoch: int) -> None:
-        """Pin the epoch: from now on an index is the same pair whenever it is asked for, until the next call.
-
-        Call it before each pass to number the epochs yourself, or once for validation data. Forwarded to the dataset's
-        own ``set_epoch``, if any.
-        """
-        self._epochs.pin(epoch)
-        if hasattr(self.dataset, "set_epoch"):
-            self.dataset.set_epoch(epoch)
-
-    def state_dict(self) -> dict[str, Any]:
-        """What :meth:`load_state_dict` goes on from: the same draws follow.
-
-        Exact between passes, and in the middle of a pass without workers or with a pinned epoch. With workers, pictures
-        that they had fetched ahead go on with their next draw.
-        """
-        state: dict[str, Any] = self._epochs.state_dict()
-        return state
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from ``state``, while no loader is in the middle of a pass."""
-        self._epochs.load_state_dict(state)
-        if self._epochs.pinned is not None:
-            self.set_epoch(self._epochs.pinned)
-
-    def __len__(self) -> int:
-        if not isinstance(self.dataset, Sized):
-            raise TypeError(f"{type(self.dataset).__name__} has no length, so neither have its RAW pairs")
-        return len(self.dataset)
+        if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
+            raise TypeError(
+                f"{type(dataset).__name__} has no index; use RawPairStream(dataset, augment) for an iterable"
+            )
+        super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
+        self._epochs = Visits(len(dataset) if isinstance(dataset, Sized) else 0)
 
     def __getitem__(self, index: int) -> Any:
         index = range(len(self))[operator.index(index)]  # an IndexError ends iteration
@@ -147,22 +184,9 @@ class RawPairs(Dataset[Any]):
         pair: RawPair = self.augment.apply(placed(picture, params.place, self.crop), params)
         return pair
 
-    def _generator(self, epoch: int, *names: int | str) -> torch.Generator:
-        return keyed_generator(self.seed, "pairs", epoch, *names)
 
-    def _paired(self, sample: Any, name: int | str, generator: torch.Generator) -> Any:
-        where = find_picture(sample, self.key)
-        try:
-            patch, place = random_patch(picked(sample, where), self.crop, self.turns, generator, self.zoom)
-            batch = self.augment.make(patch[None], generator, place[None])
-        except ValueError as error:
-            raise ValueError(f"picture {name}: {error}") from error
-        pair = batch.map(lambda t: t[0])
-        return replaced(sample, where, pair if self.keys is None else pair.under(self.keys))
-
-
-class RawPairStream(RawPairs, IterableDataset[Any]):
-    """An iterable Dataset of pictures as one of RAW pairs; :class:`RawPairs` creates it.
+class RawPairStream(_Pairs, IterableDataset[Any]):
+    """An iterable Dataset of pictures as one of RAW pairs.
 
     A stream has no index. Without ``identity`` the n-th sample that worker w of W meets is number nW + w: no two share
     a draw, and where sample i goes to worker i mod W, each keeps its draws whatever W is. A dataset that distributes
@@ -170,11 +194,11 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
     given. Each pass is a new epoch, unless one is pinned.
 
     Args:
-        dataset: an iterable of samples, as for :class:`RawPairs`. It divides itself between workers, as those of
-            WebDataset and Hugging Face do, or ``divide`` does.
+        dataset: an iterable of samples, which are as for :class:`RawPairs`. It divides itself between workers, as those
+            of WebDataset and Hugging Face do, or ``divide`` does.
+        augment, crop, seed, key, turns, keys, zoom: as for :class:`RawPairs`.
         identity: name or index of the field that identifies a sample, such as ``"__key__"``; it keys the draws.
         divide: give sample i to worker i mod W, of a dataset that every worker would go through in full.
-        augment, crop, seed, key, turns, keys, zoom: as for :class:`RawPairs`.
 
     Example:
         >>> from rawaug.isp.model import DictionaryISP
@@ -183,24 +207,24 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
         [torch.Size([4, 16, 16])]
     """
 
+    _epochs: Passes
+
     def __init__(
         self,
         dataset: Any,
         augment: RawAugment | DictionaryISP | str | Path,
         crop: int | tuple[int, int] | None = 256,
+        *,
         seed: int = 0,
         key: str | int | None = None,
         turns: bool = True,
         keys: Sequence[str] | None = None,
+        zoom: float = 1.0,
         identity: str | int | None = None,
         divide: bool = False,
-        zoom: float = 1.0,
     ) -> None:
         super().__init__(dataset, augment, crop, seed, key, turns, keys, zoom)
-        self.identity, self.divide = identity, divide
-
-    def _new_epochs(self) -> Passes:
-        return Passes()
+        self._epochs, self.identity, self.divide = Passes(), identity, divide
 
     def __iter__(self) -> Iterator[Any]:
         info = get_worker_info()
@@ -217,9 +241,6 @@ class RawPairStream(RawPairs, IterableDataset[Any]):
             self._epochs.at(number + 1)
             yield pair
         self._epochs.end()
-
-    def __getitem__(self, index: int) -> Any:
-        raise TypeError("a stream of RAW pairs cannot be indexed; iterate over it")
 
     def _identity(self, sample: Any) -> int | str:
         try:

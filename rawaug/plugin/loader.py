@@ -42,10 +42,10 @@ class WrappedLoader:
         self,
         loader: Iterable[Any],
         augment: RawAugment,
-        device: torch.device | str | None,
-        key: str | int | None,
         crop: tuple[int, int] | None,
+        key: str | int | None,
         keys: tuple[str, ...] | None,
+        device: torch.device | str | None,
     ) -> None:
         self.loader, self.key, self.crop, self.keys = loader, key, crop, keys
         named = find_device(device) if isinstance(device, str) else device
@@ -159,10 +159,11 @@ class WrappedLoader:
 def wrap(
     loader: Iterable[Any],
     augment: RawAugment | DictionaryISP | str | Path,
-    device: torch.device | str | None = None,
-    key: str | int | None = None,
     crop: int | tuple[int, int] | None = None,
+    *,
+    key: str | int | None = None,
     keys: Sequence[str] | None = None,
+    device: torch.device | str | None = None,
 ) -> WrappedLoader:
     """Any loader of sRGB batches as a loader of RAW pairs; the rest of the training script stays as it is.
 
@@ -171,13 +172,13 @@ def wrap(
             :mod:`rawaug.plugin.pictures` accepts, lists of pictures, or tuples or mappings that have these. The
             :class:`RawPair` takes their place, all else passes through.
         augment: makes the pairs, and moves to ``device``; or an ISP, its name or its path.
+        crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
+            different sizes. By default whole pictures, without their last row or column where a side is odd.
+        key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
+        keys: names for noisy, clean, variance and params, as for :class:`rawaug.RawPairs`.
         device: where the pairs are made, by default where ``augment`` is; a ``torch.device``, or a name that
             :func:`rawaug.kernels.runtime.find_device` knows, ``auto`` among them. uint8 pictures travel
             there as uint8.
-        key: name of the pictures in batches that are mappings, their index in tuples (0 by default).
-        crop: even side of a square crop, or (height, width), drawn for each picture: makes a batch of pictures of
-            different sizes. By default whole pictures, without their last row or column where a side is odd.
-        keys: names for noisy, clean, variance and params, as for :class:`rawaug.RawPairs`.
 
     Raises:
         TypeError: if ``augment`` is none of these.
@@ -190,4 +191,4 @@ def wrap(
         >>> [(pair.noisy.shape, labels) for pair, labels in loader]
         [(torch.Size([2, 4, 32, 32]), ['cat', 'dog'])]
     """
-    return WrappedLoader(loader, augmentation(augment), device, key, crop_size(crop), require_keys(keys))
+    return WrappedLoader(loader, augmentation(augment), crop_size(crop), key, require_keys(keys), device)

@@ -107,7 +107,9 @@ def test_indices_are_those_of_a_sequence(augment: RawAugment, pictures: list[Ten
 
 @pytest.mark.parametrize("kind", ["map-style", "stream"])
 def test_persistent_workers_see_the_epoch(augment: RawAugment, pictures: list[Tensor], kind: str) -> None:
-    dataset = RawPairs(pictures if kind == "map-style" else Counted(pictures, strided=True), augment, crop=16)
+    dataset: RawPairs | RawPairStream = RawPairs(pictures, augment, crop=16)
+    if kind == "stream":
+        dataset = RawPairStream(Counted(pictures, strided=True), augment, crop=16)
     loader = DataLoader(dataset, num_workers=2, persistent_workers=True)
     first = next(iter(loader)).clean
     dataset.set_epoch(1)
@@ -242,20 +244,18 @@ def test_shards_keep_their_draws_by_identity(augment: RawAugment, pictures: list
 
 def test_workers_of_a_stream_share_no_draw(augment: RawAugment) -> None:
     same = [torch.full((3, 16, 16), 128, dtype=torch.uint8)] * 6
-    stream = RawPairs(Counted(same, strided=False), augment, crop=16)
-    assert isinstance(stream, RawPairStream)
+    stream = RawPairStream(Counted(same, strided=False), augment, crop=16)
     assert len(values(DataLoader(stream, num_workers=2))) == 12  # as plain PyTorch: each worker has all
 
 
-def test_an_iterable_is_a_stream_and_forwards_the_epoch_to_its_dataset(
-    augment: RawAugment, pictures: list[Tensor]
-) -> None:
+def test_an_iterable_needs_a_stream_which_forwards_the_epoch_to_it(augment: RawAugment, pictures: list[Tensor]) -> None:
     dataset = Counted(pictures, strided=True)
-    stream = RawPairs(dataset, augment, crop=16)
+    for iterable in (dataset, iter(pictures)):
+        with pytest.raises(TypeError, match=r"has no index; use RawPairStream\(dataset, augment\)"):
+            RawPairs(iterable, augment, crop=16)
+    stream = RawPairStream(dataset, augment, crop=16)
     stream.set_epoch(4)
     assert dataset.epoch == 4
-    with pytest.raises(TypeError, match="cannot be indexed"):
-        stream[0]
     with pytest.raises(TypeError, match="Counted has no length"):
         len(stream)
     with pytest.raises(ValueError, match="identity='name'"):
