@@ -15,7 +15,7 @@ import torch
 
 from benchmarks.measure import arguments, finish, start
 from benchmarks.sensors import middle
-from rawaug.bayer import CFA, aligned, pack
+from rawaug.bayer import CFA, crop_to_cfa, pack
 from rawaug.data import Binned, open_pairs
 from rawaug.data.pairs import SomePairs
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
@@ -48,7 +48,7 @@ def main(command: Sequence[str] | None = None) -> None:
     for way, together in WAYS.items():
         found: dict[str, list[float]] = {one.name: [] for one in everyone}
         for pair in progress(Binned(pairs, args.bin, together), label=f"binned by {way}", unit="frame"):
-            clean = middle(pack(aligned(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB), side)
+            clean = middle(pack(crop_to_cfa(pair.raw, pair.cfa, CFA.RGGB)[None], CFA.RGGB), side)
             params = noise.sample(1, keyed_generator(0, "binning", pair.name))
             levels = params["shot_var"].item(), params["read_var"].item()
             noisy = Noisy.told(noise.apply(clean, params), levels, CFA.RGGB)

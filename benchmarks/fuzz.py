@@ -50,7 +50,7 @@ from rawaug.experiment.recipe import Recipe, kind_of, read_recipe
 from rawaug.io import RawFrame, read_picture, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.isolated import isolated
 from rawaug.plugin.params import load_params
-from rawaug.seeding import derived_seed
+from rawaug.seeding import derive_seed
 from rawaug.training.state import first_network
 
 WAITING_SECONDS = 240
@@ -269,7 +269,7 @@ def _fuzz_kind(
         _empty(folder)
     outcomes, reasons, slowest = Counter[str](), [], 0.0
     for number in range(count):
-        rng = np.random.default_rng(derived_seed(seed, kind, number))
+        rng = np.random.default_rng(derive_seed(seed, kind, number))
         original = originals[number % len(originals)]
         path = _placed(original, folder, str(number), _damaged(original, rng))
         start = time.perf_counter()

@@ -31,7 +31,7 @@ from benchmarks.universal import (
     tone_points,
     tone_tables,
 )
-from rawaug.isp.cameras import published_cameras
+from rawaug.isp.cameras import load_cameras
 from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
 
@@ -75,7 +75,7 @@ def draw(path: Path) -> None:
     figure = Figure(figsize=(7.6, 8.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=(1, 1.5))
     by_camera, by_light, by_tone = (figure.add_subplot(part) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
-    cameras = camera_points(published_cameras().xyz_to_camera)
+    cameras = camera_points(load_cameras().xyz_to_camera)
     shares = torch.linspace(100.0, 0.0, len(cameras))
     for name in ("universal", "universal-small"):
         isp = DictionaryISP.from_pretrained(name)

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.measure import parser
-from rawaug.bayer import bin_mosaic, binned_variance, pack
+from rawaug.bayer import bin_mosaic, bin_mosaic_variance, pack
 from rawaug.data.published import REAL_BLACK, REAL_FRAMES, REAL_WHITE
 from rawaug.io import RawFrame, read_raw
 from rawaug.noise import estimate_noise
@@ -55,7 +55,7 @@ def described(file: Path, frame: RawFrame, split: str) -> dict[str, Any]:
         "cfa": str(frame.cfa),
         "white_balance": frame.white_balance,
         "color_matrix": frame.color_matrix.tolist(),
-        "own_noise": [level * binned_variance(BINNED) for level in (estimate.shot_var, estimate.read_var)],
+        "own_noise": [level * bin_mosaic_variance(BINNED) for level in (estimate.shot_var, estimate.read_var)],
         "source": file.name,
         "source_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
     }

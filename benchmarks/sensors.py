@@ -100,7 +100,7 @@ def main() -> None:
     args = parser.parse_args()
     figures = start(args)
     pairs = list(open_pairs(args.data, bin=args.bin))[: 1 if args.quick else None]
-    packed = [(p.name, bayer.pack(bayer.aligned(p.raw, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
+    packed = [(p.name, bayer.pack(bayer.crop_to_cfa(p.raw, p.cfa, CFA.RGGB)[None], CFA.RGGB)) for p in pairs]
     side = (96 if args.quick else args.crop) // 2
     middles = [(name, middle(raw, side)) for name, raw in packed]
     lights = [(name, raw) for name, raw in packed if (raw[:, 1:3] >= CLIPPED).all(1).any()]

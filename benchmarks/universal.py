@@ -28,9 +28,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
+from rawaug.isp.cameras import camera_from_srgb, gains_in_light, load_cameras, sample_lights
 from rawaug.isp.config import ISPConfig
-from rawaug.isp.dictionary import CameraDictionary, nearest_in_hull, plausible
+from rawaug.isp.dictionary import CameraDictionary, is_plausible, nearest_in_hull
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.tone import NODES, STEPS, inverse_smoothstep, srgb_to_linear
 from rawaug.seeding import keyed_generator
@@ -56,7 +56,7 @@ class Choice(NamedTuple):
 
 def universal_isp(colour_atoms: int = 10, tone_atoms: int | None = None, gain_atoms: int = 16) -> DictionaryISP:
     """Build the ISP; ``info`` names its atoms and what their hulls hold of all points, within 45 dB."""
-    cameras, names, tables = published_cameras(), list(tone_tables()), torch.stack(list(tone_tables().values()))
+    cameras, names, tables = load_cameras(), list(tone_tables()), torch.stack(list(tone_tables().values()))
     distinct = distinct_cameras()
     points = camera_points(distinct)
     colour = chosen_atoms(points, colour_atoms)
@@ -119,12 +119,12 @@ def _inverse(points: Sequence[Sequence[float]], display: Tensor) -> Tensor:
 
 def distinct_cameras() -> Tensor:
     """The different matrices among the published ones ``(M, 3, 3)``: bodies that share a sensor often share theirs."""
-    return torch.unique(published_cameras().xyz_to_camera, dim=0)
+    return torch.unique(load_cameras().xyz_to_camera, dim=0)
 
 
 def camera_points(xyz_to_camera: Tensor) -> Tensor:
     """Cameras as points ``(N, 9)`` whose squared distance is the error of their colour on photographs."""
-    return colour_coordinates(colour_matrix(xyz_to_camera), torch.tensor(COLOURS))
+    return colour_coordinates(camera_from_srgb(xyz_to_camera), torch.tensor(COLOURS))
 
 
 def colour_coordinates(matrices: Tensor, moment: Tensor) -> Tensor:
@@ -143,8 +143,8 @@ def inverse_gains_in_any_light(xyz_to_camera: Tensor, key: str = "universal gain
     """One over the gains, the smallest of which is 1, of random cameras in random lights ``(P, 3)``, P <= ``draws``."""
     generator = keyed_generator(key)
     camera = xyz_to_camera[torch.randint(len(xyz_to_camera), (draws,), generator=generator)]
-    balance = white_balance(camera, torch.from_numpy(sample_lights(draws, generator)))
-    balance = balance[torch.from_numpy(plausible(balance.numpy()))]
+    balance = gains_in_light(camera, torch.from_numpy(sample_lights(draws, generator)))
+    balance = balance[torch.from_numpy(is_plausible(balance.numpy()))]
     return balance.amin(dim=1, keepdim=True) / balance
 
 

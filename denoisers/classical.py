@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from denoisers.domains import levels_of
+from denoisers.domains import fit_levels
 from rawaug.bayer import noise_variance
 from rawaug.registry import FILTERS
 
@@ -208,7 +208,7 @@ def _line(noisy: Tensor, variance: Tensor | None) -> tuple[Tensor, Tensor]:
     """The levels of a map, each ``(B,)``, which must be a line in the signal."""
     if variance is None:
         raise ValueError("give the variance map, or shot_var and read_var")
-    shot, read = levels_of(noisy.double(), variance.double())
+    shot, read = fit_levels(noisy.double(), variance.double())
     if not torch.allclose(noise_variance(noisy, shot, read), variance.double(), rtol=1e-2, atol=1e-12):
         raise ValueError("the variance map is not shot_var max(noisy, 0) + read_var; pass shot_var and read_var")
     return shot.flatten(), read.flatten()

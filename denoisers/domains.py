@@ -30,7 +30,7 @@ _LEAST_RATIO = 1e-3
 """Least shot_var as a multiple of sqrt(read_var): keeps r / s^2 within what float32 resolves."""
 
 
-def levels_of(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+def fit_levels(noisy: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """shot_var and read_var ``(B, 1, 1, 1)`` of a noise map ``(B, C, h, w)``, by least squares; neither is negative.
 
     What ``noisy`` has beyond C channels, such as planes of colours, does not count.

@@ -41,12 +41,12 @@ def build(name: str, **config: Any) -> Denoiser:
         >>> build("DnCNN", width=8, depth=3).config["depth"]
         3
     """
-    outlined(name, config)
+    outline(name, config)
     network: Denoiser = DENOISERS.make({"name": name, "settings": config})
     return network
 
 
-def outlined(name: str, config: dict[str, Any]) -> Denoiser:
+def outline(name: str, config: dict[str, Any]) -> Denoiser:
     """The network of :func:`build` on the meta device, where its weights take no memory."""
     DENOISERS[name]  # imports the module that has it, which may make tensors, while they are real
     with torch.device("meta"):
@@ -102,7 +102,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
         raise ValueError(f"{path}: not a denoiser of rawaug (its metadata lack format={FORMAT}, kind={KIND})")
     try:
         config, info = (parse_object(metadata.get(key, "")) for key in ("config", "info"))
-        model = outlined(metadata.get("model", ""), config)  # before the file's tensors are known to fit
+        model = outline(metadata.get("model", ""), config)  # before the file's tensors are known to fit
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     tensors = {key: x.float() if x.dtype == torch.float16 else x for key, x in tensors.items()}  # half of the bytes
@@ -116,7 +116,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Denoiser, dict[str, Any]]:
     return model.eval(), info
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """The names that :func:`from_pretrained` knows."""
     return sorted(file.stem for file in FOLDER.glob("*.safetensors"))
 
@@ -125,7 +125,7 @@ def find(name: str | Path) -> Path:
     """The file of a denoiser: a path to a ``.safetensors`` file, or the name of a shipped one."""
     path = Path(name) if Path(name).suffix else FOLDER / f"{name}.safetensors"
     if not path.is_file():
-        known = ", ".join(shipped()) or "none in this installation"
+        known = ", ".join(list_shipped()) or "none in this installation"
         raise FileNotFoundError(f"{name}: no such denoiser; give a .safetensors file or a shipped one ({known})")
     return path
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.domains import levels_of
+from denoisers.domains import fit_levels
 from denoisers.network import PACKED
 from rawaug import bayer
 
@@ -92,7 +92,7 @@ VIEWS = (4, bayer.N_VIEWS)
 
 def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
     """``(B, 4, h, w)`` to the turned picture with the same CFA: a side is one cell longer where the pattern moved."""
-    rows, columns = cfa.turned(view).shift_to(cfa)
+    rows, columns = cfa.turn(view).shift_to(cfa)
     turned = bayer.turn(bayer.unpack(packed, cfa), view)
     return bayer.pack(F.pad(turned, (columns, columns, rows, rows), mode="reflect"), cfa)
 
@@ -100,7 +100,7 @@ def to_view(packed: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
 def from_view(image: Tensor, cfa: bayer.CFA, view: int) -> Tensor:
     """The inverse of :func:`to_view`, of packed RAW or of full colour ``(B, 3, 2h, 2w)``."""
     packed = image.shape[1] == PACKED
-    turned = bayer.aligned(bayer.unpack(image, cfa) if packed else image, cfa, cfa.turned(view))
+    turned = bayer.crop_to_cfa(bayer.unpack(image, cfa) if packed else image, cfa, cfa.turn(view))
     upright = bayer.turn_back(turned, view)
     return bayer.pack(upright, cfa) if packed else upright
 
@@ -183,7 +183,7 @@ class Recorrupted(nn.Module):
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         """Denoise ``(B, 4, h, w)``; ``variance``: ``shot_var max(noisy, 0) + read_var``, of the same shape."""
-        shot_var, read_var = levels_of(noisy, variance)
+        shot_var, read_var = fit_levels(noisy, variance)
         signal = self.model(noisy, variance)
         deviation = self.alpha * bayer.noise_variance(signal, shot_var, read_var).sqrt()
         generator = torch.Generator().manual_seed(self.seed)

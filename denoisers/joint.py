@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from denoisers.network import PACKED, conv, require_bounded
 from denoisers.networks import DRUNet, ResidualBlock
-from rawaug.bayer import CFA, stencils_of
+from rawaug.bayer import CFA, demosaicing_stencils
 from rawaug.registry import DENOISERS
 
 RGB = 3
@@ -27,7 +27,7 @@ REACH = 2
 
 def _stencils() -> Tensor:
     """``(12, 1, 6, 6)``: of each colour and site of a cell, what D takes of the cell and its neighbours."""
-    found, kinds = stencils_of(CFA.RGGB, "malvar")
+    found, kinds = demosaicing_stencils(CFA.RGGB, "malvar")
     side = 2 * REACH + 1
     own = torch.zeros(1, side, side, device="cpu")
     own[0, REACH, REACH] = 1.0
@@ -84,9 +84,9 @@ class JointDRUNet(DRUNet):
 
     def residual(self, features: Tensor) -> Tensor:
         x = self.body(features)
-        return self.uncorrected(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
+        return self.base_image(self.tail(x)) + F.pixel_shuffle(self.detail(self.refine(x)), 2)
 
-    def uncorrected(self, packed: Tensor) -> Tensor:
+    def base_image(self, packed: Tensor) -> Tensor:
         """D of packed RAW, as :func:`rawaug.bayer.demosaic` gives it."""
         device = packed.device.type
         # in bfloat16 the signal would lose the digits that hold its noise

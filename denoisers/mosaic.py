@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.domains import DOMAINS, levels_of
+from denoisers.domains import DOMAINS, fit_levels
 from denoisers.network import BLIND, DEFECT, NEAR, PACKED, Denoiser, conv, pad_to_multiple
 from denoisers.networks import CONTEXT, DRUNet, ResidualBlock
 from rawaug import bayer
@@ -39,10 +39,10 @@ _MET = ("RGGB", "XTRANS", "QUAD-RGGB+1+1")
 """Where every 2 x 2 square has all colours, as far as the pattern lets it."""
 
 
-def entered(pattern: bayer.Pattern) -> bayer.Pattern:
+def entry_pattern(pattern: bayer.Pattern) -> bayer.Pattern:
     """The pattern from where a network is trained to meet it: its origin, or one line before it either way."""
-    places = {known.shifted(i, j) for known in map(bayer.pattern, _MET) for i in range(0, 6, 2) for j in range(0, 6, 2)}
-    return next(moved for i in (0, 1) for j in (0, 1) if (moved := pattern.shifted(-i, -j)) in places)
+    places = {known.shift(i, j) for known in map(bayer.pattern, _MET) for i in range(0, 6, 2) for j in range(0, 6, 2)}
+    return next(moved for i in (0, 1) for j in (0, 1) if (moved := pattern.shift(-i, -j)) in places)
 
 
 def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
@@ -51,18 +51,18 @@ def with_planes(mosaic: Tensor, pattern: bayer.Pattern) -> Tensor:
     return torch.cat([mosaic, planes.expand(len(mosaic), -1, -1, -1)], dim=1)
 
 
-def of_pattern(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, variance: Tensor, cfa: str) -> Tensor:
+def denoise_mosaic(run: Callable[[Tensor, Tensor], Tensor], mosaic: Tensor, variance: Tensor, cfa: str) -> Tensor:
     """A mosaic ``(1, 1, H, W)`` of any pattern denoised by ``run``, such as a :class:`MosaicDRUNet`, or its tiles.
 
     It gets a mirrored line above or on the left where the network is trained to meet the pattern one line earlier.
     """
     known = bayer.pattern(cfa)
-    top, left = next((i, j) for i in (0, 1) for j in (0, 1) if known.shifted(-i, -j) == entered(known))
+    top, left = next((i, j) for i in (0, 1) for j in (0, 1) if known.shift(-i, -j) == entry_pattern(known))
     noisy, told = (F.pad(x, (left, 0, top, 0), mode="reflect") for x in (with_planes(mosaic, known), variance))
     return run(noisy, told)[..., top:, left:]
 
 
-def mended(signal: Tensor, planes: Tensor) -> Tensor:
+def mend_mosaic(signal: Tensor, planes: Tensor) -> Tensor:
     """A mosaic ``(B, 1, H, W)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
 
     A defect lies beyond all pixels of its colour within two of it by :data:`denoisers.network.DEFECT`; the pixels that
@@ -157,7 +157,7 @@ class MosaicDRUNet(DRUNet):
         self._require_type(noisy, "noisy")
         raw, planes = noisy[:, :1], noisy[:, 1:]
         variance = self._required(raw, variance)
-        levels = levels_of(raw.float(), variance.float())
+        levels = fit_levels(raw.float(), variance.float())
         whole = self._repaired(raw, planes, levels) if self.mend else raw
         denoised = self._at_halves(whole, planes, levels, (whole >= 1.0).to(raw), self.pyramid)
         return torch.where(variance > 0, denoised, raw)
@@ -165,7 +165,7 @@ class MosaicDRUNet(DRUNet):
     def _repaired(self, raw: Tensor, planes: Tensor, levels: Levels) -> Tensor:
         domain = DOMAINS[self.domain]
         signal = domain.forward(raw.float(), *levels)
-        repaired = mended(signal, planes)
+        repaired = mend_mosaic(signal, planes)
         return torch.where(repaired == signal, raw, domain.inverse(repaired, *levels).to(raw.dtype))
 
     def _at_halves(self, raw: Tensor, planes: Tensor, levels: Levels, clipped: Tensor, halvings: int) -> Tensor:
@@ -213,7 +213,7 @@ class MosaicDRUNet(DRUNet):
         return F.pixel_shuffle(correction, 2)
 
 
-class OfBayer(nn.Module):
+class BayerAdapter(nn.Module):
     """A :class:`MosaicDRUNet` as a network of packed RAW, ``(B, 4, h, w)`` of RGGB, like the others."""
 
     reads_variance = True

@@ -4,7 +4,8 @@ Domain: packed RAW, float, white = 1, not clipped at black; any height and width
 times needs sides that are multiples of its ``stride = 2^s``: the picture is padded below and on the right by reflection
 without repeating the edge (as often as needed, so a 2 x 2 picture passes too), and the result is cropped back.
 
-With ``pyramid`` the result of one scale, f, is mended by what is found at half the sides, where wide noise is narrow:
+With ``pyramid`` the result of one scale, f, is corrected by what is found at half the sides, where wide
+noise is narrow:
 ``g_n(y) = f(y) + U k(g_{n-1}(B y) - B f(y))`` and ``g_0 = f``, B binning by 2 and U interpolating. k is 1, and falls
 to 0 where :data:`BLIND` of the values are clipped: their mean does not tell the light.
 
@@ -25,7 +26,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from denoisers.domains import DOMAINS, levels_of
+from denoisers.domains import DOMAINS, fit_levels
 from rawaug import bayer
 from rawaug.registry import require_between
 
@@ -95,7 +96,7 @@ def require_bounded(seed: int, **layers: int) -> None:
         require_between(key, number, 0, MOST_LAYERS)
 
 
-def mended(signal: Tensor) -> Tensor:
+def mend_planes(signal: Tensor) -> Tensor:
     """Packed RAW ``(B, 4, h, w)`` with noise of deviation 1, hot and dead pixels replaced by their neighbours' mean.
 
     A defect lies beyond all eight neighbours of its colour by :data:`DEFECT`; the other colours of its cell do not.
@@ -113,15 +114,15 @@ def mended(signal: Tensor) -> Tensor:
     return torch.where(beyond & alone, mean, signal)
 
 
-def halved(picture: Tensor) -> Tensor:
+def halve(picture: Tensor) -> Tensor:
     """A picture at half its sides; packed RAW, whose sites are those of RGGB, is binned around the new sites."""
     if picture.shape[1] != PACKED:
         return F.avg_pool2d(picture, 2)
     return bayer.pack(bayer.bin_mosaic(bayer.unpack(picture, bayer.CFA.RGGB), bayer.CFA.RGGB, 2), bayer.CFA.RGGB)
 
 
-def doubled(picture: Tensor) -> Tensor:
-    """A picture at twice its sides, linear between its places, which for packed RAW are those of :func:`halved`."""
+def double(picture: Tensor) -> Tensor:
+    """A picture at twice its sides, linear between its places, which for packed RAW are those of :func:`halve`."""
     if picture.shape[1] != PACKED:
         return F.interpolate(picture, scale_factor=2, mode="bilinear")
     taps = torch.tensor([[3.0, 7, 5, 1], [1, 5, 7, 3]], device=picture.device) / 8  # of the first and second site
@@ -145,7 +146,7 @@ class Denoiser(nn.Module, ABC):
             ``shot_var max(noisy, 0) + read_var``.
         limits: feed, as two times ``channels`` more inputs, how far the transformed signal is above 0 and below white,
             at most :data:`NEAR`: where photons are few, and where the sensor clips. Not in the domain ``linear``.
-        mend: put :func:`mended` before the network, of packed RAW. Not in the domain ``linear``.
+        mend: put :func:`mend_planes` before the network, of packed RAW. Not in the domain ``linear``.
         pyramid: times, 0 to 4, that the sides are halved to denoise there too, where wide noise is narrow, and to take
             what is wide from there; a quarter to a third more work. Not where the result is demosaiced.
 
@@ -204,7 +205,7 @@ class Denoiser(nn.Module, ABC):
     def residual(self, features: Tensor) -> Tensor:
         """``(B, inputs, h, w)``, sides multiples of ``stride``, to the correction, of the result's shape."""
 
-    def uncorrected(self, packed: Tensor) -> Tensor:
+    def base_image(self, packed: Tensor) -> Tensor:
         """What the correction is added to: the input itself, or what it is in the result's shape."""
         return packed
 
@@ -238,11 +239,11 @@ class Denoiser(nn.Module, ABC):
 
     def _at_one_scale(self, noisy: Tensor, variance: Tensor | None) -> Tensor:
         if variance is None or not self.reads_variance:
-            return self.uncorrected(noisy) + self._correction(noisy)
+            return self.base_image(noisy) + self._correction(noisy)
         if self.domain == "linear":
             correction = self._correction(noisy, variance.sqrt() if self.deviation else variance)
-            return self.uncorrected(noisy) + correction
-        domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
+            return self.base_image(noisy) + correction
+        domain, levels = DOMAINS[self.domain], fit_levels(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
         maps = [domain.relative_deviation(noisy.float(), variance.float(), *levels)] if self.variance_map else []
         if self.limits:
@@ -250,12 +251,12 @@ class Denoiser(nn.Module, ABC):
             maps += [signal.clamp_max(NEAR), (white - signal).clamp_max(NEAR)]
         correction = self._correction(signal, *maps)
         correction = maps[0] * correction if self.variance_map else correction
-        return domain.inverse(self.uncorrected(signal) + correction, *levels).to(noisy.dtype)
+        return domain.inverse(self.base_image(signal) + correction, *levels).to(noisy.dtype)
 
     def _mended(self, noisy: Tensor, variance: Tensor) -> Tensor:
-        domain, levels = DOMAINS[self.domain], levels_of(noisy.float(), variance.float())
+        domain, levels = DOMAINS[self.domain], fit_levels(noisy.float(), variance.float())
         signal = domain.forward(noisy.float(), *levels)
-        repaired = mended(signal)
+        repaired = mend_planes(signal)
         return torch.where(repaired == signal, noisy, domain.inverse(repaired, *levels).to(noisy.dtype))
 
     def _at_scales(self, noisy: Tensor, variance: Tensor | None, clipped: Tensor, halvings: int) -> Tensor:
@@ -263,16 +264,16 @@ class Denoiser(nn.Module, ABC):
         denoised = self._at_one_scale(noisy, variance)
         if not halvings:
             return denoised
-        small, seen, share = (halved(pad_to_multiple(x, 4)) for x in (noisy, denoised, clipped))
-        part = bayer.binned_variance(2) if self.channels == PACKED else 0.25
-        told = None if variance is None else part * halved(pad_to_multiple(variance, 4))
+        small, seen, share = (halve(pad_to_multiple(x, 4)) for x in (noisy, denoised, clipped))
+        part = bayer.bin_mosaic_variance(2) if self.channels == PACKED else 0.25
+        told = None if variance is None else part * halve(pad_to_multiple(variance, 4))
         # Near its own limit of resolution the half picture knows less than the whole one.
         wide, near = (
             F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
             for x in (self._at_scales(small, told, share, halvings - 1) - seen, share)
         )
         height, width = noisy.shape[-2:]
-        return denoised + doubled((1.0 - near / BLIND).clamp_min(0.0) * wide)[..., :height, :width]
+        return denoised + double((1.0 - near / BLIND).clamp_min(0.0) * wide)[..., :height, :width]
 
     def _correction(self, signal: Tensor, *maps: Tensor) -> Tensor:
         features = torch.cat([signal, *maps], dim=1) if maps else signal

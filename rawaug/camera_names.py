@@ -36,12 +36,14 @@ _LINES = (
 
 
 @lru_cache(maxsize=8192)
-def key_of(name: str) -> str:
+def camera_key(name: str) -> str:
     """What names of one camera have in common.
 
     Example:
-        >>> key_of("Sony A7 III") == key_of("Sony ILCE-7M3"), key_of("Canon EOS 5D Mark II"), key_of("Nikon Z 6_2")
-        (True, 'canon5dm2', 'nikonz6m2')
+        >>> camera_key("Sony A7 III") == camera_key("Sony ILCE-7M3"), camera_key("Canon EOS 5D Mark II")
+        (True, 'canon5dm2')
+        >>> camera_key("Nikon Z 6_2")
+        'nikonz6m2'
     """
     text = " ".join(name.casefold().split())
     for pattern, instead in _LINES:
@@ -61,36 +63,40 @@ def _elsewhere() -> dict[str, str]:
     }
 
 
-def alike(part: str, known: Iterable[str]) -> list[str]:
+def similar_cameras(part: str, known: Iterable[str]) -> list[str]:
     """The cameras of ``known`` that have ``part`` in their names, or all of its words.
 
     Example:
-        >>> alike("a7 iii", ["Sony ILCE-7M3", "Sony SLT-A77"]), alike("mark ii canon", ["Canon EOS 5D Mark II"])
-        (['Sony ILCE-7M3'], ['Canon EOS 5D Mark II'])
+        >>> similar_cameras("a7 iii", ["Sony ILCE-7M3", "Sony SLT-A77"])
+        ['Sony ILCE-7M3']
+        >>> similar_cameras("mark ii canon", ["Canon EOS 5D Mark II"])
+        ['Canon EOS 5D Mark II']
     """
-    key, words = key_of(part), part.casefold().split()
-    return [name for name in known if key in key_of(name) or all(word in name.casefold() for word in words)]
+    key, words = camera_key(part), part.casefold().split()
+    return [name for name in known if key in camera_key(name) or all(word in name.casefold() for word in words)]
 
 
-def spelled(name: str, known: Iterable[str]) -> str:
+def find_camera(name: str, known: Iterable[str]) -> str:
     """The camera of ``known``, maker and model, that goes by ``name``; of several the first.
 
     Raises:
         ValueError: if there is no such name; similar ones are suggested.
 
     Example:
-        >>> spelled("nikon  d750", ["Nikon D750", "Nikon D7500"]), spelled("Sony a7 III", ["Sony ILCE-7M3"])
+        >>> find_camera("nikon  d750", ["Nikon D750", "Nikon D7500"]), find_camera("Sony a7 III", ["Sony ILCE-7M3"])
         ('Nikon D750', 'Sony ILCE-7M3')
     """
-    known, key = list(dict.fromkeys(known)), key_of(name)
+    known, key = list(dict.fromkeys(known)), camera_key(name)
     exact = " ".join(name.casefold().split())
     by_key: dict[str, str] = {}
     for candidate in known:
         if " ".join(candidate.casefold().split()) == exact:
             return candidate
-        by_key.setdefault(key_of(candidate), candidate)
+        by_key.setdefault(camera_key(candidate), candidate)
     if key in by_key:
         return by_key[key]
-    similar = alike(name, known)[:3] or [by_key[near] for near in difflib.get_close_matches(key, by_key, 3, 0.8)]
+    similar = similar_cameras(name, known)[:3] or [
+        by_key[near] for near in difflib.get_close_matches(key, by_key, 3, 0.8)
+    ]
     hint = f"; similar: {', '.join(similar)}" if similar else ""
     raise ValueError(f"camera {name!r} is not listed{hint}; rawaug info cameras lists all")

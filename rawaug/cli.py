@@ -20,8 +20,8 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 from rawaug import __version__
-from rawaug.errors import MissingExtra, escape, resource_error, without_traceback
-from rawaug.progress import quiet as without_progress
+from rawaug.errors import MissingExtra, escape, resource_error, strip_traceback
+from rawaug.progress import hide_progress
 
 BAD_INPUT = 2
 COMMANDS = {
@@ -83,7 +83,7 @@ def _launch(
     """
     for file in own or ():
         _import(file)
-    with without_progress(quiet):
+    with hide_progress(quiet):
         app(words, exit_on_error=False, print_error=False)
 
 
@@ -142,7 +142,7 @@ def _one_line(error: Exception) -> str:
         return f"not valid JSON: {error.msg}"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
-    return " ".join(without_traceback(str(error)).split())
+    return " ".join(strip_traceback(str(error)).split())
 
 
 if __name__ == "__main__":

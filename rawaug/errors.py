@@ -74,11 +74,11 @@ def resource_error(error: BaseException) -> str | None:
     return None if found is None else f"{found}, then run the same command again"
 
 
-def without_traceback(text: str) -> str:
+def strip_traceback(text: str) -> str:
     """The last line of an error that a DataLoader's worker raised, in place of its traceback.
 
     Example:
-        >>> without_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")
+        >>> strip_traceback("Caught ValueError in a worker.\\nOriginal Traceback ...\\nValueError: a")
         'a'
     """
     if "Original Traceback" not in text:

@@ -23,7 +23,7 @@ _LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} elapsed, {remaining} lef
 
 
 @contextmanager
-def quiet(yes: bool = True) -> Iterator[None]:
+def hide_progress(yes: bool = True) -> Iterator[None]:
     """Print no progress within the block."""
     token = _quiet.set(yes)
     try:
@@ -70,7 +70,7 @@ class _Lines(terminal_tqdm):
         self.disable = True
 
 
-def timed(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
+def time_stage(stage: str) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Adds the seconds of a method to ``self.seconds[stage]``."""
 
     def decorated(method: Callable[..., T]) -> Callable[..., T]:

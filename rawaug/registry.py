@@ -34,14 +34,14 @@ Spec = str | Mapping[str, Any]
 """A name, or ``{"name": ..., "settings": {...}}``."""
 
 
-def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
+def split_spec(spec: Spec) -> tuple[str, dict[str, Any]]:
     """Both parts of a spec; a bare name has no settings.
 
     Raises:
         ValueError: if it has no name, or another key.
 
     Example:
-        >>> name_and_settings({"name": "r2r", "settings": {"alpha": 0.5}})
+        >>> split_spec({"name": "r2r", "settings": {"alpha": 0.5}})
         ('r2r', {'alpha': 0.5})
     """
     if isinstance(spec, str):
@@ -57,13 +57,13 @@ def name_and_settings(spec: Spec) -> tuple[str, dict[str, Any]]:
     return given["name"], dict(settings)
 
 
-def label_of(spec: Spec) -> str:
+def spec_label(spec: Spec) -> str:
     """A spec in a line, for tables: its name and settings."""
-    name, settings = name_and_settings(spec)
+    name, settings = split_spec(spec)
     return " ".join([name, *(f"{key}={value}" for key, value in settings.items())])
 
 
-def checked_settings(
+def check_settings(
     label: str, function: Callable[..., Any], settings: Mapping[str, Any], given: Iterable[str] = ()
 ) -> dict[str, Any]:
     """Keyword arguments for a function or class, lists as tuples; the caller passes those that are ``given`` besides.
@@ -74,7 +74,7 @@ def checked_settings(
     parameters = inspect.signature(function).parameters
     takes = [key for key, p in parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     for key in [key for key in settings if key not in takes]:
-        raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{nearest(key, takes)}")
+        raise ValueError(f"{label} has no setting {key!r}; it has {', '.join(takes) or 'none'}{suggest(key, takes)}")
     for key in takes:
         if parameters[key].default is inspect.Parameter.empty and key not in {*settings, *given}:
             raise ValueError(f"{label} needs the setting {key!r}")
@@ -95,7 +95,7 @@ def require_between(key: str, value: object, least: float, most: float) -> None:
         raise ValueError(f"{key} must be a {'whole ' * whole}number from {least} to {most}, got {value!r:.100}")
 
 
-def nearest(name: object, known: Iterable[str]) -> str:
+def suggest(name: object, known: Iterable[str]) -> str:
     """``" (nearest: UNet)"`` for a name that is nearly known, else nothing."""
     by_key = {candidate.casefold(): candidate for candidate in known}
     near = difflib.get_close_matches(str(name).casefold(), by_key, n=1)
@@ -146,7 +146,7 @@ class Registry(Mapping[str, Any]):
         if name not in self._things:
             if name not in self._entry_points:
                 raise UnknownName(
-                    f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{nearest(name, self)}; "
+                    f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}{suggest(name, self)}; "
                     f"one of your own: rawaug --import FILE.py COMMAND, or an entry point in {self.group}"
                 )
             self._things[name] = self._loaded(name)
@@ -168,8 +168,8 @@ class Registry(Mapping[str, Any]):
 
     def make(self, spec: Spec, **defaults: Any) -> Any:
         """A new one, with its settings as keyword arguments; ``defaults`` stand where these say nothing."""
-        name, settings = name_and_settings(spec)
-        return self[name](**{**defaults, **checked_settings(f"{self.kind} {name}", self[name], settings, defaults)})
+        name, settings = split_spec(spec)
+        return self[name](**{**defaults, **check_settings(f"{self.kind} {name}", self[name], settings, defaults)})
 
     def _import_next(self) -> None:
         package = self._unimported[0]

@@ -13,15 +13,15 @@ from contextlib import contextmanager
 import torch
 
 
-def derived_seed(*keys: int | str) -> int:
+def derive_seed(*keys: int | str) -> int:
     """A 63-bit seed from a sequence of integers and strings, the same on every machine."""
     digest = hashlib.blake2b(repr(keys).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
 
 
 def keyed_generator(*keys: int | str, device: torch.device | str = "cpu") -> torch.Generator:
-    """A ``torch.Generator`` on ``device``, seeded with :func:`derived_seed`."""
-    return torch.Generator(device).manual_seed(derived_seed(*keys))
+    """A ``torch.Generator`` on ``device``, seeded with :func:`derive_seed`."""
+    return torch.Generator(device).manual_seed(derive_seed(*keys))
 
 
 def rank_key() -> tuple[int, ...]:
@@ -32,7 +32,7 @@ def rank_key() -> tuple[int, ...]:
 
 
 @contextmanager
-def initialised_from(seed: int) -> Iterator[None]:
+def initialise_from(seed: int) -> Iterator[None]:
     """Layers made inside are float32 and draw their weights from ``seed``; PyTorch's global state is then restored."""
     default = torch.get_default_dtype()
     with torch.random.fork_rng(devices=[]):

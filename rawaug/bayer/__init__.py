@@ -1,13 +1,13 @@
 """Mosaics: colour filter arrays, geometry that keeps their pattern, demosaicing."""
 
-from rawaug.bayer.binning import Halving, bayer_variance, to_bayer
+from rawaug.bayer.binning import Halving, to_bayer, to_bayer_variance
 from rawaug.bayer.cfa import (
     CFA,
     N_VIEWS,
-    aligned,
     bin_mosaic,
-    binned_variance,
+    bin_mosaic_variance,
     crop,
+    crop_to_cfa,
     mosaic,
     noise_variance,
     pack,
@@ -17,8 +17,8 @@ from rawaug.bayer.cfa import (
     turn_keeping_cfa,
     unpack,
 )
-from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, require_method, stencils_of
-from rawaug.bayer.patterns import PATTERNS, Pattern, layout, named, pattern, sites
+from rawaug.bayer.demosaicing import DIRECTIONAL, METHODS, STENCILS, demosaic, demosaicing_stencils, require_method
+from rawaug.bayer.patterns import PATTERNS, Pattern, canonical_cfa, pattern, pattern_name, plane_indices
 from rawaug.bayer.transforms import Pack, RandomCrop, RandomTurn
 
 __all__ = [
@@ -33,23 +33,23 @@ __all__ = [
     "Pattern",
     "RandomCrop",
     "RandomTurn",
-    "aligned",
-    "bayer_variance",
     "bin_mosaic",
-    "binned_variance",
+    "bin_mosaic_variance",
+    "canonical_cfa",
     "crop",
+    "crop_to_cfa",
     "demosaic",
-    "layout",
+    "demosaicing_stencils",
     "mosaic",
-    "named",
     "noise_variance",
     "pack",
     "pack_rgb",
     "pattern",
+    "pattern_name",
+    "plane_indices",
     "require_method",
-    "sites",
-    "stencils_of",
     "to_bayer",
+    "to_bayer_variance",
     "turn",
     "turn_back",
     "turn_keeping_cfa",

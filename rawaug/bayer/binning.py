@@ -64,18 +64,18 @@ def to_bayer(mosaic: Tensor, cfa: str) -> Tensor:
     """A mosaic ``(1, H, W)`` of any pattern as one of RGGB at half the sides, ``(1, h, w)``, h and w even.
 
     Lines at the end that fill no cell are left out, and of Quad-Bayer a first line that halves the squares of a colour.
-    :func:`bayer_variance` says what of the noise is left.
+    :func:`to_bayer_variance` says what of the noise is left.
     """
     known, places = pattern(cfa), ((0, 0), (0, 1), (1, 0), (1, 1))
-    top, left = next((place for place in places if known.shifted(*place).name in PATTERNS), (0, 0))
+    top, left = next((place for place in places if known.shift(*place).name in PATTERNS), (0, 0))
     height, width = ((side - first) // 4 * 4 for side, first in zip(mosaic.shape[-2:], (top, left), strict=True))
     if not min(height, width):
         raise ValueError(f"a mosaic of {tuple(mosaic.shape[-2:])} is too small for half of its sides; it needs 4 x 4")
-    halving = Halving(known.shifted(top, left).planes(height, width)[None])
+    halving = Halving(known.shift(top, left).planes(height, width)[None])
     return F.pixel_shuffle(halving(mosaic[None, :, top : top + height, left : left + width]), 2)[0]
 
 
-def bayer_variance(cfa: str) -> float:
+def to_bayer_variance(cfa: str) -> float:
     """Of independent noise of variance 1, what :func:`to_bayer` leaves, the mean over the colours' sites."""
     halving = Halving(pattern(cfa).planes(_WHOLE, _WHOLE)[None])
     return float(halving.variance(torch.ones(1, 1, 1, 1))[..., 2:-2, 2:-2].mean())

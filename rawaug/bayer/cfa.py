@@ -5,7 +5,7 @@ Bayer's patterns (US patent 3,971,065, 1976). *Packed* RAW holds the four sites 
 always in the order R, Gr, Gb, B (Gr is the green of the red row), so that a network need not know the sensor's pattern.
 
 A flip or a quarter turn of a mosaic moves the pattern: a mirrored RGGB is GRBG. :func:`turn` only moves pixels,
-:meth:`CFA.turned` says what the pattern becomes, and :func:`turn_keeping_cfa` crops a line where that brings it back.
+:meth:`CFA.turn` says what the pattern becomes, and :func:`turn_keeping_cfa` crops a line where that brings it back.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ class CFA(StrEnum):
         a, b, c, d = ("RGB".index(colour) for colour in self.value)
         return (a, b), (c, d)
 
-    def shifted(self, rows: int, columns: int) -> CFA:
+    def shift(self, rows: int, columns: int) -> CFA:
         """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right."""
         cell = [self.value[:2], self.value[2:]]
         return CFA("".join(cell[(i + rows) % 2][(j + columns) % 2] for i in (0, 1) for j in (0, 1)))
 
-    def turned(self, view: int) -> CFA:
+    def turn(self, view: int) -> CFA:
         """The pattern after :func:`turn` of a mosaic with even sides."""
         cell = torch.arange(4).reshape(1, 1, 2, 2)
         return CFA("".join(self.value[k] for k in turn(cell, view).flatten().tolist()))
 
     def shift_to(self, other: CFA) -> tuple[int, int]:
-        """(rows, columns) in {0, 1} with ``self.shifted(rows, columns) == other``."""
-        return next((i, j) for i in (0, 1) for j in (0, 1) if self.shifted(i, j) == other)
+        """(rows, columns) in {0, 1} with ``self.shift(rows, columns) == other``."""
+        return next((i, j) for i in (0, 1) for j in (0, 1) if self.shift(i, j) == other)
 
 
 def noise_variance(raw: Tensor, shot_var: float | Tensor, read_var: float | Tensor) -> Tensor:
@@ -132,7 +132,7 @@ def turn_back(image: Tensor, view: int) -> Tensor:
 def turn_keeping_cfa(raw: Tensor, cfa: CFA | str, view: int) -> Tensor:
     """Turn a mosaic ``(..., H, W)`` and keep its pattern: where it would move, one line on either side is cropped."""
     require_even(*raw.shape[-2:])
-    kept = aligned(turn(raw, view), CFA(cfa).turned(view), CFA(cfa))
+    kept = crop_to_cfa(turn(raw, view), CFA(cfa).turn(view), CFA(cfa))
     if not all(kept.shape[-2:]):
         raise ValueError(f"a mosaic of {tuple(raw.shape[-2:])} is too small to turn while keeping its CFA")
     return kept
@@ -142,10 +142,10 @@ def crop(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     """Crop ``(..., H, W)``; ValueError if the offset or size is odd, which moves the pattern, or beyond the mosaic."""
     if any(value % 2 for value in (top, left, height, width)):
         raise ValueError(f"offset ({top}, {left}) and size {height} x {width} must be even to keep the CFA")
-    return cropped(raw, top, left, height, width)
+    return crop_window(raw, top, left, height, width)
 
 
-def cropped(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
+def crop_window(raw: Tensor, top: int, left: int, height: int, width: int) -> Tensor:
     sides = tuple(raw.shape[-2:])
     if min(top, left) < 0 or min(height, width) < 1 or top + height > sides[0] or left + width > sides[1]:
         raise ValueError(f"crop {height} x {width} at ({top}, {left}) extends beyond the mosaic {sides}")
@@ -158,7 +158,7 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     The mean is over 2 ``factor`` pixels of the old mosaic either way, ``factor`` sites of a colour, about the centre of
     the new site; with an even factor a site at the window's end counts by the part of it that is inside. So the sites
     of the new mosaic are as far apart as a sensor's, and demosaicing finds edges where they are. The pattern stays;
-    independent noise has :func:`binned_variance` of its variance. Beyond the border its last sites are repeated.
+    independent noise has :func:`bin_mosaic_variance` of its variance. Beyond the border its last sites are repeated.
     With ``together`` the four sites of a new cell are means around its one centre, as a pixel of full colour needs
     them, so that the colours of its truth are in register.
     ValueError if the CFA is not Bayer's, or a side is not a multiple of 2 ``factor``.
@@ -176,7 +176,7 @@ def bin_mosaic(raw: Tensor, cfa: CFA | str, factor: int, together: bool = False)
     return torch.stack([torch.stack(pair, -1).flatten(-2) for pair in sites], -2).flatten(-3, -2)
 
 
-def binned_variance(factor: int, together: bool = False) -> float:
+def bin_mosaic_variance(factor: int, together: bool = False) -> float:
     """Of independent noise of variance 1 after :func:`bin_mosaic`: about ``1 / factor^2``, 0.051 for 4."""
     part = (-1 if together else factor - 1) / 4 % 1
     return ((factor - 1 + part**2 + (1 - part) ** 2) / factor**2) ** 2
@@ -194,7 +194,7 @@ def _window_means(plane: Tensor, axis: int, factor: int, move: float) -> Tensor:
     return torch.lerp(near, far, part)
 
 
-def aligned(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
+def crop_to_cfa(mosaic: Tensor, cfa: CFA, target: CFA) -> Tensor:
     """``(..., H, W)`` from the first site where ``cfa`` reads as ``target``; sides stay even."""
     rows, columns = cfa.shift_to(target)
     height, width = mosaic.shape[-2:]

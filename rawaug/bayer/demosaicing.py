@@ -48,7 +48,7 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
     require_method(method)
     if method in DIRECTIONAL:
         return DIRECTIONAL[method](raw, CFA(cfa))
-    stencils, kinds = stencils_of(cfa, method)
+    stencils, kinds = demosaicing_stencils(cfa, method)
     edge = stencils.shape[-1] // 2
     padded = F.pad(raw, (edge, edge, edge, edge), mode="reflect")  # about the border sites: the pattern stays
     found = torch.cat([raw, F.conv2d(padded, stencils[:, None].to(raw))], dim=1)
@@ -61,7 +61,7 @@ def demosaic(raw: Tensor, cfa: CFA | str, method: str = "bilinear") -> Tensor:
 
 
 @lru_cache
-def stencils_of(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
+def demosaicing_stencils(cfa: CFA | str, method: str) -> tuple[Tensor, list[list[list[int]]]]:
     """Four stencils ``(4, K, K)``, and which makes a colour at a site: ``kinds[colour][row][column]``, 0 for none."""
     cross, along_row, diagonal = STENCILS[method]
     own = CFA(cfa).channels

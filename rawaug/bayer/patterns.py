@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer.cfa import CFA, cropped, require_channels, turn
+from rawaug.bayer.cfa import CFA, crop_window, require_channels, turn
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class Pattern:
         """Side of the cell."""
         return len(self.rows)
 
-    def shifted(self, rows: int, columns: int) -> Pattern:
+    def shift(self, rows: int, columns: int) -> Pattern:
         """The pattern of the mosaic that starts ``rows`` lower and ``columns`` further right; it has a name again.
 
         Example:
-            >>> pattern("QUAD-RGGB").shifted(1, 3).name, pattern("RGGB").shifted(0, 1).name
+            >>> pattern("QUAD-RGGB").shift(1, 3).name, pattern("RGGB").shift(0, 1).name
             ('QUAD-RGGB+1+3', 'GRBG')
         """
         size = self.period
@@ -84,7 +84,7 @@ class Pattern:
         """Crop ``(..., H, W)`` at whole cells, so that the pattern begins at its corner again; any size."""
         if top % self.period or left % self.period:
             raise ValueError(f"offset ({top}, {left}) must be a multiple of {self.period} to keep {self.name}")
-        return cropped(raw, top, left, height, width)
+        return crop_window(raw, top, left, height, width)
 
     def shift_after(self, view: int) -> tuple[int, int]:
         """Rows and columns, less than the period, from which a turned mosaic of whole cells reads the pattern again."""
@@ -162,28 +162,28 @@ _BY_ROWS: dict[tuple[str, ...], Pattern] = {}
 _BY_NAME = {phase.name: _BY_ROWS.setdefault(phase.rows, phase) for phase in _phases()}
 
 
-def named(rows: Sequence[str]) -> str | None:
+def pattern_name(rows: Sequence[str]) -> str | None:
     """The name of the pattern whose cell is read as ``rows`` from its top left, or None if it is unknown.
 
     Example:
-        >>> named(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
+        >>> pattern_name(["GRBGBR", "BGGRGG", "RGGBGG", "GBRGRB", "RGGBGG", "BGGRGG"])
         'XTRANS+1+1'
     """
     found = _BY_ROWS.get(tuple(rows))
     return None if found is None else found.name
 
 
-def layout(cfa: str) -> str:
+def canonical_cfa(cfa: str) -> str:
     """The :class:`CFA` of a Bayer pattern's name, the name of another; ValueError if there is no such pattern."""
     name = pattern(cfa).name
     return CFA(name) if name in CFA.__members__ else name
 
 
-def sites(cfa: str) -> Tensor:
+def plane_indices(cfa: str) -> Tensor:
     """Which of R, Gr, Gb, B (0 to 3) each site of a pattern's cell is, int64 ``(n, n)``; if not Bayer's, greens are 1.
 
     Example:
-        >>> sites("GRBG").tolist(), sites("XTRANS").shape
+        >>> plane_indices("GRBG").tolist(), plane_indices("XTRANS").shape
         ([[1, 0], [3, 2]], torch.Size([6, 6]))
     """
     known = pattern(cfa)

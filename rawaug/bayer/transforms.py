@@ -82,7 +82,7 @@ class RandomTurn(_Transform):
 
     Args:
         cfa: pattern of the mosaics.
-        keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turned(view)``.
+        keep_cfa: crop a line on either side where the pattern would move; if not, it becomes ``cfa.turn(view)``.
         quarter: draw quarter turns too; without them the sides are not exchanged.
         seed: of its own draws, where no generator is passed.
 

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from rawaug.bayer import CFA, aligned
+from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.camera.psnr_r import psnr_r
 from rawaug.data import RawFolder, open_pairs
 from rawaug.data.folders import Kept, Readable, left_out
@@ -24,7 +24,7 @@ from rawaug.data.pairs import Pair, shared_frame
 from rawaug.io import RawFrame, read_raw
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_noise, from_dark_frames, plot_noise
+from rawaug.noise import IsoLevel, MeasuredLevels, NoiseEstimate, estimate_dark_noise, estimate_noise, plot_noise
 from rawaug.noise.estimate import WORST_FIT
 
 MOST_FRAMES = 32
@@ -195,7 +195,7 @@ def _measured(
         matching = dark.get(iso) or dark.get(None)
         if matching is None:
             raise ValueError(f"dark: has no frame{where}; give dark frames at every measured ISO")
-        read_var = from_dark_frames(*_aligned(matching)).read_var
+        read_var = estimate_dark_noise(*_aligned(matching)).read_var
     try:
         estimate = estimate_noise(*_aligned(frames), read_var=read_var)
     except ValueError as error:
@@ -244,7 +244,7 @@ def _frame(pairs: Sequence[Pair], index: int) -> RawFrame:
 def _aligned(frames: Sequence[RawFrame]) -> tuple[list[Tensor], str]:
     cfa, patterns = frames[0].cfa, {frame.cfa for frame in frames}
     if patterns <= set(CFA):
-        return [aligned(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
+        return [crop_to_cfa(frame.mosaic, CFA(frame.cfa), CFA(cfa)) for frame in frames], cfa
     if len(patterns) > 1:
         raise ValueError(f"the frames are of several patterns, {', '.join(sorted(patterns))}; measure each separately")
     return [frame.mosaic for frame in frames], cfa

@@ -12,7 +12,7 @@ from rawaug.data.pairs import Pair
 from rawaug.isp import staged
 from rawaug.isp.fit.samples import block_averages
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.metrics import PATCH, patch_psnr
 from rawaug.seeding import keyed_generator
 
@@ -60,6 +60,6 @@ def windows_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair, count: in
     values, (height, width) = [], pair.raw.shape[-2:]
     for top, left in windows_of(pair, count):
         window = (None, slice(None), slice(top, top + PATCH), slice(left, left + PATCH))
-        place = place_in_frame(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
+        place = frame_coordinates(min(PATCH, height), min(PATCH, width), (top, left), (height, width))
         values.append(patch_psnr(make(pair.srgb[window], place).clamp(0.0, 1.0), pair.raw[window]))
     return torch.cat(values).mean().item()

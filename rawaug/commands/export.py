@@ -155,7 +155,7 @@ class ReversePass(nn.Module):
 
 
 def _places(image: Tensor) -> Tensor:
-    """Coordinates of :func:`rawaug.isp.stages.place_in_frame`, computed from a tensor, so that any size is traced."""
+    """Coordinates of :func:`rawaug.isp.stages.frame_coordinates`, from a tensor, so that any size is traced."""
     ones = torch.ones_like(image[:, :1])
     rows, columns = ones.cumsum(2), ones.cumsum(3)
     height, width = rows[..., -1:, -1:], columns[..., -1:, -1:]

@@ -10,11 +10,11 @@ from typing import Any
 import denoisers
 from denoisers.files import FOLDER
 from rawaug import __version__
-from rawaug.camera_names import alike, key_of
+from rawaug.camera_names import camera_key, similar_cameras
 from rawaug.files import find_weights, read_header, sha256
-from rawaug.isp.cameras import published_cameras
+from rawaug.isp.cameras import load_cameras
 from rawaug.isp.model import DictionaryISP
-from rawaug.noise.cameras import SPREAD, measured_ranges, profile_ends, published_profiles
+from rawaug.noise.cameras import SPREAD, load_profiles, measured_ranges, profile_ends
 
 _WITH_LEVELS = 3
 """So few cameras are listed with their levels."""
@@ -46,15 +46,15 @@ def cameras(part: str = "") -> list[dict[str, Any]]:
     Raises:
         ValueError: if there is none.
     """
-    listed, profiles = published_cameras(), published_profiles()
+    listed, profiles = load_cameras(), load_profiles()
     found: dict[str, dict[str, Any]] = {}
     for name, matrix in zip(listed.names, listed.xyz_to_camera.tolist(), strict=True):
-        found.setdefault(key_of(name), {"name": name, "xyz_to_camera": matrix, "iso": None})
+        found.setdefault(camera_key(name), {"name": name, "xyz_to_camera": matrix, "iso": None})
     limits = dict(zip(profiles.names, profiles.limits().exp().round().tolist(), strict=True))
     for name, iso in {**limits, **measured_ranges()}.items():
-        found.setdefault(key_of(name), {"name": name, "xyz_to_camera": None, "iso": None})["iso"] = iso
+        found.setdefault(camera_key(name), {"name": name, "xyz_to_camera": None, "iso": None})["iso"] = iso
     named = {camera["name"]: camera for camera in found.values()}
-    wanted = sorted(alike(part, named), key=str.casefold)
+    wanted = sorted(similar_cameras(part, named), key=str.casefold)
     if not wanted:
         raise ValueError(f"no camera has {part!r} in its name; rawaug info cameras lists all")
     few = {name for name in wanted if part and name in limits}

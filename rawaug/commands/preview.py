@@ -21,7 +21,7 @@ from rawaug.files import require_writable
 from rawaug.io import encode_srgb, read_picture
 from rawaug.io.pictures import MAX_PIXELS
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import LensShading, place_in_frame
+from rawaug.isp.stages import LensShading, frame_coordinates
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
@@ -75,7 +75,7 @@ def _draw_stages(augment: RawAugment, whole: Tensor, count: int, seed: int) -> A
     height, width = (min(side, _MAXIMUM) for side in frame)
     top, left = (frame[0] - height) // 4 * 2, (frame[1] - width) // 4 * 2
     srgb = bayer.crop(whole, top, left, height, width)
-    place = place_in_frame(height, width, (top, left), frame)
+    place = frame_coordinates(height, width, (top, left), frame)
     setting = isp.reverse(srgb[None], place=place).params
     panels = stage_pictures(augment, srgb, setting, place)
     generator = keyed_generator(seed, "preview")
@@ -107,7 +107,7 @@ def _draw_atoms(isp: DictionaryISP) -> Any:
     _swatches(colour, isp)
     _gain_swatches(gains, isp)
     lens = isp.find(LensShading)
-    mask = lens.mask(place_in_frame(75, 100))[0, 0] if lens else torch.ones(75, 100)
+    mask = lens.mask(frame_coordinates(75, 100))[0, 0] if lens else torch.ones(75, 100)
     image = shading.imshow(mask.numpy(), vmin=0, vmax=1, cmap="gray")
     figure.colorbar(image, ax=shading, shrink=0.6)
     shading.set_title("lens shading mask" if mask.min() < 1 else "lens shading: none", fontsize=9)

@@ -21,7 +21,7 @@ from rawaug.commands import value_of
 from rawaug.experiment import plan
 from rawaug.experiment.plan import settings_of, with_own_pairs
 from rawaug.experiment.recipe import Recipe, find_recipe, kind_of, read_recipe, recipe_list
-from rawaug.registry import EXPERIMENTS, nearest
+from rawaug.registry import EXPERIMENTS, suggest
 
 SHARED = ("channels", "variance_map", "deviation", "domain")
 """Settings that all networks have: they say what a recipe's network is for."""
@@ -191,7 +191,7 @@ def _require_known(settings: type[Any], content: Any, known: Sequence[str], abov
     hints = get_type_hints(settings)
     for key, value in content.items():
         if key not in hints:
-            raise ValueError(f"{above}{key}: no such key{nearest(f'{above}{key}', known)}")
+            raise ValueError(f"{above}{key}: no such key{suggest(f'{above}{key}', known)}")
         part, named = _part(hints[key])
         parts = value.items() if named and isinstance(value, Mapping) else [("", value)]
         for name, one in parts if part else ():

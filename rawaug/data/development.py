@@ -29,7 +29,7 @@ UNKNOWN_COLOUR = (1.0, 1.0, 1.0), torch.eye(3, device="cpu")
 """Gains and matrix where a dataset states none."""
 
 
-def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
+def srgb_from_camera(xyz_to_camera: np.ndarray) -> Tensor:
     """M from the nine numbers of X: white-balanced camera colour to linear sRGB, float32 ``(3, 3)``, row sums 1."""
     camera = np.asarray(xyz_to_camera, np.float64).reshape(3, 3) @ XYZ_FROM_SRGB
     if not (np.isfinite(camera).all() and camera.sum(axis=1).all()):
@@ -37,7 +37,7 @@ def color_matrix(xyz_to_camera: np.ndarray) -> Tensor:
     return torch.from_numpy(np.linalg.inv(camera / camera.sum(axis=1, keepdims=True))).float()
 
 
-def white_balance(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
+def gains_from_neutral(as_shot_neutral: np.ndarray) -> tuple[float, float, float]:
     """Multipliers of R, G, B, green being 1."""
     red, green, blue = (float(value) for value in np.ravel(as_shot_neutral))
     if not (min(red, green, blue) > 0 and max(red, green, blue) < np.inf):

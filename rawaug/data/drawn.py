@@ -29,7 +29,7 @@ from torch.utils.data import Dataset
 
 from rawaug.errors import extra
 from rawaug.registry import PICTURES
-from rawaug.seeding import derived_seed
+from rawaug.seeding import derive_seed
 
 _OVERSAMPLING = 2
 _FLAT_SHARE = 0.25
@@ -163,7 +163,7 @@ class Shapes(Dataset[Tensor]):
 
     def __getitem__(self, index: int) -> Tensor:
         number = range(self.count)[index]
-        return drawn(self.side, np.random.default_rng(derived_seed(self.seed, "shapes", number)))
+        return drawn(self.side, np.random.default_rng(derive_seed(self.seed, "shapes", number)))
 
 
 @PICTURES.register("shapes")

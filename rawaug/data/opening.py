@@ -13,7 +13,7 @@ from rawaug.data.folders import PictureFolder, RawFolder
 from rawaug.data.pair_folder import require_no_pairs
 from rawaug.data.pairs import Binned, LazyPairs, Pair
 from rawaug.io.pictures import MAX_PIXELS
-from rawaug.registry import DATASETS, PICTURES, Registry, checked_settings, nearest
+from rawaug.registry import DATASETS, PICTURES, Registry, check_settings, suggest
 
 _SPLITS = ("train", "validation", "test")
 
@@ -62,7 +62,7 @@ def open_pairs(
         return folder
     reader = _reader(DATASETS, str(spec), kind, path, "a RAW file or folder")
     path, named = _path_and_split(path)
-    chosen = checked_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
+    chosen = check_settings(f"{kind}:", reader, settings, given=("path", "split")) if settings else {}
     pairs: Sequence[Pair] = reader(path, named or split, **chosen)
     if max_pixels is not None and isinstance(pairs, LazyPairs):
         pairs.max_pixels = max_pixels
@@ -109,7 +109,7 @@ def open_pictures(spec: str | Sequence[str], min_side: int = 2, max_pixels: int 
 def _reader(kinds: Registry, spec: str, kind: str, path: str, other: str) -> Callable[[str, Any], Any]:
     if kind not in kinds:
         known = ", ".join(f"{name}:" for name in kinds)
-        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{nearest(kind, kinds)}")
+        raise ValueError(f"{spec}: unknown {kinds.kind}; use {known} or the path of {other}{suggest(kind, kinds)}")
     reader: Callable[[str, Any], Any] = kinds[kind]
     if not path and inspect.signature(reader).parameters["path"].default is inspect.Parameter.empty:
         raise ValueError(f"{spec}: has no path; write {kind}:PATH")

@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rawaug.bayer import CFA, bin_mosaic, binned_variance, to_bayer
+from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, to_bayer
 from rawaug.files import digest
 from rawaug.io import RawFrame
 from rawaug.io.pictures import MAX_PIXELS, decode_srgb, encode_srgb
@@ -155,7 +155,7 @@ class Pair:
         if not min(height, width):
             raise ValueError(f"pair {self.name}: {tuple(self.raw.shape[-2:])} is too small to be binned by {factor}")
         levels: dict[str, Any] = {}
-        left = binned_variance(factor, together)
+        left = bin_mosaic_variance(factor, together)
         if self.shot_var is not None and self.read_var is not None:
             levels |= {"shot_var": self.shot_var * left, "read_var": self.read_var * left}
         if self.own_noise is not None:

@@ -23,7 +23,7 @@ from rawaug.data.pair_folder import clean_pattern, pairs_by_pattern
 from rawaug.data.sidd import find_file
 from rawaug.files import files_below
 from rawaug.io.pictures import read_picture
-from rawaug.registry import nearest
+from rawaug.registry import suggest
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _NAMES = {"cc15": ("*_real.*", "*_mean.*"), "polyu": ("*_real.*", "*_mean.*"), "pictures": ("*_noisy.*", "*_clean.*")}
@@ -75,7 +75,7 @@ def open_picture_pairs(spec: str, noisy: str | None = None, clean: str | None = 
     """
     kind, _, path = spec.partition(":")
     if kind not in KINDS:
-        raise ValueError(f"{spec}: no such pairs of pictures; use one of {', '.join(KINDS)}{nearest(kind, KINDS)}")
+        raise ValueError(f"{spec}: no such pairs of pictures; use one of {', '.join(KINDS)}{suggest(kind, KINDS)}")
     if (noisy or clean) and kind != "pictures":
         raise ValueError(f"{spec}: noisy and clean are patterns of pictures:DIR; omit them")
     folder = Path(path)

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from rawaug import bayer
 from rawaug.bayer import CFA, turn_back
-from rawaug.data.development import UNKNOWN_COLOUR, color_matrix, developed_pair, white_balance
+from rawaug.data.development import UNKNOWN_COLOUR, developed_pair, gains_from_neutral, srgb_from_camera
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import FrameLabel, LazyPairs, Pair, captured_noise, measured_levels
 from rawaug.files import files_below
@@ -162,7 +162,7 @@ class Colour(NamedTuple):
 def colour_of(file: Path) -> Colour:
     tags: dict[str, Any] = read_value(file, "metadata")
     try:
-        gains, matrix = white_balance(tags["AsShotNeutral"]), color_matrix(tags["ColorMatrix2"])
+        gains, matrix = gains_from_neutral(tags["AsShotNeutral"]), srgb_from_camera(tags["ColorMatrix2"])
         return Colour(gains, matrix, view_of_orientation(int(tags.get("Orientation", 1))))
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(f"{file}: has no valid AsShotNeutral and ColorMatrix2 ({error}); download it again") from error

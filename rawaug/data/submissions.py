@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.data.development import color_matrix, white_balance
+from rawaug.data.development import gains_from_neutral, srgb_from_camera
 from rawaug.data.mat import normalised, read_array, read_value
 from rawaug.data.pairs import Lazy, Pair
 from rawaug.data.sidd import BLOCKS, HELD_BACK, Once, blocks_of_scenes, find_file, noise_level_functions, phone_of
@@ -158,7 +158,7 @@ class Dnd(Lazy[RawFrame]):
             size = f"{noisy.shape[1]} x {noisy.shape[2]}"
             raise ValueError(f"{self.file(k)}: box {box + 1} of info.mat extends beyond the frame of {size}")
         mosaic = noisy[:, top:bottom, left:right].contiguous()
-        return RawFrame(mosaic, frame.cfa.shifted(top, left), name=self.names[index], **frame.stated)
+        return RawFrame(mosaic, frame.cfa.shift(top, left), name=self.names[index], **frame.stated)
 
 
 class _Frame(NamedTuple):
@@ -178,8 +178,8 @@ def _frame(info: dict[str, Any], file: Path, index: int) -> _Frame:
             CFA("".join("RGB"[int(colour) - 1] for colour in np.ravel(camera["pattern"]))),
             {
                 "noise_profile": (float(noise["a"]), float(noise["b"])),
-                "white_balance": white_balance(camera["AsShotNeutral"]),
-                "color_matrix": color_matrix(camera["ColorMatrix2"]),
+                "white_balance": gains_from_neutral(camera["AsShotNeutral"]),
+                "color_matrix": srgb_from_camera(camera["ColorMatrix2"]),
             },
         )
     except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:

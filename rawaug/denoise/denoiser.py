@@ -22,18 +22,18 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers.classical import Stabilised
-from denoisers.files import find, shipped
-from denoisers.mosaic import MosaicDRUNet, OfBayer, of_pattern
+from denoisers.files import find, list_shipped
+from denoisers.mosaic import BayerAdapter, MosaicDRUNet, denoise_mosaic
 from denoisers.network import PACKED
 from rawaug import bayer
-from rawaug.bayer import CFA, aligned, noise_variance
+from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.denoise.foreign import AGAIN, STRIDE, BiasFreeDnCNN, OnnxNetwork, published_pmrid
 from rawaug.files import parse_object, read_header, read_tensors, sha256
 from rawaug.io import RawFrame
-from rawaug.kernels.runtime import fast_in_bfloat16, find_device
+from rawaug.kernels.runtime import find_device, has_fast_bfloat16
 from rawaug.noise import anscombe
 from rawaug.progress import progress
-from rawaug.registry import DENOISERS, FILTERS, Spec, label_of, name_and_settings, nearest
+from rawaug.registry import DENOISERS, FILTERS, Spec, spec_label, split_spec, suggest
 
 Levels = tuple[float, float]
 """(shot_var, read_var)."""
@@ -63,7 +63,7 @@ class Noisy(NamedTuple):
     @classmethod
     def told(cls, image: Tensor, levels: Levels, cfa: CFA | str) -> Noisy:
         """Packed RAW ``(1, 4, h, w)``, or a mosaic, with the variance of these levels."""
-        return cls(image, noise_variance(image, *levels), levels, bayer.layout(cfa))
+        return cls(image, noise_variance(image, *levels), levels, bayer.canonical_cfa(cfa))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,7 @@ class RawDenoiser:
         if isinstance(network, nn.Module) and not isinstance(network, OnnxNetwork):
             where = find_device(str(device))
             network.to(where, memory_format=torch.channels_last)  # type: ignore[call-overload]
-            mixed = precision == "auto" and getattr(network, "mixed", False) and fast_in_bfloat16(where)
+            mixed = precision == "auto" and getattr(network, "mixed", False) and has_fast_bfloat16(where)
             changes = {"device": where, "mixed": mixed, **changes}
         made = replace(found, **changes)
         return replace(made, settings={**made.settings, "self_ensemble": made.views > 1}) if made.settings else made
@@ -200,7 +200,7 @@ class RawDenoiser:
         run = partial(denoisers.tiled, self.of_any, tile=2 * self.tiles[0], each=counted("tile"))
         image, variance = (x.to(self.device) for x in (given.image, given.variance))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            denoised = of_pattern(run, image, variance, given.cfa).cpu()
+            denoised = denoise_mosaic(run, image, variance, given.cfa).cpu()
         if self.checked and not denoised.isfinite().all():
             raise ValueError(f"{self.name}: the result is not finite")
         return denoised
@@ -249,7 +249,7 @@ def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
     if own == cfa:
         return image
     packed = image.shape[1] == PACKED
-    upright = aligned(bayer.unpack(image, own) if packed else image, own, cfa)
+    upright = crop_to_cfa(bayer.unpack(image, own) if packed else image, own, cfa)
     return bayer.pack(upright, cfa) if packed else upright
 
 
@@ -258,7 +258,7 @@ def _cropped(image: Tensor, own: CFA, cfa: CFA) -> Tensor:
 
 def shipped_of_mosaics() -> list[str]:
     """The shipped networks that denoise the mosaic and leave demosaicing to others."""
-    return [name for name in shipped() if _denoises_mosaics(read_header(find(name)))]
+    return [name for name in list_shipped() if _denoises_mosaics(read_header(find(name)))]
 
 
 def _denoises_mosaics(header: Mapping[str, str]) -> bool:
@@ -271,7 +271,7 @@ def require_classical(specs: Sequence[Spec]) -> None:
     for spec in specs:
         reason = FILTERS.make(spec).missing()
         if reason is not None:
-            raise ValueError(f"classical: {name_and_settings(spec)[0]}: {reason}")
+            raise ValueError(f"classical: {split_spec(spec)[0]}: {reason}")
 
 
 def _found(spec: Any, name: str | None) -> RawDenoiser:
@@ -285,13 +285,13 @@ def _found(spec: Any, name: str | None) -> RawDenoiser:
     if path.suffix == ".onnx":
         network = OnnxNetwork(path)
         return replace(_of_network(path.stem, network, network.info), settings=_hashed(path))
-    if path.suffix or str(spec) in shipped():
+    if path.suffix or str(spec) in list_shipped():
         return replace(_of_weights(find(spec)), settings=_hashed(find(spec)))
     if str(spec) in FILTERS:
         return _of_filter(str(spec))
-    known = [*shipped(), *FILTERS]
+    known = [*list_shipped(), *FILTERS]
     raise ValueError(
-        f"{spec}: no such denoiser{nearest(spec, known)}; give one of {', '.join(known)}, a .safetensors or an .onnx"
+        f"{spec}: no such denoiser{suggest(spec, known)}; give one of {', '.join(known)}, a .safetensors or an .onnx"
     )
 
 
@@ -317,10 +317,10 @@ def _of_weights(path: Path) -> RawDenoiser:
 def _of_network(name: str, network: nn.Module, info: Mapping[str, Any]) -> RawDenoiser:
     """A network; one that does not say so takes a variance if its ``forward`` has two arguments."""
     of_any = network if isinstance(network, MosaicDRUNet) else None
-    network = network if of_any is None else OfBayer(of_any)
+    network = network if of_any is None else BayerAdapter(of_any)
     reads = getattr(network, "reads_variance", None)
     reads = _takes_two(network.forward) if reads is None else reads
-    if not isinstance(network, (denoisers.Denoiser, OfBayer, OnnxNetwork, BiasFreeDnCNN)):
+    if not isinstance(network, (denoisers.Denoiser, BayerAdapter, OnnxNetwork, BiasFreeDnCNN)):
         network = _Foreign(network, bool(reads))
     made = network.eval()
     upscale, own = getattr(made, "upscale", 1), CFA(info.get("cfa", "RGGB"))
@@ -350,7 +350,7 @@ def _of_filter(spec: Spec) -> RawDenoiser:
         """Noise of an unknown law is taken for white, at the mean level of its map."""
         return denoiser if levels is None else partial(stabilised, shot_var=levels[0], read_var=levels[1])
 
-    return RawDenoiser(name=label_of(spec), model=model, tiles=FILTER_TILES, settings={"classical": spec})
+    return RawDenoiser(name=spec_label(spec), model=model, tiles=FILTER_TILES, settings={"classical": spec})
 
 
 def _of_function(function: Callable[..., Any], name: str | None) -> RawDenoiser:

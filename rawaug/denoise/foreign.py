@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import denoisers
-from denoisers.domains import levels_of
+from denoisers.domains import fit_levels
 from rawaug.errors import extra
 from rawaug.files import parse_object, read_tensors
 from rawaug.noise import anscombe
@@ -123,7 +123,7 @@ class BiasFreeDnCNN(nn.Module):
 
     def forward(self, noisy: Tensor, variance: Tensor) -> Tensor:
         """Packed RAW ``(B, 4, h, w)`` denoised; ``variance`` is a map ``shot_var max(noisy, 0) + read_var``."""
-        shot, read = (level.flatten() for level in levels_of(noisy, variance))
+        shot, read = (level.flatten() for level in fit_levels(noisy, variance))
         black, white = (anscombe.forward(noisy.new_full((1, 1, 1, 1), y), shot, read) for y in (0.0, 1.0))
         u = (anscombe.forward(noisy, shot, read) - black) / (white - black)
         planes = self._grey(u.flatten(0, 1)[:, None]).reshape(noisy.shape)

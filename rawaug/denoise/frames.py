@@ -211,7 +211,7 @@ def _file_denoised(
 def _clip_below_zero(mosaic: Tensor, frame: RawFrame) -> float:
     """Clip, in place, what a digital number cannot hold; its share of the sites."""
     below = 0
-    cell = bayer.sites(frame.cfa)
+    cell = bayer.plane_indices(frame.cfa)
     for i, j in product(range(len(cell)), repeat=2):
         plane, black = mosaic[0, i :: len(cell), j :: len(cell)], frame.black[cell[i, j]]
         lowest = -black / (frame.white - black)

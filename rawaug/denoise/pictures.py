@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import denoisers
-from denoisers.files import find, shipped
+from denoisers.files import find, list_shipped
 from rawaug.denoise.denoiser import CPU, Noisy, counted
 from rawaug.denoise.foreign import AGAIN, published_ffdnet
 from rawaug.errors import extra
@@ -28,7 +28,7 @@ from rawaug.files import files_in, read_tensors, require_writable
 from rawaug.io.picture_files import PICTURE_FORMATS, StoredPicture, read_stored, write_stored
 from rawaug.kernels.runtime import find_device
 from rawaug.progress import progress
-from rawaug.registry import FILTERS, Spec, label_of, nearest
+from rawaug.registry import FILTERS, Spec, spec_label, suggest
 
 PICTURES = "rawaug-srgb"
 """What denoises pictures where no denoiser is named."""
@@ -86,7 +86,7 @@ class PictureDenoiser:
             planes = (srgb[0] / deviation).permute(1, 2, 0).contiguous().numpy()
             return torch.from_numpy(deviation * denoiser.denoise(planes)).permute(2, 0, 1)[None].float()
 
-        return cls(label_of(spec) if level is None else f"{label_of(spec)}, told {255.0 * level:.3g}", run)
+        return cls(spec_label(spec) if level is None else f"{spec_label(spec)}, told {255.0 * level:.3g}", run)
 
     @classmethod
     def of_network(cls, name: str, network: nn.Module, device: str = "cpu", strength: float = 1.0) -> PictureDenoiser:
@@ -119,9 +119,11 @@ def _level(spec: str, told: str) -> float:
 
 def _network(spec: str) -> tuple[str, nn.Module]:
     """The name and the network of a file, which has three channels."""
-    if not Path(spec).suffix and spec not in shipped():
-        raise ValueError(f"{spec}: no such denoiser of pictures{nearest(spec, shipped())}; give one of {PICTURES}, or "
-                         "a .safetensors of rawaug run srgb or of FFDNet's authors")  # fmt: skip
+    if not Path(spec).suffix and spec not in list_shipped():
+        raise ValueError(
+            f"{spec}: no such denoiser of pictures{suggest(spec, list_shipped())}; give one of {PICTURES}, or "
+            "a .safetensors of rawaug run srgb or of FFDNet's authors"
+        )
     path = find(spec)
     metadata, tensors = read_tensors(path, AGAIN)
     if "conv00.weight" in tensors and metadata.get("format") != "rawaug":

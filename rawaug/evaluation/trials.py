@@ -20,7 +20,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.bayer import CFA, aligned, noise_variance
+from rawaug.bayer import CFA, crop_to_cfa, noise_variance
 from rawaug.data.development import develop_packed, exposure_of
 from rawaug.data.folders import Cached
 from rawaug.data.pairs import Pair, SomePairs
@@ -97,10 +97,10 @@ def trial_of(pair: Pair, noise: NoiseModel, cfa: CFA | str | None = None, seed: 
         about: other attributes, such as ``condition``.
     """
     pair, cfa = pair.with_levels(), CFA(pair.cfa if cfa is None else cfa)
-    clean = bayer.pack(aligned(pair.raw, pair.cfa, cfa)[None], cfa)
+    clean = bayer.pack(crop_to_cfa(pair.raw, pair.cfa, cfa)[None], cfa)
     levels: Levels | None
     if pair.noisy is not None and pair.shot_var is not None and pair.read_var is not None:
-        noisy, levels = bayer.pack(aligned(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var)
+        noisy, levels = bayer.pack(crop_to_cfa(pair.noisy, pair.cfa, cfa)[None], cfa), (pair.shot_var, pair.read_var)
         variance = noise_variance(noisy, *levels)
     else:
         params = noise.sample(1, keyed_generator(seed, "test noise", pair.name))

@@ -17,8 +17,8 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.registry import ESTIMATORS, SRGB_NOISE, label_of
-from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.registry import ESTIMATORS, SRGB_NOISE, spec_label
+from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.training.estimators import SelfSupervised
 from rawaug.training.noisy_frames import FrozenPictures, NoisyCrops, held_out, noisy_frame
 from rawaug.training.srgb_noise import NoisyPictures
@@ -30,7 +30,7 @@ WATCHED = 16
 
 def methods_of(recipe: Recipe) -> dict[str, str]:
     """What each row of the table is, in a line."""
-    filters = {label_of(spec): "a filter, nothing is trained" for spec in recipe.classical}
+    filters = {spec_label(spec): "a filter, nothing is trained" for spec in recipe.classical}
     unchanged = {Path(name).stem: "trained weights as they are" for name in recipe.untouched}
     return {**filters, **unchanged, **{label: _explained(recipe, label) for label in recipe.arms}}
 
@@ -40,7 +40,7 @@ def _explained(recipe: Recipe, label: str) -> str:
     begun = f"{network.name} from random weights" if network.start is None else f"{network.start}, trained further"
     real, made = "real pairs" if arm.sees_clean else "real noisy frames", "RAW made from pictures"
     mixed = f"{real}, with {made} as {arm.augmented:.0%} of a batch"
-    how = "" if arm.sees_clean else f", by {label_of(arm.estimator)}"
+    how = "" if arm.sees_clean else f", by {spec_label(arm.estimator)}"
     frames = {0.0: real, 1.0: made}.get(arm.augmented, mixed)
     return f"{begun}, on {frames}{how}"
 
@@ -69,7 +69,7 @@ def training_stream(
     seed: int,
 ) -> TrainingStream:
     """The training samples of one arm."""
-    crop, seed, estimator = recipe.train.crop, derived_seed(seed, "stream"), ESTIMATORS.make(arm.estimator)
+    crop, seed, estimator = recipe.train.crop, derive_seed(seed, "stream"), ESTIMATORS.make(arm.estimator)
     real: Source | None = None
     made: Source | None = None
     augment: RawAugment | None = None
@@ -82,7 +82,7 @@ def training_stream(
         if frames and arm.augmented < 1.0:
             real = NoisyCrops(frames, estimator, crop, isp.cfa)
         if augment:
-            frozen = FrozenPictures(pictures, augment, derived_seed(seed, "pictures"), estimator.shots)
+            frozen = FrozenPictures(pictures, augment, derive_seed(seed, "pictures"), estimator.shots)
             made = NoisyCrops(frozen, estimator, crop, isp.cfa)
     else:
         real = RealCrops(frames, noise, crop, isp.cfa) if frames else None
@@ -96,7 +96,7 @@ def validation_samples(
     """The frozen samples by which weights are chosen, the same in every arm and run."""
     augment = RawAugment(isp, noise, target=recipe.target)
     if recipe.self_supervised:
-        frozen = frames or FrozenPictures(pictures, augment, derived_seed("validation"))[:WATCHED]
+        frozen = frames or FrozenPictures(pictures, augment, derive_seed("validation"))[:WATCHED]
         return [Trial(*sample) for sample in held_out(frozen, isp.cfa)]
     if frames:
         return [trial_of(pair, noise, isp.cfa) for pair in frames]

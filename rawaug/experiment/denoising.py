@@ -42,8 +42,8 @@ from rawaug.files import find_weights, fingerprint, one_at_a_time, sha256, write
 from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, camera_law, noise_model
 from rawaug.plugin.augment import noise_for
-from rawaug.progress import timed
-from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, label_of, name_and_settings
+from rawaug.progress import time_stage
+from rawaug.registry import ESTIMATORS, EXPERIMENTS, FILTERS, Spec, spec_label, split_spec
 from rawaug.training.config import weights_key
 from rawaug.training.loop import require_trainable, train
 from rawaug.training.noisy_frames import faintness_note, noisy_only
@@ -164,7 +164,7 @@ class TrainingRun:
         start = self.starts[arm]
         return isp.cfa if start is None else start.cfa
 
-    @timed("fit")
+    @time_stage("fit")
     def fitted_isp(self, seed: int) -> DictionaryISP:
         """The ISP of the few pairs, or the recipe's own."""
         if self.recipe.camera is not None:
@@ -186,7 +186,7 @@ class TrainingRun:
         isp.save(path)
         return isp
 
-    @timed("training")
+    @time_stage("training")
     def trained(self, arm: str, isp: DictionaryISP, noise: NoiseModel, seed: int) -> Denoiser:
         recipe, place = self.recipe, self.place(arm, seed)
         path = place / "denoiser.safetensors"
@@ -244,7 +244,7 @@ class TrainingRun:
         samples = (seed, *real, *pictures, *how)
         return weights_key(recipe.network_of(arm), recipe.loop_of(arm), samples, validation)
 
-    @timed("scores of the arms")
+    @time_stage("scores of the arms")
     def evaluated(self, arm: str, model: Denoiser, noise: NoiseModel, isp: DictionaryISP, seed: int) -> dict[str, Any]:
         """Plain and self-ensemble scores on the test frames."""
         path = self.place(arm, seed) / "evaluation.json"
@@ -335,17 +335,17 @@ class TrainingRun:
         summaries = [scores for runs in results.values() for run in runs for scores in run.values()]
         require_numbers([*summaries, *classical.values()])
 
-    @timed("other denoisers")
+    @time_stage("other denoisers")
     def compared(self, others: Sequence[RawDenoiser], noise: NoiseModel, isp: DictionaryISP) -> dict[str, list[Row]]:
         """The rows of what the arms are compared with."""
         return self.scored(others, noise, isp, "other denoisers") if others else {}
 
-    @timed("report")
+    @time_stage("report")
     def pictured(self, page: Page, denoisers: Sequence[RawDenoiser], trials: Sequence[Trial]) -> Path:
         """Write the page, with curves and frames, and the picture; of the classical denoisers they show the first."""
         logs = {arm: [self.place(arm, seed) / "log.csv" for seed in self.seeds] for arm in self.recipe.arms}
         page.add_curves(draw_curves(logs))
-        hidden = [label_of(spec) for spec in self.classical[1:]]
+        hidden = [spec_label(spec) for spec in self.classical[1:]]
         shown = [one for one in denoisers if one.name not in hidden]
         rows: list[Panels] = []
         for trial in shown_on_page(trials):
@@ -366,7 +366,7 @@ class TrainingRun:
         elif untouched := [name for name in self.recipe.untouched if Path(name).stem == chosen]:
             what = f"--denoiser {untouched[0]}"
         elif chosen in others:
-            spec = next(spec for spec in self.classical if label_of(spec) == chosen)
+            spec = next(spec for spec in self.classical if spec_label(spec) == chosen)
             what = f"--classical {spec if isinstance(spec, str) else shlex.quote(json.dumps(spec))}"
         else:
             return [*lines, "to use: nothing, the frames are best as they are"]
@@ -392,7 +392,7 @@ def installed_classical(specs: Sequence[Spec], shown: bool = True) -> list[Spec]
     ``shown``.
     """
     bm3d = {"BM3D": FILTERS["BM3D"].missing()}
-    kept = [spec for spec in specs if not bm3d.get(name_and_settings(spec)[0])]
+    kept = [spec for spec in specs if not bm3d.get(split_spec(spec)[0])]
     if shown and len(kept) < len(specs):
         print(f"classical: BM3D is left out: {bm3d['BM3D']}")
     require_classical(kept)

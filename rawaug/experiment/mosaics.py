@@ -32,7 +32,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.augment import RawAugment
 from rawaug.registry import EXPERIMENTS
-from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.training.mosaics import MosaicCrops
 from rawaug.training.stream import TrainingStream
 
@@ -83,7 +83,7 @@ def mosaic_trial(pair: Pair, cfa: str, noise: NoiseModel, seed: int = 0) -> Tria
     levels = (params["shot_var"].item(), params["read_var"].item()) if "shot_var" in params else None
     develop = partial(developed, pair=pair, exposure=exposure_of(bayer.pack_rgb(rgb, CFA.RGGB), pair))
     way = {"demosaiced": partial(demosaiced, pair=pair, cfa=cfa)}
-    about: dict[str, Any] = {"condition": cfa, "levels": levels, "cfa": bayer.layout(cfa), "develop": develop}
+    about: dict[str, Any] = {"condition": cfa, "levels": levels, "cfa": bayer.canonical_cfa(cfa), "develop": develop}
     return Trial(raw, rgb, variance, pair.name, "rgb", ways=way, **about)
 
 
@@ -130,7 +130,7 @@ class MosaicRun(TrainingRun):
         recipe, own = self.recipe, self.recipe.arms[arm]
         augment = RawAugment(isp, noise, own.sampling, own.strength, exposure=own.exposure)
         crops = MosaicCrops(self.pictures, augment, recipe.train.crop, own.zoom, recipe.patterns)
-        return TrainingStream(None, crops, recipe.train.batch, 1.0, derived_seed(seed, "stream"))
+        return TrainingStream(None, crops, recipe.train.batch, 1.0, derive_seed(seed, "stream"))
 
     def watched(self, isp: DictionaryISP, noise: NoiseModel) -> list[Trial]:
         frames = self.frames["validation"]

@@ -14,7 +14,7 @@ from rawaug.files import yaml_value
 from rawaug.isp.fit import FitConfig
 from rawaug.kernels.runtime import find_device
 from rawaug.plugin.targets import Target, Targets
-from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, name_and_settings, nearest, require_between
+from rawaug.registry import ESTIMATORS, EXPERIMENTS, SRGB_NOISE, require_between, split_spec, suggest
 from rawaug.training.config import MOST, DenoiserConfig, TrainConfig, Weighing
 
 SHORT_CROP = 256
@@ -146,7 +146,7 @@ class ArmConfig:
         """This arm by its name ``label``; with a search an arm for each value, ``LABEL_KEYVALUE``."""
         if self.search is None:
             return {label: self}
-        name, settings = name_and_settings(self.estimator)
+        name, settings = split_spec(self.estimator)
         if len(self.search) != 1 or not all(self.search.values()):
             raise ValueError(f"arms: {label}: search needs one setting with values, such as {{gamma: [2, 8, 16]}}")
         key, values = next(iter(self.search.items()))
@@ -159,7 +159,7 @@ class ArmConfig:
     @property
     def sees_clean(self) -> bool:
         """Whether the estimator needs clean frames."""
-        name, _ = name_and_settings(self.estimator)
+        name, _ = split_spec(self.estimator)
         return bool(ESTIMATORS[name].sees_clean)
 
 
@@ -238,7 +238,7 @@ class Recipe:
                     SRGB_NOISE.make(arm.srgb_noise)
                     if self.target != "srgb":
                         raise ValueError(f"srgb_noise is for target 'srgb', not {self.target!r}; omit it")
-                name, _ = name_and_settings(arm.estimator)
+                name, _ = split_spec(arm.estimator)
                 weigh, known = self.loop_of(label).weigh, ESTIMATORS[name].weighings
                 if weigh not in known:
                     raise ValueError(f"weigh: {weigh} is not for noisy targets of {name}; use {' or '.join(known)}")
@@ -320,5 +320,5 @@ def find_recipe(name: str) -> Path:
     wanted = path.with_suffix("").as_posix() if path.suffix == ".yaml" else path.as_posix()
     if wanted in known:
         return known[wanted]
-    shipped = f"{', '.join(known)}{nearest(wanted, known)}"
+    shipped = f"{', '.join(known)}{suggest(wanted, known)}"
     raise FileNotFoundError(f"{name}: no such recipe; give a YAML file or a shipped recipe: {shipped}")

@@ -41,7 +41,7 @@ from rawaug.isp.model import DictionaryISP
 from rawaug.noise import NoiseModel, noise_model
 from rawaug.plugin.targets import Target
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, Spec, label_of, name_and_settings
+from rawaug.registry import EXPERIMENTS, Spec, spec_label, split_spec
 from rawaug.seeding import keyed_generator
 
 BLACK, WHITE = 8192.0, 65535.0
@@ -83,7 +83,7 @@ class SrgbRecipe(Recipe):
             if network.start is None and given != (3, False):
                 raise ValueError("denoiser.settings: a blind network of sRGB has channels: 3, variance_map: false")
         for spec in self.classical:
-            if (name := name_and_settings(spec)[0]) not in _WITHOUT_PLANES:
+            if (name := split_spec(spec)[0]) not in _WITHOUT_PLANES:
                 raise ValueError(f"classical: {name} is for RAW; on sRGB use one of {', '.join(_WITHOUT_PLANES)}")
 
     @property
@@ -224,7 +224,7 @@ def developed(mosaic: Tensor, pair: Pair) -> Tensor:
 
 def best_filter(spec: Spec, trials: Sequence[Trial]) -> PictureDenoiser:
     """The filter of the deviation with the highest mean PSNR on these trials."""
-    filters = [replace(PictureDenoiser.of_filter(spec, level), name=label_of(spec)) for level in DEVIATIONS]
+    filters = [replace(PictureDenoiser.of_filter(spec, level), name=spec_label(spec)) for level in DEVIATIONS]
     return max(filters, key=lambda one: fmean(row.psnr for row in score([one], trials)))
 
 

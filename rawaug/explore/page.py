@@ -23,7 +23,7 @@ from rawaug.errors import MissingExtra, escape, extra
 from rawaug.explore.view_state import Look, command, iso_range, loaded, noises_of, possible, python, tones_of
 from rawaug.explore.views import VIEWS, Panel, denoised, seen_in
 from rawaug.files import WEIGHTS
-from rawaug.isp.cameras import LAMPS, published_cameras
+from rawaug.isp.cameras import LAMPS, load_cameras
 from rawaug.plugin.sampling_config import SamplingConfig
 
 STYLE = """
@@ -151,7 +151,7 @@ def build(pictures: Sequence[Path], names: Sequence[str] | None = None) -> Any:
 
 def _controls(gr: Any, choices: Sequence[tuple[str, str]]) -> dict[str, Any]:
     isps, usual, made = sorted(file.stem for file in WEIGHTS.glob("*.safetensors")), SamplingConfig(), dict[str, Any]()
-    cameras = sorted(set(published_cameras().names), key=str.casefold)
+    cameras = sorted(set(load_cameras().names), key=str.casefold)
     whole = {"num_choices_shown": None}  # in a list that is shown in part, a retyped choice gives way to the first one
     with gr.Group():
         made["picture"] = gr.Dropdown(choices, value=choices[0][1] if choices else None, label="Picture", **whole)

@@ -27,7 +27,7 @@ from rawaug.explore import figures
 from rawaug.explore.view_state import Drawn, Look, drawn
 from rawaug.io import encode_srgb
 from rawaug.isp.config import ISPParams
-from rawaug.isp.stages import place_in_frame
+from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.pictures import even_sided
@@ -219,7 +219,7 @@ def _developed(made: Drawn, part: Tensor, scale: int = 1) -> np.ndarray:
     """The central part of RAW, or of linear RGB at 1 / ``scale`` of the size, developed by a draw's own setting."""
     rgb = part if scale > 1 else pattern(made.augment.cfa).demosaic(made.augment.mosaic(part)[None])[0]
     top, left, height, width = (place // scale for place in (*_centre(made.srgb)[:2], *made.srgb.shape[-2:]))
-    place = place_in_frame(rgb.shape[-2], rgb.shape[-1], (top, left), (height, width))
+    place = frame_coordinates(rgb.shape[-2], rgb.shape[-1], (top, left), (height, width))
     return _to_uint8(made.augment.isp.forward_pixels(rgb[None], _batched(made.pair.params.isp), place)[0])
 
 

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from rawaug import __version__
-from rawaug.bayer import pattern, sites
+from rawaug.bayer import pattern, plane_indices
 from rawaug.errors import extra
 from rawaug.files import replacing
 from rawaug.io.gain_map import GainMap, of_planes, opcode_list
@@ -149,7 +149,7 @@ def digital_numbers(frame: RawFrame, path: Path) -> np.ndarray:
     if not 0 <= min(frame.black) <= max(frame.black) < frame.white < _BEYOND_16_BITS:
         raise ValueError(f"{path}: levels must be 0 <= black < white <= 65535, got {frame.black} and {frame.white}")
     numbers = np.empty((height, width), np.uint16)
-    cell = sites(frame.cfa)
+    cell = plane_indices(frame.cfa)
     for i, j in product(range(len(cell)), repeat=2):
         black, site = frame.black[cell[i, j]], (slice(i, None, len(cell)), slice(j, None, len(cell)))
         plane = frame.mosaic[0][site].double().mul_(frame.white - black).add_(black).round_()
@@ -197,7 +197,7 @@ def _opcodes(code: int, maps: Sequence[GainMap]) -> Tags:
 
 
 def _tags_of_the_mosaic(frame: RawFrame) -> Tags:
-    known, kinds = pattern(frame.cfa), sites(frame.cfa).flatten().tolist()
+    known, kinds = pattern(frame.cfa), plane_indices(frame.cfa).flatten().tolist()
     size = known.period
     repeats = size if size == 2 or len(set(frame.black)) > 1 else 1  # LibRaw states one level of X-Trans, if it is one
     levels = [frame.black[kind] for kind in kinds[: repeats**2]]

@@ -28,7 +28,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from rawaug.bayer import CFA, named, sites
+from rawaug.bayer import CFA, pattern_name, plane_indices
 from rawaug.errors import extra
 from rawaug.io.gain_map import GainMap, gains_at_sites
 from rawaug.io.pictures import require_utf8
@@ -313,7 +313,7 @@ def _tiled(cell: np.ndarray, height: int, width: int) -> np.ndarray:
 
 def _of_planes(black: np.ndarray, cfa: str) -> tuple[float, float, float, float]:
     """Levels of R, Gr, Gb, B from those of the cell; where all greens are one, its mean twice."""
-    kinds = sites(cfa).numpy()
+    kinds = plane_indices(cfa).numpy()
     means = [float(black[kinds == kind].mean()) if (kinds == kind).any() else None for kind in range(4)]
     red, green, other, blue = (means[1] if level is None else level for level in means)
     assert red is not None and green is not None and other is not None and blue is not None
@@ -351,7 +351,7 @@ def _cell(path: Path, raw: Any, tags: TiffTags) -> tuple[np.ndarray, str]:
     elif shape in ((2, 2), (6, 6)) and raw.raw_type != _stack():
         cell = np.asarray(raw.raw_colors_visible[: shape[0], : shape[1]])
     colours = raw.color_desc.decode("ascii", "replace")
-    name = named(["".join(colours[k] for k in row) for row in cell]) if colours == "RGBG" else None
+    name = pattern_name(["".join(colours[k] for k in row) for row in cell]) if colours == "RGBG" else None
     if name is None or (len(cell) == 2 and set(cell.flat) != {0, 1, 2, 3}):
         raise ValueError(f"{path}: has no mosaic of a known pattern but {_kind(raw)}; {_KNOWN}")
     return cell, CFA(name) if len(cell) == 2 else name

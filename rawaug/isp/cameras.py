@@ -30,8 +30,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rawaug.camera_names import spelled
-from rawaug.registry import nearest
+from rawaug.camera_names import find_camera
+from rawaug.registry import suggest
 
 Array = NDArray[np.float64]
 """Lights are a few numbers a batch, on the CPU: NumPy's calls cost a fifth of PyTorch's."""
@@ -51,13 +51,13 @@ class CameraMatrices(NamedTuple):
     names: tuple[str, ...]
     xyz_to_camera: Tensor
 
-    def named(self, names: Sequence[str]) -> Tensor:
+    def select(self, names: Sequence[str]) -> Tensor:
         """The matrices ``(len(names), 3, 3)`` of these cameras, whatever the case of the letters."""
-        return self.xyz_to_camera[[self.names.index(spelled(name, self.names)) for name in names]]
+        return self.xyz_to_camera[[self.names.index(find_camera(name, self.names)) for name in names]]
 
 
 @cache
-def published_cameras() -> CameraMatrices:
+def load_cameras() -> CameraMatrices:
     """The cameras of the package's table; where two sources name one camera LibRaw's comes first."""
     text = resources.files("rawaug.isp").joinpath("facts/camera_matrices.tsv").read_text("utf-8")
     rows = [line.split("\t") for line in text.splitlines()[2:]]
@@ -67,7 +67,7 @@ def published_cameras() -> CameraMatrices:
     return CameraMatrices(tuple(f"{maker} {model}" for maker, model, *_ in rows), matrices / green)
 
 
-def colour_matrix(xyz_to_camera: Tensor) -> Tensor:
+def camera_from_srgb(xyz_to_camera: Tensor) -> Tensor:
     """C, linear sRGB to white-balanced camera RGB: ``(..., 3, 3)`` whose rows sum to 1."""
     matrix = xyz_to_camera @ SRGB_TO_XYZ.to(xyz_to_camera)
     return matrix / matrix.sum(dim=-1, keepdim=True)
@@ -78,7 +78,7 @@ def responses(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
     return torch.einsum("...ij,...j->...i", xyz_to_camera, light.to(xyz_to_camera))
 
 
-def white_balance(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
+def gains_in_light(xyz_to_camera: Tensor, light: Tensor) -> Tensor:
     """Gains ``(..., 3)`` that make a white surface grey under a light of white point ``(..., 3)``; green is 1."""
     response = responses(xyz_to_camera, light)
     return response[..., 1:2] / response
@@ -140,7 +140,7 @@ def light_range(light: float | str | None) -> LightRange:
         return PHOTOGRAPHS
     if isinstance(light, str):
         if light not in LAMPS:
-            listed, near = ", ".join(LAMPS), nearest(light, LAMPS)
+            listed, near = ", ".join(LAMPS), suggest(light, LAMPS)
             raise ValueError(f"light {light!r} is unknown; use a colour temperature or one of {listed}{near}")
         return PHOTOGRAPHS._replace(lamps=1.0, among=np.array([LAMPS[light]]))
     if not WARMEST <= light <= COLDEST:
@@ -162,7 +162,7 @@ def daylight(kelvin: Array) -> Array:
     return np.stack([x, (2.87 - 3.0 * x) * x - 0.275], axis=-1)
 
 
-def off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
+def move_off_locus(xy: Array, kelvin: Array, duv: Array) -> Array:
     """``xy`` ``(..., 2)`` moved by ``duv`` ``(...)`` along the Planckian locus' normal at ``kelvin`` ``(...)``."""
     rate = _planckian_uv(kelvin)[1]
     normal = rate[..., ::-1] * (1.0, -1.0)  # to higher v: the locus runs to lower u as it gets hotter
@@ -189,7 +189,7 @@ def sample_lights(batch: int, generator: torch.Generator, lights: LightRange = A
     on_daylight &= temperature >= DAYLIGHT_FROM
     xy = np.where(on_daylight[:, None], daylight(np.maximum(temperature, DAYLIGHT_FROM)), planckian(temperature))
     lamp = among[(drawn[:, 3] * len(among)).astype(np.int64)]
-    return _white_point(off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
+    return _white_point(move_off_locus(np.where(drawn[:, 2:3] < lamps, lamp, xy), temperature, duv))
 
 
 def _planckian_uv(kelvin: Array) -> tuple[Array, Array]:

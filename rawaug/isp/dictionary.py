@@ -29,9 +29,9 @@ from rawaug.isp.cameras import (
     XYZ_TO_SRGB,
     Array,
     LightRange,
-    colour_matrix,
+    camera_from_srgb,
+    gains_in_light,
     sample_lights,
-    white_balance,
     white_point,
 )
 from rawaug.isp.config import ISPParams
@@ -47,7 +47,7 @@ _ROUNDS = 100
 _STEPS = 400
 
 
-def l1_normalised(matrices: Tensor) -> Tensor:
+def l1_normalise(matrices: Tensor) -> Tensor:
     """``(..., 3, 3)`` with every row divided by its l1 norm."""
     return F.normalize(matrices, p=1.0, dim=-1)
 
@@ -71,7 +71,7 @@ class ColourDictionary(nn.Module):
 
     def atoms(self) -> Tensor:
         """``(N, 3, 3)``, rows of l1 norm 1."""
-        return l1_normalised(self.matrices)
+        return l1_normalise(self.matrices)
 
     def combine(self, weights: Tensor) -> Tensor:
         """Weights ``(B, N)`` to matrices ``(B, 3, 3)``."""
@@ -110,8 +110,8 @@ class CameraDictionary(ColourDictionary):
     @torch.no_grad()
     def set_cameras(self, xyz_to_camera: Tensor, known: Tensor) -> None:
         """Take matrices ``(N, 3, 3)`` from XYZ to camera for the atoms, and weights ``(P, N)`` of the known cameras."""
-        self.matrices.copy_(colour_matrix(xyz_to_camera))
-        self.light.copy_(log_light(white_balance(xyz_to_camera, white_point(D65))))
+        self.matrices.copy_(camera_from_srgb(xyz_to_camera))
+        self.light.copy_(log_light(gains_in_light(xyz_to_camera, white_point(D65))))
         self.known.copy_(known)
 
     def atoms(self) -> Tensor:
@@ -250,7 +250,7 @@ class CameraSampler:
             drawn = np.einsum("bm,bmn->bn", shares.numpy(), self.known[chosen.numpy()])
             light = sample_lights(len(open_), generator, self.lights)
             weights[open_], balance[open_] = drawn, self.balance(drawn, light)
-            open_ = open_[~plausible(balance[open_])]
+            open_ = open_[~is_plausible(balance[open_])]
             if not len(open_):
                 return weights, balance
         raise ValueError(
@@ -264,7 +264,7 @@ class CameraSampler:
         return np.asarray(response[:, 1:2] / response)
 
 
-def plausible(balance: Array) -> NDArray[np.bool_]:
+def is_plausible(balance: Array) -> NDArray[np.bool_]:
     """Which white balances ``(B, 3)`` are within :data:`PLAUSIBLE_GAINS`, ``(B,)``."""
     low, high = PLAUSIBLE_GAINS
     return np.asarray(((balance >= low) & (balance <= high)).all(axis=1))

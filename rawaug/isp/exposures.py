@@ -25,7 +25,7 @@ from torch import Tensor
 
 from rawaug.isp.config import ISPParams, ISPResult
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import WhiteBalance, display_referred, inverse_gains
+from rawaug.isp.stages import WhiteBalance, as_display_referred, inverse_gains
 
 MIDDLE_GREY = 0.18
 """Linear light up to which highlights are not compressed."""
@@ -38,7 +38,7 @@ _SCENE_WHITE = 0.999
 """Share of the pixels that must not be clipped."""
 
 
-def trust(srgb: Tensor) -> Tensor:
+def confidence(srgb: Tensor) -> Tensor:
     """m: confidence ``(B, 1, H, W)`` that pixels of sRGB ``(B, 3, H, W)`` in [0, 1] are not clipped."""
     return ((_CLIPPED - srgb.amax(dim=1, keepdim=True)) / _RAMP).clamp(0.0, 1.0)
 
@@ -63,11 +63,11 @@ def merge_exposures(isp: DictionaryISP, pictures: Sequence[Tensor], ev: Sequence
     """
     _require_bracket(pictures, ev)
     nearest = min(range(len(ev)), key=lambda k: abs(ev[k]))
-    params = isp.choose(display_referred(pictures[nearest]))
+    params = isp.choose(as_display_referred(pictures[nearest]))
     total = exposure = torch.zeros(())
     for picture, stops in zip(pictures, ev, strict=True):
-        x = display_referred(picture)
-        weight = trust(x)
+        x = as_display_referred(picture)
+        weight = confidence(x)
         if stops == min(ev):
             weight = weight.clamp_min(_LAST_RESORT)
         total = total + weight * _linear_reverse(isp, x, params)

@@ -147,7 +147,7 @@ class FastForward(nn.Module):
         display = self._display(raws[0], params, place)
 
         def in_steps(raw: Tensor) -> Tensor:
-            found = [self._demosaiced(*one) for one in zip(raw.split(1), methods, display.gains, strict=True)]
+            found = [self._demosaic_balanced(*one) for one in zip(raw.split(1), methods, display.gains, strict=True)]
             linear = torch.cat(found)
             return fastest("render", linear, display, otherwise=lambda: render(linear, display))
 
@@ -155,7 +155,7 @@ class FastForward(nn.Module):
             return [in_steps(raw) for raw in raws]
         return [fastest("develop", raw, display, self.cfa, methods, otherwise=partial(in_steps, raw)) for raw in raws]
 
-    def _demosaiced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
+    def _demosaic_balanced(self, raw: Tensor, method: str, gains: Tensor) -> Tensor:
         """Balanced, and clipped at black, before a choice of direction, as RAW developers do it."""
         if method not in bayer.DIRECTIONAL:
             return bayer.demosaic(raw, self.cfa, method)
@@ -163,7 +163,11 @@ class FastForward(nn.Module):
         sites = bayer.mosaic(balance.expand(3, 2, 2), self.cfa).repeat(1, raw.shape[-2] // 2, raw.shape[-1] // 2)
         balanced = (raw * sites).clamp_min(0.0)
         return fastest(
-            "directional", balanced, self.cfa, method, otherwise=lambda: bayer.demosaic(balanced, self.cfa, method)
+            "demosaic_directional",
+            balanced,
+            self.cfa,
+            method,
+            otherwise=lambda: bayer.demosaic(balanced, self.cfa, method),
         ).div_(balance)
 
     def _display(self, linear: Tensor, params: ISPParams, place: Tensor | None) -> Display:
@@ -241,10 +245,10 @@ class _Chooser(nn.Module):
         self.register_buffer("tone_weights", isp.typical_tones().clone())
         encoders = isp.reverse_encoders
         with torch.no_grad():
-            self.colour_encoder = _folded(encoders.colour, [isp.colour.atoms()])
+            self.colour_encoder = _fold_encoder(encoders.colour, [isp.colour.atoms()])
             floor = 1.0 / isp.gain.channel_gains()
             factors = (floor, highlight_rise(floor, isp.config.knee))
-            self.gain_encoder = _folded(encoders.gain, [torch.diag_embed(factor) for factor in factors])
+            self.gain_encoder = _fold_encoder(encoders.gain, [torch.diag_embed(factor) for factor in factors])
 
     @torch.no_grad()
     def forward(self, srgb: Tensor, table: Tensor) -> ISPParams:
@@ -270,7 +274,7 @@ def _small(srgb: Tensor, table: Tensor) -> Tensor:
     return look_up(table, thumbnail(as_float(srgb)))[:, :3]
 
 
-def _folded(encoder: Encoder, maps: list[Tensor]) -> Encoder:
+def _fold_encoder(encoder: Encoder, maps: list[Tensor]) -> Encoder:
     """The encoder for K maps of 3 channels; ``maps``, K times ``(N, 3, 3)``, make its N images of them."""
     encoder = deepcopy(encoder)
     if encoder.layers is None:

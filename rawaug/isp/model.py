@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from rawaug import bayer
-from rawaug.camera_names import spelled
+from rawaug.camera_names import find_camera
 from rawaug.files import find_weights, parse_object, read_tensors, to_json, write_tensors
 from rawaug.isp import staged, stages
-from rawaug.isp.cameras import light_range, published_cameras
+from rawaug.isp.cameras import light_range, load_cameras
 from rawaug.isp.config import ISPConfig, ISPParams, ISPResult
 from rawaug.isp.dictionary import CameraDictionary, CameraSampler, convex_weights
 from rawaug.isp.staged import StagedISP, thumbnail
@@ -114,7 +114,7 @@ class DictionaryISP(StagedISP):
             raw_samples: ``(B, K, 3)`` of (row, column, RAW value): the gains are solved for from these few readings
                 (:func:`rawaug.isp.staged.with_raw_samples`).
             place: coordinates of the pixels in the full frame, ``(1 or B, 2, H, W)``
-                (:func:`rawaug.isp.stages.place_in_frame`); the picture is taken for a full frame by default.
+                (:func:`rawaug.isp.stages.frame_coordinates`); the picture is taken for a full frame by default.
             intermediates: also return x1 ... x5.
 
         Returns:
@@ -127,12 +127,12 @@ class DictionaryISP(StagedISP):
         if srgb.ndim != 4 or srgb.shape[1] != 3 or min(srgb.shape[2:]) < 2:
             raise ValueError(f"sRGB must have shape (B, 3, H >= 2, W >= 2), got {tuple(srgb.shape)}")
         with self._float32(srgb):
-            x = stages.display_referred(srgb)
+            x = stages.as_display_referred(srgb)
             params = staged.with_white_balance(self, params or self.choose(x), white_balance, digital_gain)
             if len(params.gains) != len(x):
                 raise ValueError(f"the parameters are for {len(params.gains)} pictures, but the batch has {len(x)}")
             if raw_samples is not None:
-                params = staged.with_raw_samples(self, x, params, raw_samples, stages.placed(x, place))
+                params = staged.with_raw_samples(self, x, params, raw_samples, stages.coordinates_or_full(x, place))
             seen: dict[str, Tensor] = {}
             x5 = self.reverse_pixels(x, params, place, seen if intermediates else None)
             return ISPResult(bayer.mosaic(x5, self.cfa), params, seen)
@@ -159,7 +159,7 @@ class DictionaryISP(StagedISP):
         with self._float32(raw):
             x5 = bayer.demosaic(_scene_referred(raw), self.cfa)
             if params is None:
-                params = self.choose_forward(self.unshaded(x5, place))
+                params = self.choose_forward(self.remove_shading(x5, place))
             params = staged.with_white_balance(self, params, white_balance, None)
             seen: dict[str, Tensor] = {"x5": x5}
             srgb = self.forward_pixels(x5, params, place, seen if intermediates else None)
@@ -253,18 +253,18 @@ class DictionaryISP(StagedISP):
 
 
 @torch.no_grad()
-def of_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
+def restrict_to_cameras(isp: DictionaryISP, names: str | Sequence[str]) -> DictionaryISP:
     """The ISP with the published cameras of these names for its atoms: all lights, the same tones."""
     if not isinstance(isp.colour, CameraDictionary):
         raise ValueError("a camera by name needs an ISP of published cameras, such as universal")
-    listed = published_cameras()
-    known = [spelled(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
+    listed = load_cameras()
+    known = [find_camera(name, listed.names) for name in ([names] if isinstance(names, str) else names)]
     narrowed = DictionaryISP(replace(isp.config, colour_atoms=len(known), cameras=len(known), encoders=False))
     kept = {key: value for key, value in isp.state_dict().items() if not _of_colour(key)}
     own = {key: value for key, value in narrowed.state_dict().items() if _of_colour(key)}
     narrowed.load_state_dict(kept | own)
     assert isinstance(narrowed.colour, CameraDictionary)
-    narrowed.colour.set_cameras(listed.named(known), torch.eye(len(known)))
+    narrowed.colour.set_cameras(listed.select(known), torch.eye(len(known)))
     narrowed.info = {**isp.info, "cameras": known}
     return narrowed.to(isp.colour.matrices.device).eval()
 

@@ -25,9 +25,9 @@ from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.dictionary import CameraDictionary, ColourDictionary, GainDictionary, nearest_in_hull
 from rawaug.isp.stages import Stage
 from rawaug.isp.tone import ToneCurve, ToneDictionary
-from rawaug.kernels.reference import through_curves
+from rawaug.kernels.reference import apply_curves
 from rawaug.registry import STAGES
-from rawaug.seeding import derived_seed, initialised_from
+from rawaug.seeding import derive_seed, initialise_from
 
 S = TypeVar("S", bound=Stage)
 
@@ -105,7 +105,7 @@ class StagedISP(nn.Module):
         """What a fit recorded."""
         self.config = config or ISPConfig()
         """What it is made of; :meth:`configure` and :meth:`use_encoders` change it."""
-        with initialised_from(seed):
+        with initialise_from(seed):
             self.colour = ColourDictionary(self.config.colour_atoms)
             if self.config.cameras:
                 self.colour = CameraDictionary(self.config.colour_atoms, self.config.cameras)
@@ -141,7 +141,7 @@ class StagedISP(nn.Module):
 
     def use_encoders(self, enabled: bool, seed: int = 0) -> None:
         """Make networks for the encoders, drawn from ``seed``, or remove them; existing ones stay as they are."""
-        with initialised_from(derived_seed(seed, "encoders")):
+        with initialise_from(derive_seed(seed, "encoders")):
             for encoder in (module for module in self.modules() if isinstance(module, Encoder)):
                 if not enabled:
                     encoder.layers = None
@@ -185,7 +185,7 @@ class StagedISP(nn.Module):
             x = stage.reverse(x, None) if stage.makes <= 2 else x
         return x
 
-    def unshaded(self, x: Tensor, place: Tensor | None) -> Tensor:
+    def remove_shading(self, x: Tensor, place: Tensor | None) -> Tensor:
         """x5 to x4, what the forward encoders look at."""
         for stage in reversed(self.ordered_stages):
             x = stage.forward(x, None, place) if stage.makes >= 5 else x
@@ -261,10 +261,10 @@ def _mixed(
     target = value * torch.einsum("bck,bc->bk", own, params.gains)
     weight = ((value < CLIPPED) / (value.clamp_min(0.0) + SHADOW)).sqrt()
     seen = torch.einsum("bck,bcd->bkd", own, params.matrix)
-    curved = torch.stack([through_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
+    curved = torch.stack([apply_curves(curve.expand(len(pixels), -1), pixels) for curve in tones.curves], dim=1)
     makes = torch.einsum("bkd,bndk->bnk", seen, curved[:, :, :, 0])
     tone_weights = _nearest(weight * target, weight[:, None] * makes, tones.typical)
-    x2 = through_curves(tones.combine(tone_weights), pixels)[:, :, 0]
+    x2 = apply_curves(tones.combine(tone_weights), pixels)[:, :, 0]
     makes = torch.einsum("bck,ncd,bdk->bnk", own, cameras.atoms(), x2)
     colour_weights = _nearest(weight * target, weight[:, None] * makes, cameras.typical)
     matrix = cameras.combine(colour_weights)

@@ -35,7 +35,7 @@ import torch
 from torch import Tensor, nn
 
 from rawaug.isp.config import HIGHLIGHT_KNEE, ISPConfig, ISPParams
-from rawaug.kernels.reference import frame_of
+from rawaug.kernels.reference import mask_frame
 from rawaug.registry import STAGES
 
 EPS = 1e-6
@@ -51,7 +51,7 @@ def as_float(srgb: Tensor) -> Tensor:
     return srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb
 
 
-def display_referred(srgb: Tensor) -> Tensor:
+def as_display_referred(srgb: Tensor) -> Tensor:
     """:func:`as_float` of a picture; ValueError unless it is uint8 or float32 in [0, 1]."""
     if srgb.layout != torch.strided:
         raise ValueError(f"a picture must be a dense tensor, got {srgb.layout}; call to_dense()")
@@ -151,7 +151,7 @@ def apply_gains(x: Tensor, gains: Tensor) -> Tensor:
     return x * gains[:, :, None, None]
 
 
-def place_in_frame(
+def frame_coordinates(
     height: int, width: int, offset: tuple[int, int] = (0, 0), frame: tuple[int, int] | None = None
 ) -> Tensor:
     """Coordinates ``(1, 2, H, W)`` (y, x) of a crop's pixels in its *full* frame: centre 0, half the diagonal 1."""
@@ -162,15 +162,15 @@ def place_in_frame(
     return torch.stack(torch.meshgrid(y, x, indexing="ij"))[None]
 
 
-def placed(x: Tensor, place: Tensor | None) -> Tensor:
+def coordinates_or_full(x: Tensor, place: Tensor | None) -> Tensor:
     """``place``, or that of a full frame, in the dtype of the image ``x``."""
-    return (place_in_frame(*x.shape[-2:]) if place is None else place).to(x)
+    return (frame_coordinates(*x.shape[-2:]) if place is None else place).to(x)
 
 
 class GaussianMask(nn.Module):
     """The sensor's fall-off ``G(p) = exp(-||L^T (p - mu)||^2 / 2)``, precision ``Sigma^-1 = L L^T``; flat at first.
 
-    ``p`` are the coordinates of :func:`place_in_frame`.
+    ``p`` are the coordinates of :func:`frame_coordinates`.
     """
 
     def __init__(self) -> None:
@@ -375,10 +375,10 @@ class ColorCorrection(Stage):
     name, makes = "colour", 3
 
     def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return correct_colour(x, chosen(params).matrix)
+        return correct_colour(x, require_params(params).matrix)
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return correct_colour(x, torch.linalg.pinv(chosen(params).matrix))
+        return correct_colour(x, torch.linalg.pinv(require_params(params).matrix))
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         return batch._replace(matrix=params.matrix.to(batch.matrix))
@@ -391,10 +391,10 @@ class WhiteBalance(Stage):
     name, makes = "gains", 4
 
     def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return inverse_gains(x, chosen(params).gains, self.config.knee)
+        return inverse_gains(x, require_params(params).gains, self.config.knee)
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        return apply_gains(x, chosen(params).gains)
+        return apply_gains(x, require_params(params).gains)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         return batch._replace(floor=1.0 / params.gains.to(batch.floor)[:, None])
@@ -413,23 +413,23 @@ class LensShading(Stage):
         self.forward_attention = AttentionMask() if config.attention else None
 
     def reverse(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        x = x * self.mask(placed(x, place))
+        x = x * self.mask(coordinates_or_full(x, place))
         return x if self.reverse_attention is None else x * self.reverse_attention(x)
 
     def forward(self, x: Tensor, params: ISPParams | None, place: Tensor | None = None) -> Tensor:
-        x = x / self.mask(placed(x, place))
+        x = x / self.mask(coordinates_or_full(x, place))
         return x if self.forward_attention is None else x * self.forward_attention(x)
 
     def bake(self, tables: Tables) -> Tables:
-        return _attended(tables, self.reverse_attention)
+        return _bake_attention(tables, self.reverse_attention)
 
     def bake_forward(self, tables: Tables) -> Tables:
-        return _attended(tables, self.forward_attention)
+        return _bake_attention(tables, self.forward_attention)
 
     def adjust(self, batch: BatchParams, params: ISPParams, place: Tensor | None, size: tuple[int, int]) -> BatchParams:
         centre = (float(self.mask.mean[0]), float(self.mask.mean[1]))
         places = [[0, 0, *size]] * len(batch.frame) if place is None else place.tolist()
-        frame = batch.frame.new_tensor([frame_of(p, *size, centre) for p in places]).reshape(len(batch.frame), 6)
+        frame = batch.frame.new_tensor([mask_frame(p, *size, centre) for p in places]).reshape(len(batch.frame), 6)
         precision = self.mask.precision * (0.5 / math.log(2.0))
         shading = torch.stack([precision[0, 0], 2.0 * precision[0, 1], precision[1, 1]])
         return batch._replace(frame=frame, shading=shading)
@@ -442,14 +442,14 @@ class LensShading(Stage):
         return {f"mask.{key}": p for key, p in self.mask.named_parameters()}
 
     def coarse(self, x: Tensor, place: Tensor | None) -> Tensor:
-        return x * self.mask(placed(x, place))
+        return x * self.mask(coordinates_or_full(x, place))
 
 
-def _attended(tables: Tables, mask: AttentionMask | None) -> Tables:
+def _bake_attention(tables: Tables, mask: AttentionMask | None) -> Tables:
     return tables if mask is None else tables._replace(attention=mask(tables.cube))
 
 
-def chosen(params: ISPParams | None) -> ISPParams:
+def require_params(params: ISPParams | None) -> ISPParams:
     """``params``, which every stage after x2 needs."""
     if params is None:
         raise ValueError("this stage needs the pictures' parameters; choose them first")

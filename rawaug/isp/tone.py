@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from rawaug.isp.config import ISPConfig, ISPParams
 from rawaug.isp.stages import BatchParams, Stage
-from rawaug.kernels.reference import through_curves
+from rawaug.kernels.reference import apply_curves
 from rawaug.registry import STAGES
 
 STEPS = 4
@@ -46,7 +46,7 @@ def inverse_smoothstep(x: Tensor) -> Tensor:
 
 def to_linear(srgb: Tensor, tables: Tensor) -> Tensor:
     """Pictures ``(B, C, H, W)``, uint8 or float in [0, 1], through one table ``(B, 1021)`` each; float32."""
-    return through_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
+    return apply_curves(tables[:, ::STEPS] if srgb.dtype == torch.uint8 else tables, srgb)
 
 
 def to_code(linear: Tensor, tables: Tensor) -> Tensor:

@@ -26,22 +26,22 @@ _failed: list[str] = []
 """Names of the errors that Triton's kernels have raised; after one they are not tried again."""
 
 
-def triton_usable(image: Tensor) -> bool:
+def can_use_triton(image: Tensor) -> bool:
     """Whether to try a Triton kernel on ``image``."""
     return image.device.type == "cuda" and not _failed and find_spec("triton") is not None
 
 
 def fastest(name: str, image: Tensor, *args: Any, otherwise: Callable[[], R]) -> R:
     """``name(image, *args)`` by the kernel for the image's device, or ``otherwise()`` where there is none."""
-    if name in _ON_GPU and triton_usable(image):
-        return kernel_or(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
+    if name in _ON_GPU and can_use_triton(image):
+        return try_kernel(lambda: getattr(import_module("rawaug.kernels.gpu"), name)(image, *args), otherwise)
     if image.device.type == "cpu" and runtime.has_numba():
         result: R = getattr(import_module("rawaug.kernels.cpu"), name)(image, *args)
         return result
     return otherwise()
 
 
-def kernel_or(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
+def try_kernel(kernel: Callable[[], R], otherwise: Callable[[], R]) -> R:
     """The result of ``kernel``, or of ``otherwise`` after a warning if it fails."""
     try:
         return kernel()

@@ -21,10 +21,10 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 from torch import Tensor
 
-from rawaug.bayer import CFA, stencils_of
-from rawaug.kernels.directions import directional as directional
+from rawaug.bayer import CFA, demosaicing_stencils
+from rawaug.kernels.directions import demosaic_directional as demosaic_directional
 from rawaug.kernels.reference import INCREMENTS, MULTIPLIERS, ROUNDS, Camera, Display
-from rawaug.kernels.runtime import compiled, over_rows, part
+from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _TILE = 256  # cells of RAW that are worked on at a time
 _NOISE_TILE = 512  # and of noise
@@ -65,13 +65,13 @@ def unprocess(srgb: Tensor, camera: Camera, white: float) -> Tensor:
     knee, ceiling = np.float32(camera.knee), np.float32(white)
 
     settings = (scale, table, codes, curves, attention, colour, knee, frame, shading, sites, ceiling)
-    over_rows(batch * height, width, lambda start, stop: _raw_rows(picture, *settings, out, start, stop))
+    run_over_rows(batch * height, width, lambda start, stop: _raw_rows(picture, *settings, out, start, stop))
     return raw
 
 
 def render(linear: Tensor, display: Display) -> Tensor:
     """Camera colour x5 ``(B, 3, H, W)``, float32 on the CPU, to sRGB in [0, 1]."""
-    return _rendered(linear.detach().contiguous(), None, np.empty(0, np.int64), linear.shape, display)
+    return _render_rows(linear.detach().contiguous(), None, np.empty(0, np.int64), linear.shape, display)
 
 
 def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str]) -> Tensor:
@@ -80,10 +80,10 @@ def develop(raw: Tensor, display: Display, cfa: CFA | str, methods: Sequence[str
     weights = np.stack([_site_weights(CFA(cfa), method) for method in used])
     padded = F.pad(raw.detach(), (2, 2, 2, 2), mode="reflect")  # about the border sites: the pattern stays
     which = np.array([used.index(method) for method in methods])
-    return _rendered(padded, weights, which, (len(raw), 3, *raw.shape[2:]), display)
+    return _render_rows(padded, weights, which, (len(raw), 3, *raw.shape[2:]), display)
 
 
-def _rendered(
+def _render_rows(
     source: Tensor, weights: np.ndarray | None, methods: np.ndarray, shape: Sequence[int], display: Display
 ) -> Tensor:
     srgb = torch.empty(tuple(shape), dtype=torch.float32)
@@ -93,7 +93,7 @@ def _rendered(
     pixels, out = source.numpy(), srgb.numpy()
     # Absent parts are None, so that no code is compiled for them.
     settings = tuple(value.detach().contiguous().numpy() if value.numel() else None for value in display)
-    over_rows(
+    run_over_rows(
         batch * height, 3 * width, lambda start, stop: _srgb_rows(pixels, weights, methods, *settings, out, start, stop)
     )
     return srgb
@@ -102,7 +102,7 @@ def _rendered(
 @lru_cache
 def _site_weights(cfa: CFA, method: str) -> np.ndarray:
     """``(2, 3, 6, _TILE)``: by row and colour, the weights of the six sums of :func:`_demosaic` at each site."""
-    stencils, kinds = stencils_of(cfa, method)
+    stencils, kinds = demosaicing_stencils(cfa, method)
     edge = 2 - stencils.shape[-1] // 2
     around = F.pad(stencils, (edge, edge, edge, edge))
     own = torch.eye(6)[:1]
@@ -154,7 +154,7 @@ def _interpolation(context, build, signature: Signature, values):  # type: ignor
     return context.get_dummy_value()
 
 
-@part
+@compile_part
 def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
     """The node below a value, at most ``last``, and the share of the way to the next; values are clamped."""
     x = np.float32(value) * scale
@@ -166,7 +166,7 @@ def _cell_of(value, scale, last):  # type: ignore[no-untyped-def]
     return node, x - np.float32(node)
 
 
-@part
+@compile_part
 def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # type: ignore[no-untyped-def]
     """Values of the table ``(N, N, N, 4)`` at colours ``(n,)``, to ``out`` ``(2, 3, _TILE)``.
 
@@ -188,7 +188,7 @@ def _look_up(red, green, blue, scale, table, nodes, shares, halves, out):  # typ
         _interpolate(flat, np.int64(nodes[j]), row, layer, u, v, w, found, at, np.int64(_TILE))
 
 
-@part
+@compile_part
 def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
     """Values of a curve ``(T,)`` at one channel of a row: even sites to ``out`` ``(2, n)`` [0], odd ones to [1]."""
     last, share = np.int32(len(curve) - 2), shares[0]
@@ -201,7 +201,7 @@ def _through_curve(plane, scale, curve, nodes, shares, out):  # type: ignore[no-
         odd[j] = curve[b] + (curve[b + np.uint32(1)] - curve[b]) * share[2 * j + 1]
 
 
-@part
+@compile_part
 def _of_codes(plane, curve, out):  # type: ignore[no-untyped-def]
     """:func:`_through_curve` of bytes, for which the curve has an entry each."""
     even, odd = out[0], out[1]
@@ -209,7 +209,7 @@ def _of_codes(plane, curve, out):  # type: ignore[no-untyped-def]
         even[j], odd[j] = curve[plane[2 * j]], curve[plane[2 * j + 1]]
 
 
-@part
+@compile_part
 def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
     """The mask at every second pixel of a row from ``first`` on.
 
@@ -231,7 +231,7 @@ def _fall_off(frame, row, first, shading, out):  # type: ignore[no-untyped-def]
         out[j] = p * np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
-@part
+@compile_part
 def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-untyped-def]
     """One channel of x4 times the mask, of x2 ``(3, n)``."""
     c0, c1, c2 = colour[channel, 0], colour[channel, 1], colour[channel, 2]
@@ -248,7 +248,7 @@ def _develop(x2, colour, channel, knee, mask, white, out):  # type: ignore[no-un
         out[j] = white if y > white else y
 
 
-@part
+@compile_part
 def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: ignore[no-untyped-def]
     """One channel of x4 ``(3, n)`` times the attention that all three call for."""
     count, scale = len(out), np.float32(len(table) - 1)
@@ -258,7 +258,7 @@ def _attend(x4, channel, table, nodes, shares, found, white, out):  # type: igno
         out[j] = white if y > white else y
 
 
-@compiled
+@compile_loop
 def _raw_rows(  # type: ignore[no-untyped-def]
     srgb, scale, table, codes, curves, attention, colour, knee, frame, shading, sites, white, raw, start, stop,
 ):  # fmt: skip
@@ -295,13 +295,13 @@ def _raw_rows(  # type: ignore[no-untyped-def]
                     _develop(x2[column], colour[b], channel, knee, mask, white, out)
 
 
-@part
+@compile_part
 def _pairs(one, other, out):  # type: ignore[no-untyped-def]
     for j in range(len(out)):
         out[j] = one[j] + other[j]
 
 
-@part
+@compile_part
 def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untyped-def]
     """Colours ``(3, n)`` of a row from ``first`` on, of a mosaic with margins of 2.
 
@@ -323,13 +323,13 @@ def _demosaic(mosaic, row, first, weights, sums, out):  # type: ignore[no-untype
             _weighted(weights[c, k], sums[k], weights[c, k + 1], sums[k + 1], True, out[c])
 
 
-@part
+@compile_part
 def _weighted(a, x, b, y, more, out):  # type: ignore[no-untyped-def]
     for j in range(len(out)):
         out[j] = (out[j] if more else _ZERO) + (a[j] * x[j] + b[j] * y[j])
 
 
-@part
+@compile_part
 def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
     """The root of one channel of x2, held to [0, 1], of x3 ``(3, n)``."""
     for j in range(len(out)):
@@ -339,7 +339,7 @@ def _root(x, c0, c1, c2, out):  # type: ignore[no-untyped-def]
         out[j] = np.sqrt(y)
 
 
-@part
+@compile_part
 def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
     """Values of a curve ``(T,)`` at one channel, in [0, 1], of a row."""
     last = np.int32(len(curve) - 2)
@@ -351,7 +351,7 @@ def _at_curve(root, curve, nodes, shares, out):  # type: ignore[no-untyped-def]
         out[j] = curve[a] + (curve[a + np.uint32(1)] - curve[a]) * shares[j]
 
 
-@compiled
+@compile_loop
 def _srgb_rows(  # type: ignore[no-untyped-def]
     source, weights, methods, table, curves, attention, matrix, gains, frame, shading, srgb, start, stop,
 ):  # fmt: skip
@@ -423,11 +423,11 @@ def shot_read(
     key = np.array([(k & 0xFFFFFFFF, k >> 32) for k in keys], dtype=np.uint32)
     ceiling = np.float32(white)
     batch, _, height, width = clean.shape
-    over_rows(batch * height, 4 * width, lambda a, b: _noise_rows(signal, variances, key, ceiling, out, var, a, b))
+    run_over_rows(batch * height, 4 * width, lambda a, b: _noise_rows(signal, variances, key, ceiling, out, var, a, b))
     return noisy, variance
 
 
-@part
+@compile_part
 def _words(key, first, count, words):  # type: ignore[no-untyped-def]
     for i in range(count):
         a, b, c, d = np.uint32(first + i), np.uint32(0), np.uint32(0), np.uint32(0)
@@ -440,7 +440,7 @@ def _words(key, first, count, words):  # type: ignore[no-untyped-def]
         words[0, i], words[1, i], words[2, i], words[3, i] = a, b, c, d
 
 
-@part
+@compile_part
 def _log(x):  # type: ignore[no-untyped-def]
     """Natural logarithm of a positive, normal float32: exponent, and a polynomial in the mantissa about 1."""
     bits = np.float32(x).view(np.int32)
@@ -452,7 +452,7 @@ def _log(x):  # type: ignore[no-untyped-def]
     return np.float32(exponent) * np.float32(math.log(2)) + m * p
 
 
-@part
+@compile_part
 def _sine(turn):  # type: ignore[no-untyped-def]
     """Sine of an angle in units of 2^-32 turns: folded to a quarter turn about 0, then an odd polynomial."""
     folded = turn
@@ -466,7 +466,7 @@ def _sine(turn):  # type: ignore[no-untyped-def]
     return x * p
 
 
-@part
+@compile_part
 def _normals(words, count, normals):  # type: ignore[no-untyped-def]
     for pair in (0, 2):
         for i in range(count):
@@ -478,7 +478,7 @@ def _normals(words, count, normals):  # type: ignore[no-untyped-def]
             normals[pair + 1, i] = radius * _sine(turn)
 
 
-@part
+@compile_part
 def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-untyped-def]
     for j in range(len(signal)):
         y = signal[j]
@@ -487,14 +487,14 @@ def _disturb(signal, normals, shot, read, white, noisy):  # type: ignore[no-unty
         noisy[j] = white if value > white else value
 
 
-@part
+@compile_part
 def _law(noisy, shot, read, variance):  # type: ignore[no-untyped-def]
     for j in range(len(noisy)):
         light = noisy[j] if noisy[j] > _ZERO else _ZERO
         variance[j] = shot * light + read
 
 
-@compiled
+@compile_loop
 def _noise_rows(clean, levels, keys, white, noisy, variance, start, stop):  # type: ignore[no-untyped-def]
     """Rows ``start`` to ``stop`` of the batch's rows of cells, one picture's after the other's."""
     height, width = clean.shape[2], clean.shape[3]

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from rawaug.bayer import CFA
-from rawaug.kernels.runtime import compiled, over_rows, part
+from rawaug.kernels.runtime import compile_loop, compile_part, run_over_rows
 
 _MARGIN = 6
 """Green looks 2 sites around, colour 1, steps of colour 1, their count 1; even, so that the pattern stays."""
 _HALF, _QUARTER, _TWO = np.float32(0.5), np.float32(0.25), np.float32(2)
 
 
-def directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
+def demosaic_directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     """Mosaics ``(B, 1, H, W)``, float32 on the CPU, to ``(B, 3, H, W)`` by ``adams`` or ``ahd``."""
     batch, _, height, width = raw.shape
     rgb = torch.empty(batch, 3, height, width)
@@ -22,11 +22,11 @@ def directional(raw: Tensor, cfa: CFA, method: str) -> Tensor:
     for mosaic, out in zip(raw.detach().numpy()[:, 0], rgb.numpy(), strict=True):
         padded = np.pad(mosaic, ends, mode="reflect")
         settings = (padded, *cfa.sites[0], method == "ahd", out)
-        over_rows(height, width, lambda start, stop, given=settings: _rows(*given, start, stop))  # type: ignore[misc]
+        run_over_rows(height, width, lambda start, stop, given=settings: _rows(*given, start, stop))  # type: ignore[misc]
     return rgb
 
 
-@compiled
+@compile_loop
 def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: ignore[no-untyped-def]
     """Rows ``start`` to ``stop`` of a picture whose mosaic has margins."""
     own = mosaic[start : stop + 2 * _MARGIN]
@@ -56,7 +56,7 @@ def _rows(mosaic, red_row, red_column, homogeneous, rgb, start, stop):  # type: 
                 rgb[c, start + i - _MARGIN, j - _MARGIN] = value
 
 
-@part
+@compile_part
 def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-def]
     """Green of a site in both pictures; without ``homogeneous`` that of the lesser change in the first."""
     here = own[i, j]
@@ -76,7 +76,7 @@ def _green(own, i, j, known, homogeneous, pictures):  # type: ignore[no-untyped-
     pictures[0, 1, i, j], pictures[1, 1, i, j] = row, column
 
 
-@part
+@compile_part
 def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-def]
     """Red and blue of a row: green plus the mean of what the sites of the colour nearby are above green."""
     green, near, far = picture[1], 0 if with_red else 2, 2 if with_red else 0
@@ -91,7 +91,7 @@ def _colours(own, i, with_red, red_column, picture):  # type: ignore[no-untyped-
             picture[near, i, j], picture[far, i, j] = green[i, j] + across * _HALF, green[i, j] + down * _HALF
 
 
-@part
+@compile_part
 def _leads(pictures, lead):  # type: ignore[no-untyped-def]
     """How many more of a site's four neighbours are like it in the first picture than in the second."""
     rows, width = lead.shape

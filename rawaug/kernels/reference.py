@@ -61,7 +61,7 @@ class Camera(NamedTuple):
     sites: Tensor
 
 
-def frame_of(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
+def mask_frame(place: list[int], height: int, width: int, centre: tuple[float, float]) -> list[float]:
     """One row of :attr:`Camera.frame`, for a picture of ``height`` x ``width`` with the mask's centre at (y, x).
 
     ``place`` is top, left, height and width of the full frame, and, if the crop was turned or enlarged, its view and
@@ -105,7 +105,7 @@ def look_up(table: Tensor, x: Tensor) -> Tensor:
     return found[0].transpose(0, 1)
 
 
-def through_curves(curves: Tensor, x: Tensor) -> Tensor:
+def apply_curves(curves: Tensor, x: Tensor) -> Tensor:
     """Each picture of ``x`` ``(B, C, H, W)`` through its own curve, ``curves`` ``(B, T)``, by linear interpolation.
 
     Of 256 entries each is a code of uint8, and nothing is interpolated; floats are held to [0, 1].
@@ -157,13 +157,13 @@ def render(linear: Tensor, display: Display) -> Tensor:
     # The root spreads the dark tones, where an inverse tone curve is steep, over more of the table's nodes.
     root = torch.einsum("bij,bjhw->bihw", display.matrix, x).clamp(1e-12, 1.0).sqrt()
     if display.curves.numel():
-        return through_curves(display.curves, root)
+        return apply_curves(display.curves, root)
     return look_up(display.table, root)[:, :3].clamp(0.0, 1.0)
 
 
 def _develop(srgb: Tensor, camera: Camera, top: int, raw: Tensor) -> None:
     """Rows of pictures from ``top`` on, to ``raw``."""
-    x2 = through_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
+    x2 = apply_curves(camera.curves, srgb) if camera.curves.numel() else look_up(camera.table, srgb)[:, :3]
     mask = fall_off(camera, top, *srgb.shape[-2:])
     for plane, (i, j, channel) in enumerate(camera.sites.tolist()):
         here = x2[..., i::2, j::2]
@@ -198,7 +198,7 @@ def fall_off(camera: Camera | Display, top: int, height: int, width: int) -> Ten
     return torch.exp2(-(a * y * y + (b * y + c * x) * x))[:, None]
 
 
-def words(key: int, counters: Tensor) -> Tensor:
+def philox(key: int, counters: Tensor) -> Tensor:
     """Philox4x32-10 of int64 ``counters`` ``(n,)`` below 2^32, under a key below 2^64: int64 ``(4, n)`` below 2^32."""
     zero = torch.zeros_like(counters)
     a, b, c, d = counters, zero, zero, zero
@@ -212,7 +212,7 @@ def words(key: int, counters: Tensor) -> Tensor:
 
 def normals(key: int, height: int, width: int) -> Tensor:
     """Standard normal float32 ``(4, height, width)``: the four planes of a packed picture, cells counted row by row."""
-    w = words(key, torch.arange(height * width))
+    w = philox(key, torch.arange(height * width))
     radius = (w[0::2].float() + 0.5).mul_(2.0**-32).log_().mul_(-2.0).sqrt_()
     turn = torch.where(w[1::2] < 2**31, w[1::2], w[1::2] - 2**32).double().mul_(2.0 * math.pi / 2**32)
     drawn = torch.stack([radius * turn.cos().float(), radius * turn.sin().float()], dim=1)

@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from rawaug.registry import nearest
+from rawaug.registry import suggest
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,7 +35,7 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
     """
     kind, _, number = name.partition(":")
     if kind not in KINDS or (number and not number.isdigit()):
-        raise ValueError(f"{key} {name!r} is unknown; use one of {', '.join(KINDS)}{nearest(kind, KINDS)}")
+        raise ValueError(f"{key} {name!r} is unknown; use one of {', '.join(KINDS)}{suggest(kind, KINDS)}")
     found = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available())}
     present = next((gpu for gpu, devices in found.items() if devices), None)
     if kind in ("auto", "gpu"):
@@ -45,7 +45,7 @@ def find_device(name: str, key: str = "device", count: int = 1) -> torch.device:
     return torch.device(f"{kind}:{number}" if number else kind)
 
 
-def fast_in_bfloat16(device: torch.device) -> bool:
+def has_fast_bfloat16(device: torch.device) -> bool:
     """Whether dense convolutions take less time in bfloat16 there: with AVX-512 BF16, AMX, or on newer GPUs."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
@@ -95,7 +95,7 @@ def has_numba() -> bool:
     return not numba.config.DISABLE_JIT
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compile_loop(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorator: the function as machine code that releases the GIL, cached on disk where a folder is writable."""
     from numba import njit
 
@@ -105,8 +105,8 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return njit(**_OPTIONS)(function)
 
 
-def part(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator: for functions that only :func:`compiled` ones of the same module call."""
+def compile_part(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator: for functions that only :func:`compile_loop` ones of the same module call."""
     from numba import njit
 
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
@@ -126,7 +126,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
-def over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
+def run_over_rows(rows: int, width: int, run: Callable[[int, int], None]) -> None:
     """Call ``run(start, stop)`` on parts of ``rows`` rows of ``width`` numbers, on as many threads as PyTorch uses."""
     threads = torch.get_num_threads()
     pieces = min(threads * _PIECES, rows, rows * width // _GRAIN)

@@ -50,7 +50,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from rawaug.camera_names import spelled
+from rawaug.camera_names import find_camera
 from rawaug.noise.levels import (
     EldLevels,
     FixedLevels,
@@ -60,13 +60,13 @@ from rawaug.noise.levels import (
     PmridLevels,
     Preset,
     SiddLevels,
-    interpolated,
+    interpolate_levels,
     iso_limits,
+    load_presets,
     log_uniform,
-    published,
 )
 from rawaug.noise.models import NoiseModel, PoissonGaussianNoise, ShotReadNoise
-from rawaug.registry import NOISE, Spec, checked_settings, name_and_settings, nearest
+from rawaug.registry import NOISE, Spec, check_settings, split_spec, suggest
 from rawaug.seeding import keyed_generator
 
 ANY_CAMERA = "any camera"
@@ -95,7 +95,7 @@ class Profiles(NamedTuple):
 
 
 @cache
-def published_profiles() -> Profiles:
+def load_profiles() -> Profiles:
     """The package's ``profiles.tsv``; the geometric mean where a camera has an ISO twice."""
     cameras: dict[str, dict[float, list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     text = resources.files("rawaug.noise").joinpath("profiles.tsv").read_text("utf-8")
@@ -122,10 +122,10 @@ class ProfileLevels:
     """
 
     def __init__(self, camera: str = ANY_CAMERA, iso: Iso = None) -> None:
-        profiles = published_profiles()
+        profiles = load_profiles()
         names = profiles.names
         if camera.casefold() != ANY_CAMERA:
-            names = (spelled(camera, names),)
+            names = (find_camera(camera, names),)
         chosen = torch.tensor([profiles.names.index(name) for name in names])
         limits = profiles.limits()[chosen]
         measured = (round(math.exp(limits.min())), round(math.exp(limits.max())))
@@ -143,7 +143,7 @@ class ProfileLevels:
         drawn = torch.randint(len(self.cameras), (batch,), generator=generator, device=device)
         low, high = self.limits.to(device)[drawn].unbind(1)
         at = low + (high - low) * torch.rand(batch, generator=generator, device=device, dtype=torch.float64)
-        iso, shot, read = published_profiles().table.to(device)[:, self.cameras.to(device)[drawn]]
+        iso, shot, read = load_profiles().table.to(device)[:, self.cameras.to(device)[drawn]]
         right = torch.searchsorted(iso, at[:, None]).clamp(1, iso.shape[1] - 1)
         (x0, x1), (s0, s1), (r0, r1) = ((y.gather(1, right - 1), y.gather(1, right)) for y in (iso, shot, read))
         t = ((at[:, None] - x0) / (x1 - x0)).clamp(0.0, 1.0)
@@ -240,7 +240,7 @@ class MeasuredLevels:
         known = next((level for level in self.levels if level.iso == iso), None)
         if known is not None:
             return known.shot_var, known.read_var
-        shot_var, read_var = interpolated(self.table, torch.tensor([low]))
+        shot_var, read_var = interpolate_levels(self.table, torch.tensor([low]))
         return float(shot_var), float(read_var)
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -248,7 +248,7 @@ class MeasuredLevels:
         device = generator.device
         if self.limits is None or len(self.levels) == 1:
             return FixedLevels(*self.at(None)).sample(batch, generator)
-        return interpolated(self.table.to(device), log_uniform(self.limits, batch, generator))
+        return interpolate_levels(self.table.to(device), log_uniform(self.limits, batch, generator))
 
     def spec(self) -> dict[str, Any]:
         """The noise by name: what files of weights hold, and :func:`rawaug.noise.noise_model` reads."""
@@ -288,7 +288,7 @@ NoiseSpec = Spec | Sequence[float] | Sequence[str]
 
 @cache
 def _by_iso() -> dict[str, Callable[[Iso], SiddLevels | PmridLevels | EldLevels]]:
-    data = published()
+    data = load_presets()
     sidd = {name: partial(SiddLevels, name) for name in data["sidd_noise_level_function"]["cameras"]}
     return {**sidd, "pmrid": PmridLevels, **{name: partial(EldLevels, name) for name in data["eld"]["cameras"]}}
 
@@ -305,7 +305,7 @@ def measured_ranges() -> dict[str, tuple[float, float]]:
 
 def noise_names() -> list[str]:
     """Every name that :func:`noise_model` knows."""
-    return [*NOISE, *published()["presets"], *camera_names(), ANY_CAMERA, *published_profiles().names]
+    return [*NOISE, *load_presets()["presets"], *camera_names(), ANY_CAMERA, *load_profiles().names]
 
 
 def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None) -> NoiseLevels:
@@ -316,7 +316,7 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
     """
     if isinstance(spec, str) and spec in _by_iso():
         return _by_iso()[spec](iso)
-    if isinstance(spec, str) and spec not in published()["presets"]:
+    if isinstance(spec, str) and spec not in load_presets()["presets"]:
         return _of_profile(spec, iso)
     if not isinstance(spec, str) and spec and all(isinstance(name, str) for name in spec):
         return MixedLevels([noise_levels(str(name), iso=iso) for name in spec])
@@ -330,12 +330,12 @@ def noise_levels(spec: str | Sequence[float] | Sequence[str], *, iso: Iso = None
         raise ValueError(f"fixed noise must be a pair (shot_var, read_var), got {spec}")
     shot_var, read_var = (float(value) for value in spec)
     if 0 < shot_var < read_var:
-        question_order(shot_var, read_var)
+        warn_of_swapped_levels(shot_var, read_var)
     return FixedLevels(shot_var, read_var)
 
 
 @cache
-def question_order(shot_var: float, read_var: float) -> None:
+def warn_of_swapped_levels(shot_var: float, read_var: float) -> None:
     """Once for each pair of levels: no sensor has more read noise than shot noise at white."""
     said = f"noise ({shot_var:g}, {read_var:g}): read_var is above shot_var, as in no sensor"
     warnings.warn(f"{said}; the order is (shot_var, read_var)", stacklevel=3)
@@ -344,12 +344,12 @@ def question_order(shot_var: float, read_var: float) -> None:
 def _of_profile(spec: str, iso: Iso) -> ProfileLevels:
     if spec.casefold() != ANY_CAMERA:
         try:
-            spelled(spec, published_profiles().names)
+            find_camera(spec, load_profiles().names)
         except ValueError as unknown:
-            short = [*published()["presets"], *camera_names(), *NOISE]
+            short = [*load_presets()["presets"], *camera_names(), *NOISE]
             raise ValueError(
                 f"noise {spec!r} is unknown: {unknown}; use one of {', '.join(short)}, {ANY_CAMERA!r}, maker and model "
-                f"of a camera, or (shot_var, read_var){nearest(spec, short)}; one of your own: rawaug --import FILE.py"
+                f"of a camera, or (shot_var, read_var){suggest(spec, short)}; one of your own: rawaug --import FILE.py"
             ) from None
     return ProfileLevels(spec, iso)
 
@@ -379,10 +379,10 @@ def noise_model(spec: NoiseSpec | NoiseModel, *, iso: Iso = None, poisson: bool 
     if isinstance(spec, Mapping) and "settings" not in spec:  # {name: DarkFrames, path: ...}
         spec = {"name": spec.get("name"), "settings": {key: spec[key] for key in spec if key != "name"}}
     if isinstance(spec, (str, Mapping)):
-        name, settings = name_and_settings(spec)
+        name, settings = split_spec(spec)
         if name not in NOISE:
             noise_levels(name)  # an unknown name is reported before its settings
-            options = checked_settings(f"noise {name!r}", partial(_shot_read, name), settings)
+            options = check_settings(f"noise {name!r}", partial(_shot_read, name), settings)
             return _shot_read(name, **{"iso": iso, "poisson": poisson, **options})
         model: NoiseModel = NOISE.make(spec)
     elif isinstance(spec, NoiseModel):

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rawaug.bayer import CFA, pack, pattern, sites
+from rawaug.bayer import CFA, pack, pattern, plane_indices
 from rawaug.errors import escape, extra
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def estimate_noise(
             left out, and those near another level of clipping, where the file's lowest or highest value piles up.
         cfa: the pattern, of all of them: Bayer's, or X-Trans or Quad-Bayer, of which each site of the cell is a plane
             of its own, so that flat regions must be three or two times as wide.
-        read_var: known from dark frames (:func:`from_dark_frames`); fitted too if omitted.
+        read_var: known from dark frames (:func:`estimate_dark_noise`); fitted too if omitted.
 
     Raises:
         ValueError: if there are too few flat regions, or they do not span a range of signals.
@@ -169,7 +169,7 @@ def _planes(mosaic: Tensor, cfa: CFA | str) -> tuple[Tensor, Tensor]:
         return pack(mosaic, cfa), torch.arange(4)
     size = pattern(cfa).period
     height, width = (side // size * size for side in mosaic.shape[-2:])
-    return F.pixel_unshuffle(mosaic[:, :height, :width], size), sites(cfa).flatten()
+    return F.pixel_unshuffle(mosaic[:, :height, :width], size), plane_indices(cfa).flatten()
 
 
 def _piles_up(frame: Tensor) -> bool:
@@ -297,7 +297,7 @@ class DarkNoise:
     black_offset: tuple[float, float, float, float]
 
 
-def from_dark_frames(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
+def estimate_dark_noise(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
     """The noise without light, the mean over the frames ``(1, H, W)`` of one camera at one ISO.
 
     Raises:
@@ -305,7 +305,7 @@ def from_dark_frames(frames: Sequence[Tensor], cfa: CFA | str) -> DarkNoise:
 
     Example:
         >>> frame = torch.randn(1, 256, 256, generator=torch.Generator().manual_seed(0)) * 1e-3
-        >>> dark = from_dark_frames([frame], "RGGB")
+        >>> dark = estimate_dark_noise([frame], "RGGB")
         >>> 0.9e-6 < dark.read_var < 1.1e-6  # for estimate_noise(mosaics, cfa, read_var=dark.read_var)
         True
     """

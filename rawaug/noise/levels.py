@@ -37,7 +37,7 @@ class NoiseLevels(Protocol):
 
 
 @cache
-def published() -> dict[str, Any]:
+def load_presets() -> dict[str, Any]:
     """The package's ``presets.json``: published levels, each with its source."""
     data: dict[str, Any] = json.loads(resources.files("rawaug.noise").joinpath("presets.json").read_text("utf-8"))
     return data
@@ -102,7 +102,7 @@ class Preset:
     """A published preset: ``upi``, ``cycleisp_dnd``, ``cycleisp_sidd`` or ``rawir``."""
 
     def __init__(self, name: str) -> None:
-        law = _known("noise preset", name, published()["presets"])
+        law = _known("noise preset", name, load_presets()["presets"])
         self.name = name
         self.shot_range: tuple[float, float] = tuple(law["shot"])
         self.line: dict[str, float] = law["read_line"]
@@ -130,7 +130,7 @@ def iso_limits(camera: str, iso: Iso, measured: tuple[float, float]) -> tuple[fl
     return float(low), float(high)
 
 
-def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
+def interpolate_levels(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
     """(shot_var, read_var), each ``(B,)``, at ISO values ``(B,)``, linear in the logarithms.
 
     ``table`` ``(3, N >= 2)`` float64 has those of ISO, ascending, shot_var and read_var.
@@ -144,7 +144,7 @@ def interpolated(table: Tensor, iso: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class SiddLevels:
-    """One of SIDD's phones: interpolated in the logarithms of ISO and variance between the tabulated ISOs.
+    """One of SIDD's phones, interpolated in the logarithms of ISO and variance between the tabulated ISOs.
 
     Args:
         phone: ``iPhone 7``, ``Google Pixel``, ``Samsung Galaxy S6 Edge``, ``Motorola Nexus 6`` or ``LG G4``.
@@ -152,20 +152,20 @@ class SiddLevels:
     """
 
     def __init__(self, phone: str, iso: Iso = None) -> None:
-        levels = _known("SIDD phone", phone, published()["sidd_noise_level_function"]["cameras"])
+        levels = _known("SIDD phone", phone, load_presets()["sidd_noise_level_function"]["cameras"])
         rows = sorted((float(iso), *pair) for iso, pair in levels.items())
         self.table = torch.tensor(rows, dtype=torch.float64).log().T.contiguous()
         self.iso = iso_limits(phone, iso, (rows[0][0], rows[-1][0]))
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        return interpolated(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
+        return interpolate_levels(self.table.to(generator.device), log_uniform(self.iso, batch, generator))
 
 
 class PmridLevels:
     """The OPPO Reno 10x of PMRID: gain linear, read variance quadratic in the ISO, one or limits within 100 to 6400."""
 
     def __init__(self, iso: Iso = None) -> None:
-        self.law: dict[str, Any] = published()["pmrid"]
+        self.law: dict[str, Any] = load_presets()["pmrid"]
         self.iso = iso_limits("pmrid", iso, tuple(self.law["iso"]))
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -181,7 +181,7 @@ class EldLevels:
     """
 
     def __init__(self, camera: str, iso: Iso = None) -> None:
-        law = published()["eld"]
+        law = load_presets()["eld"]
         self.camera: dict[str, Any] = _known("ELD camera", camera, law["cameras"])
         self.white_dn = float(law["white_dn"])
         self.lowest_iso = float(law["iso"][0])

@@ -27,7 +27,7 @@ from rawaug.kernels import fastest
 from rawaug.kernels.reference import normals
 from rawaug.kernels.runtime import eager
 from rawaug.noise.levels import NoiseLevels
-from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.seeding import derive_seed, keyed_generator
 
 Params = dict[str, Tensor]
 """By name, tensors whose first dimension is the batch."""
@@ -98,7 +98,7 @@ def require_batch(clean: Tensor, params: Params) -> None:
             )
 
 
-def new_seeds(batch: int, generator: torch.Generator) -> Tensor:
+def draw_seeds(batch: int, generator: torch.Generator) -> Tensor:
     """One int64 seed a picture, ``(batch,)``."""
     return torch.randint(2**63 - 1, (batch,), generator=generator, device=generator.device)
 
@@ -108,7 +108,7 @@ def per_picture(value: Tensor, like: Tensor) -> Tensor:
     return value.to(like).reshape(-1, 1, 1, 1)
 
 
-def drawn_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
+def draw_normals(like: Tensor, generators: Iterable[torch.Generator]) -> Tensor:
     """Standard normals in the shape and type of ``like``, one generator a picture."""
     drawn = torch.empty_like(like, memory_format=torch.contiguous_format)
     for picture, generator in zip(drawn, generators, strict=True):
@@ -127,7 +127,7 @@ class ShotReadModel(NoiseModel):
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         """``shot_var``, ``read_var`` and ``seed``, each ``(batch,)``."""
         shot_var, read_var = self.levels.sample(batch, generator)
-        return {"shot_var": shot_var, "read_var": read_var, "seed": new_seeds(batch, generator)}
+        return {"shot_var": shot_var, "read_var": read_var, "seed": draw_seeds(batch, generator)}
 
     def variance(self, clean: Tensor, params: Params) -> Tensor:
         return noise_variance(clean, *(per_picture(params[name], clean) for name in ("shot_var", "read_var")))
@@ -180,10 +180,10 @@ class ShotReadNoise(ShotReadModel):
     def _normals(self, like: Tensor, params: Params) -> Tensor:
         if like.device.type == "cpu":
             return torch.stack([normals(key, *like.shape[-2:]) for key in self._keys(params)]).to(like)
-        return drawn_normals(like, self.generators(params, like.device))
+        return draw_normals(like, self.generators(params, like.device))
 
     def _keys(self, params: Params) -> list[int]:
-        return [derived_seed(seed, self.stream) for seed in params["seed"].tolist()]
+        return [derive_seed(seed, self.stream) for seed in params["seed"].tolist()]
 
 
 class PoissonGaussianNoise(ShotReadModel):
@@ -203,13 +203,13 @@ class PoissonGaussianNoise(ShotReadModel):
         """The noise of a group of pictures; of each, photons are drawn first, then read noise."""
         shot_var = per_picture(params["shot_var"][group], clean)
         light = clean.clamp(min=0)
-        photons = poisson(light / shot_var.clamp(min=_NO_SHOT), drawn_normals(clean, generators)).mul_(shot_var)
+        photons = poisson(light / shot_var.clamp(min=_NO_SHOT), draw_normals(clean, generators)).mul_(shot_var)
         noise = photons.sub_(light).masked_fill_(shot_var <= _NO_SHOT, 0.0)
         return noise.add_(self.read_noise(clean, {name: value[group] for name, value in params.items()}, generators))
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         """Read noise of the shape ``(b, 4, h, w)`` of ``like``, from one generator a picture."""
-        return drawn_normals(like, generators).mul_(per_picture(params["read_var"], like).sqrt())
+        return draw_normals(like, generators).mul_(per_picture(params["read_var"], like).sqrt())
 
 
 def poisson(rate: Tensor, normals: Tensor) -> Tensor:
@@ -222,13 +222,13 @@ def poisson(rate: Tensor, normals: Tensor) -> Tensor:
     piece = _CACHED if rate.device.type == "cpu" else max(rate.numel(), 1)
     for part, out in zip(rate.reshape(-1).split(piece), normals.view(-1).split(piece), strict=True):
         low = part < INVERSION_LIMIT
-        walked = _walked(part[low], out[low]).to(out)
-        out.copy_(_expanded(part, out))
+        walked = _invert_sum(part[low], out[low]).to(out)
+        out.copy_(_invert_expansion(part, out))
         out[low] = walked
     return normals
 
 
-def _expanded(rate: Tensor, w: Tensor) -> Tensor:
+def _invert_expansion(rate: Tensor, w: Tensor) -> Tensor:
     """Giles' expansion to the order 1 / rate, rounded down."""
     root = rate.clamp(min=INVERSION_LIMIT).sqrt()
     w2 = w * w
@@ -236,7 +236,7 @@ def _expanded(rate: Tensor, w: Tensor) -> Tensor:
     return (rate + w * root + (1 / 3 + w2 / 6) + tail / root).floor_().clamp_(min=0)
 
 
-def _walked(rate: Tensor, w: Tensor) -> Tensor:
+def _invert_sum(rate: Tensor, w: Tensor) -> Tensor:
     """The number of k with F(k) < Phi(w), in double precision: in single, the sum would stop short of the far tail."""
     rate, u = rate.double(), torch.special.ndtr(w.double()).clamp_(max=1 - 1e-13)  # which the sum does reach
     term = torch.exp(-rate)

@@ -25,15 +25,15 @@ from torch import Tensor
 
 from rawaug.bayer import pack
 from rawaug.noise.cameras import noise_levels
-from rawaug.noise.estimate import from_dark_frames
+from rawaug.noise.estimate import estimate_dark_noise
 from rawaug.noise.levels import EldLevels, FixedLevels, Iso, NoiseLevels, log_uniform, normal, uniform
 from rawaug.noise.models import (
     NoiseModel,
     Params,
     PoissonGaussianNoise,
     ShotReadNoise,
-    drawn_normals,
-    new_seeds,
+    draw_normals,
+    draw_seeds,
     per_picture,
 )
 from rawaug.registry import NOISE, require_between
@@ -51,7 +51,7 @@ def _require_not_negative(**values: Range) -> None:
             raise ValueError(f"{name} must be at least 0, or a range (low, high) with 0 < low <= high, got {value}")
 
 
-def draw(value: Range, batch: int, generator: torch.Generator) -> Tensor:
+def draw_between(value: Range, batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)``: the value, or log-uniform draws between its limits."""
     if isinstance(value, tuple):
         return log_uniform(value, batch, generator)
@@ -111,12 +111,12 @@ class _Banding(NoiseModel):
         self.line_var = line_var
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        return {self.key: draw(self.line_var, batch, generator), "seed": new_seeds(batch, generator)}
+        return {self.key: draw_between(self.line_var, batch, generator), "seed": draw_seeds(batch, generator)}
 
     @torch.no_grad()
     def disturb(self, clean: Tensor, params: Params, out: Tensor | None = None) -> Tensor:
         one = clean[:, :2].narrow(self.across, 0, min(1, clean.shape[self.across]))
-        lines = drawn_normals(one, self.generators(params, clean.device))
+        lines = draw_normals(one, self.generators(params, clean.device))
         lines *= per_picture(params[self.key], clean).sqrt()
         return torch.add(clean, lines[:, self.line_of_plane], out=out)
 
@@ -210,8 +210,11 @@ class DefectPixels(_FixedPattern):
         self.dead, self.hot, self.clusters = dead, hot, clusters
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
-        shares = {"dead_share": draw(self.dead, batch, generator), "hot_share": draw(self.hot, batch, generator)}
-        return shares | {"seed": new_seeds(batch, generator)}
+        shares = {
+            "dead_share": draw_between(self.dead, batch, generator),
+            "hot_share": draw_between(self.hot, batch, generator),
+        }
+        return shares | {"seed": draw_seeds(batch, generator)}
 
     def generators(self, params: Params, device: torch.device) -> Iterator[torch.Generator]:
         """Frames of a burst, each with a seed of its own, have the defects of one sensor."""
@@ -248,7 +251,7 @@ class Quantisation(NoiseModel):
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         if len(self.quanta) == 1:
-            return {"quantum": draw(self.quanta[0], batch, generator)}
+            return {"quantum": draw_between(self.quanta[0], batch, generator)}
         chosen = torch.randint(len(self.quanta), (batch,), generator=generator, device=generator.device)
         return {"quantum": torch.tensor(self.quanta, device=generator.device)[chosen]}
 
@@ -406,14 +409,14 @@ class DarkFrames(PoissonGaussianNoise):
         if untagged:
             raise ValueError(f"DarkFrames: {untagged[0]} has no NoiseProfile tag; give shot_var, the photons' share")
         self.planes = [pack(frame.mosaic[None], frame.cfa)[0] for frame in frames]
-        self.read_var = torch.tensor([from_dark_frames([frame.mosaic], frame.cfa).read_var for frame in frames])
+        self.read_var = torch.tensor([estimate_dark_noise([frame.mosaic], frame.cfa).read_var for frame in frames])
         self.shot_var = [frame.noise_profile[0] if shot_var is None else shot_var for frame in frames]  # type: ignore[index]
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         frame = torch.randint(len(self.planes), (batch,), generator=generator, device=generator.device)
-        shot = torch.stack([draw(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
+        shot = torch.stack([draw_between(self.shot_var[k], 1, generator)[0] for k in frame.tolist()])
         read = self.read_var.to(generator.device)[frame]
-        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": new_seeds(batch, generator)}
+        return {"shot_var": shot, "read_var": read, "dark_frame": frame, "seed": draw_seeds(batch, generator)}
 
     def read_noise(self, like: Tensor, params: Params, generators: Sequence[torch.Generator]) -> Tensor:
         noise = torch.empty_like(like, memory_format=torch.contiguous_format)

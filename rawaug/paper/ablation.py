@@ -34,18 +34,18 @@ from rawaug.evaluation.tables import mean_and_spread, print_rows
 from rawaug.experiment.run_folder import claim, require_free
 from rawaug.files import fingerprint, write_json
 from rawaug.isp import staged
-from rawaug.isp.cameras import colour_matrix, published_cameras, sample_lights, white_balance
+from rawaug.isp.cameras import camera_from_srgb, gains_in_light, load_cameras, sample_lights
 from rawaug.isp.config import POINTWISE_STAGES
-from rawaug.isp.dictionary import plausible
+from rawaug.isp.dictionary import is_plausible
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.descent import cycle_error
 from rawaug.isp.fit.samples import block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.metrics import psnr, worst_and_best_quarter
 from rawaug.paper.methods import cycled_without_mosaic, resumed, reverse_parameters
 from rawaug.progress import progress
-from rawaug.registry import EXPERIMENTS, checked_settings
+from rawaug.registry import EXPERIMENTS, check_settings
 from rawaug.seeding import keyed_generator
 
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
@@ -150,7 +150,7 @@ def _comparable(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return blocks.srgb[None], blocks.raw[None], blocks.place, (~blocks.clipped)[None, None]
     picked = (..., slice(None, None, STRIDE), slice(None, None, STRIDE))
     raw = bayer.demosaic(pair.raw[None], pair.cfa)[picked]
-    place = place_in_frame(*pair.raw.shape[-2:])[picked]
+    place = frame_coordinates(*pair.raw.shape[-2:])[picked]
     srgb = as_float(pair.srgb[None])[picked]
     return srgb, raw, place, (srgb.amax(1, keepdim=True) < 0.98) & (raw.amax(1, keepdim=True) < 0.98)
 
@@ -229,7 +229,7 @@ class ComponentAblation:
         for name, changes in self.variants.items():
             if "seed" in changes:
                 raise ValueError(f"variants: {name}: all variants of a run share its seed; set seed, not fit.seed")
-            replace(self.fit, **checked_settings(f"variants: {name}", FitConfig, changes))
+            replace(self.fit, **check_settings(f"variants: {name}", FitConfig, changes))
 
     def shortest(self) -> ComponentAblation:
         """A few steps of every variant, on two frames."""
@@ -270,7 +270,7 @@ def ablate_components(learned: ComponentAblation, overwrite: bool = False) -> di
 
 def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: int, part: str) -> list[Pair]:
     """A frame of 288 x 448 of each picture, the cameras in turn, each in a light of its own."""
-    matrices = published_cameras().named(cameras)
+    matrices = load_cameras().select(cameras)
     frames = []
     for k, picture in enumerate(pictures):
         which = k % len(cameras)
@@ -280,10 +280,10 @@ def synthetic_frames(pictures: Sequence[Tensor], cameras: Sequence[str], seed: i
 
 
 def _frame(picture: Tensor, xyz_to_camera: Tensor, generator: torch.Generator, name: str) -> Pair:
-    balances = white_balance(xyz_to_camera, torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))).numpy()
-    red, green, blue = balances[plausible(balances)][0].tolist()
+    balances = gains_in_light(xyz_to_camera, torch.from_numpy(sample_lights(LIGHTS_TRIED, generator))).numpy()
+    red, green, blue = balances[is_plausible(balances)][0].tolist()
     least = min(red, green, blue)
-    to_srgb = torch.linalg.inv(colour_matrix(xyz_to_camera)).tolist()
+    to_srgb = torch.linalg.inv(camera_from_srgb(xyz_to_camera)).tolist()
     camera = DemoCamera(color_matrix=tuple((r, g, b) for r, g, b in to_srgb))
     shot = camera.sample(generator, iso=100)._replace(white_balance=(red / least, green / least, blue / least))
     return camera.apply(_scene(picture, generator), shot, name)

@@ -30,7 +30,7 @@ from rawaug.noise import NoiseModel, noise_model
 from rawaug.paper.methods import Method
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
-from rawaug.seeding import derived_seed, keyed_generator
+from rawaug.seeding import derive_seed, keyed_generator
 from rawaug.training.config import DenoiserConfig, TrainConfig
 from rawaug.training.loop import train
 from rawaug.training.stream import PictureCrops, Source, TrainingStream
@@ -94,7 +94,7 @@ def psnr_d(model: Method, pictures: Sequence[Tensor], config: DownstreamConfig, 
 
 def trained_on(crops: Source, config: DownstreamConfig, place: Path, seed: int) -> Denoiser:
     """A denoiser trained on these samples."""
-    stream = TrainingStream(None, crops, config.train.batch, 1.0, derived_seed(seed, "downstream"))
+    stream = TrainingStream(None, crops, config.train.batch, 1.0, derive_seed(seed, "downstream"))
     drawn = (crops.draw(keyed_generator("watched", k)) for k in range(WATCHED))
     watched = [Trial(s.noisy[None], s.clean[None], s.variance[None]) for s in drawn]
     folder = place / f"seed{seed}"

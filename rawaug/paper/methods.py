@@ -44,7 +44,7 @@ from rawaug.isp.config import ISPParams
 from rawaug.isp.fit import FitConfig, fit_isp
 from rawaug.isp.fit.samples import PixelSamples, block_averages, sample_pixels
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import as_float, place_in_frame, placed
+from rawaug.isp.stages import as_float, coordinates_or_full, frame_coordinates
 from rawaug.metrics import PATCH, psnr
 from rawaug.paper.baselines import BASELINES, Training, fit_baseline
 from rawaug.paper.baselines.base import BaselineISP, CropTrainedISP
@@ -182,7 +182,7 @@ def _from_samples(isp: DictionaryISP, pair: Pair, blind: ISPParams) -> ISPParams
     rows, columns = (torch.randint(side, (SAMPLES,), generator=generator) for side in pair.raw.shape[-2:])
     readings = torch.stack([rows.float(), columns.float(), pair.raw[0, rows, columns]], dim=1)[None]
     x = as_float(pair.srgb[None])
-    return staged.with_raw_samples(isp, x, blind, readings, placed(x, None))
+    return staged.with_raw_samples(isp, x, blind, readings, coordinates_or_full(x, None))
 
 
 @torch.no_grad()
@@ -223,7 +223,7 @@ def balanced_psnr(make: Callable[[Tensor, Tensor], Tensor], pair: Pair) -> float
     values = []
     for (top, bottom), (left, right) in product(*map(pairwise, edges)):
         piece = (None, slice(None), slice(top, bottom), slice(left, right))
-        place = place_in_frame(bottom - top, right - left, (top, left), (height, width))
+        place = frame_coordinates(bottom - top, right - left, (top, left), (height, width))
         made = make(pair.srgb[piece], place).clamp(0.0, 1.0)
         values.append(psnr(_seen(made, pair), _seen(pair.raw[piece], pair)).item())
     return fmean(values)

@@ -27,14 +27,14 @@ from rawaug.bayer import CFA, pattern
 from rawaug.isp.config import ISPParams
 from rawaug.isp.dictionary import EXPOSURE, perturb
 from rawaug.isp.fast import BakedISP, FastForward
-from rawaug.isp.model import DictionaryISP, of_cameras
+from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.kernels.runtime import eager
 from rawaug.noise import Iso, NoiseModel, NoiseSpec, ShotReadNoise, camera_law, noise_model
 from rawaug.plugin.finishing import Finish
 from rawaug.plugin.params import AugmentParams, RawPair
 from rawaug.plugin.pictures import even_sided, find_picture, is_picture, picked, replaced, to_rgb_batch
 from rawaug.plugin.targets import Burst, Target, Targets, reaching_white, through_jpeg
-from rawaug.registry import nearest
+from rawaug.registry import suggest
 from rawaug.seeding import keyed_generator, rank_key
 
 Sampling = Literal["convex", "independent", "perturb", "chosen"]
@@ -204,7 +204,7 @@ class RawAugment(nn.Module):
                 raise ValueError("iso is that of one camera's noise: give its name as camera= or noise=")
             settings["noise"] = {"name": named, "settings": {"iso": iso}}
         loaded = isp if isinstance(isp, DictionaryISP) else DictionaryISP.from_pretrained(isp)
-        return cls(loaded if camera is None else of_cameras(loaded, camera), **settings)
+        return cls(loaded if camera is None else restrict_to_cameras(loaded, camera), **settings)
 
     @eager
     @torch.no_grad()
@@ -473,7 +473,7 @@ def tone_weights(isp: DictionaryISP, name: str) -> Tensor:
     names = list(isp.info.get("tones", []))
     if isp.tone is None or name not in names:
         listed = ", ".join(names) or "none by name: its tone is learned"
-        raise ValueError(f"tone {name!r} is no curve of this ISP, which has {listed}{nearest(name, names)}")
+        raise ValueError(f"tone {name!r} is no curve of this ISP, which has {listed}{suggest(name, names)}")
     return torch.eye(len(names))[names.index(name)]
 
 

@@ -28,7 +28,7 @@ from rawaug import bayer
 from rawaug.isp.config import ISPParams
 from rawaug.isp.fast import FastForward
 from rawaug.kernels.runtime import one_thread
-from rawaug.noise.models import new_seeds
+from rawaug.noise.models import draw_seeds
 from rawaug.plugin.finishing import Finish
 from rawaug.plugin.params import AugmentParams
 
@@ -123,7 +123,7 @@ class Burst:
         motion = 2.0 * torch.rand(batch, self.frames, 3, generator=generator) - 1.0
         motion *= torch.tensor([shift, shift, math.radians(degrees)])
         motion[:, 0] = 0.0
-        return {"motion": motion, "frame_seed": new_seeds(batch * self.frames, generator).reshape(batch, self.frames)}
+        return {"motion": motion, "frame_seed": draw_seeds(batch * self.frames, generator).reshape(batch, self.frames)}
 
     def frames_of(self, scene: Tensor, motion: Tensor) -> Tensor:
         """Linear light ``(B, 3, H, W)`` as the frames see it, ``(B * N, 3, H, W)``."""

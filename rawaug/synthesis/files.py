@@ -23,7 +23,7 @@ from rawaug.data.formats import write_npz, write_tiff
 from rawaug.files import digest, read_header, replacing, write_tensors
 from rawaug.io import GainMap, RawFrame, write_dng
 from rawaug.io.pictures import encode_png
-from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, place_in_frame
+from rawaug.isp.stages import ColorCorrection, LensShading, WhiteBalance, frame_coordinates
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.params import RawPair, load_params
 from rawaug.synthesis.maker import Format, Origin, PairMaker, noise_levels, replayed
@@ -200,7 +200,7 @@ def _shading_maps(augment: RawAugment, pair: RawPair) -> tuple[GainMap, ...]:
     y = torch.linspace(0, height, rows) - height / 2
     x = torch.linspace(0, width, columns) - width / 2
     place = torch.stack(torch.meshgrid(y, x, indexing="ij"))[None] / (0.5 * (height**2 + width**2) ** 0.5)
-    mask = lens.mask(place.to(place_in_frame(1, 1)))[0]
+    mask = lens.mask(place.to(frame_coordinates(1, 1)))[0]
     corrected = GainMap(
         area=(0, 0, height, width),
         pitch=(1, 1),

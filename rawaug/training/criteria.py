@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from denoisers.domains import DOMAINS, levels_of
+from denoisers.domains import DOMAINS, fit_levels
 from rawaug.data.pairs import Sample
 from rawaug.registry import LOSSES
 
@@ -55,7 +55,7 @@ def normalised(loss: Criterion, sample: Sample) -> Criterion:
 
 
 def stabilised(loss: Criterion, sample: Sample) -> Criterion:
-    levels, root = levels_of(sample.noisy, sample.variance), DOMAINS["anscombe"]
+    levels, root = fit_levels(sample.noisy, sample.variance), DOMAINS["anscombe"]
     return lambda denoised, clean: loss(*(root.forward(y, *levels) for y in (denoised, clean)))
 
 

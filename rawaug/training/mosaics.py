@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from denoisers.mosaic import entered, with_planes
+from denoisers.mosaic import entry_pattern, with_planes
 from rawaug import bayer
 from rawaug.data.pairs import Sample
 from rawaug.plugin.augment import RawAugment
@@ -29,7 +29,7 @@ class MosaicCrops:
     def __init__(
         self, pictures: Any, augment: RawAugment, crop: int, zoom: float, patterns: Mapping[str, float]
     ) -> None:
-        self.crop, self.patterns = crop, [entered(bayer.pattern(name)) for name in patterns]
+        self.crop, self.patterns = crop, [entry_pattern(bayer.pattern(name)) for name in patterns]
         self.shares = torch.tensor([*patterns.values()])
         room = max(pattern.period for pattern in self.patterns)
         self.pairs = []

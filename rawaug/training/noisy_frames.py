@@ -25,7 +25,7 @@ from torch import Tensor
 
 from denoisers.classical import NonLocalMeans, Stabilised
 from rawaug import bayer
-from rawaug.bayer import CFA, aligned
+from rawaug.bayer import CFA, crop_to_cfa
 from rawaug.data.development import develop_packed
 from rawaug.data.pairs import Lazy, Pair, Sample
 from rawaug.noise import ShotReadModel, anscombe, camera_law
@@ -177,7 +177,7 @@ def held_out(frames: Sequence[NoisyFrame], cfa: CFA, seed: int = 0) -> list[Samp
     samples, estimator = [], R2R()
     for frame in frames:
         images = torch.cat([frame.shots[:1], frame.signal])
-        packed = bayer.pack(aligned(images, frame.cfa, cfa)[:, None], cfa)
+        packed = bayer.pack(crop_to_cfa(images, frame.cfa, cfa)[:, None], cfa)
         drawn = estimator.sample(packed.shape[1:], keyed_generator(seed, "held out", frame.name))
         sample = estimator.apply(NoisyCrop(packed[:1], packed[1], frame.shot_var, frame.read_var), drawn)
         samples.append(Sample(*(x[None] for x in sample)))

@@ -20,7 +20,7 @@ from torch import Tensor
 from rawaug.data.pairs import Sample
 from rawaug.isp.stages import as_float
 from rawaug.noise.levels import uniform
-from rawaug.noise.models import Params, drawn_normals, new_seeds, per_picture, poisson
+from rawaug.noise.models import Params, draw_normals, draw_seeds, per_picture, poisson
 from rawaug.plugin.dataset import crop_size, random_patch
 from rawaug.plugin.targets import through_jpeg
 from rawaug.registry import SRGB_NOISE, require_between
@@ -51,10 +51,10 @@ class WhiteNoise:
 
     def sample(self, batch: int, generator: torch.Generator) -> Params:
         low, high = self.sigma
-        return {"sigma": (low + (high - low) * uniform(generator, batch)) / 255, "seed": new_seeds(batch, generator)}
+        return {"sigma": (low + (high - low) * uniform(generator, batch)) / 255, "seed": draw_seeds(batch, generator)}
 
     def apply(self, srgb: Tensor, params: Params) -> Tensor:
-        normals = drawn_normals(srgb, _generators(params))
+        normals = draw_normals(srgb, _generators(params))
         return (srgb + per_picture(params["sigma"], srgb) * normals).clamp_(0.0, 1.0)
 
 
@@ -89,17 +89,17 @@ class BsrganNoise:
             "photons": torch.where(drawn < self.poisson, 10.0 ** (2.0 + 2.0 * photons), 0.0),
             "grey": grey < 0.5,
             "quality": torch.randint(self.jpeg[0], self.jpeg[1] + 1, (batch,), generator=generator),
-            "seed": new_seeds(batch, generator),
+            "seed": draw_seeds(batch, generator),
         }
 
     def apply(self, srgb: Tensor, params: Params) -> Tensor:
         generators = _generators(params)
-        mixed = torch.einsum("bij,bjhw->bihw", params["mixing"].to(srgb), drawn_normals(srgb, generators))
+        mixed = torch.einsum("bij,bjhw->bihw", params["mixing"].to(srgb), draw_normals(srgb, generators))
         noisy = (srgb + mixed).clamp_(0.0, 1.0)
         for picture, photons, grey, generator in zip(noisy, params["photons"], params["grey"], generators, strict=True):
             if photons:
                 light = torch.einsum("c,chw->hw", _LUMA.to(picture), picture)[None] if grey else picture
-                normals = drawn_normals(light[None], [generator])[0]
+                normals = draw_normals(light[None], [generator])[0]
                 picture += poisson(light * photons, normals) / photons - light
         return through_jpeg(noisy.clamp_(0.0, 1.0), params["quality"])
 

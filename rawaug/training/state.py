@@ -21,7 +21,7 @@ from denoisers.files import find
 from denoisers.network import Denoiser
 from rawaug.bayer import CFA
 from rawaug.files import replacing, sha256
-from rawaug.seeding import derived_seed
+from rawaug.seeding import derive_seed
 from rawaug.training.config import DenoiserConfig, TrainConfig
 
 
@@ -42,7 +42,7 @@ def start_of(config: DenoiserConfig) -> Start | None:
 
 def first_network(config: DenoiserConfig, seed: int) -> Denoiser:
     """The network before its first step, in train mode; layers that it has beyond those of its start are drawn."""
-    drawn = {"seed": derived_seed(seed, "network") % 2**31, **config.settings}
+    drawn = {"seed": derive_seed(seed, "network") % 2**31, **config.settings}
     if config.start is None:
         return denoisers.build(config.name, **drawn)
     model, _ = denoisers.load(find(config.start))

@@ -77,7 +77,7 @@ def packed_crop(
     height, width = mosaics[0].shape[-2:]
     if min(height, width) < crop + 6:
         raise ValueError(f"{name}: a frame of {height} x {width} is too small for train.crop={crop}")
-    mosaics = [bayer.aligned(mosaic, own, cfa) for mosaic in mosaics]
+    mosaics = [bayer.crop_to_cfa(mosaic, own, cfa) for mosaic in mosaics]
     side = crop + 4  # turned, then cut to size, so that lines lost to the CFA do not show
     top, left = (2 * int(torch.randint((n - side) // 2 + 1, (), generator=generator)) for n in mosaics[0].shape[-2:])
     view = int(torch.randint(bayer.N_VIEWS, (), generator=generator))

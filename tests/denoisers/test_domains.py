@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from denoisers.domains import DOMAINS, KSigma, levels_of
+from denoisers.domains import DOMAINS, KSigma, fit_levels
 
 LEVELS = [(1e-2, 1e-3), (1e-3, 1e-5), (KSigma.least_shot, 1e-6)]
 
@@ -50,11 +50,11 @@ def test_levels_are_read_off_the_map() -> None:
     noisy = torch.rand(3, 4, 16, 16, generator=torch.Generator().manual_seed(0)) - 0.1
     shot, read = torch.tensor([1e-2, 1e-3, 0.0]), torch.tensor([1e-4, 0.0, 1e-5])
     variance = shot.reshape(-1, 1, 1, 1) * noisy.clamp_min(0.0) + read.reshape(-1, 1, 1, 1)
-    found = levels_of(noisy, variance)
+    found = fit_levels(noisy, variance)
     torch.testing.assert_close(found[0].flatten(), shot, rtol=1e-4, atol=1e-8)
     torch.testing.assert_close(found[1].flatten(), read, rtol=1e-3, atol=1e-8)
     flat = torch.full((1, 4, 8, 8), 0.5)  # no slope can be known, the variance can
-    shot, read = levels_of(flat, torch.full_like(flat, 1e-3))
+    shot, read = fit_levels(flat, torch.full_like(flat, 1e-3))
     assert (0.5 * shot + read).item() == pytest.approx(1e-3)
 
 

@@ -147,7 +147,7 @@ def test_a_name_or_a_path_gives_the_network(tmp_path: Path, monkeypatch: pytest.
         from_pretrained("huge")
 
 
-@pytest.mark.parametrize("name", pretrained.shipped())
+@pytest.mark.parametrize("name", pretrained.list_shipped())
 def test_every_shipped_denoiser_has_its_card_and_the_template_its_fields(name: str) -> None:
     weights = pretrained.FOLDER / f"{name}.safetensors"
     card = weights.with_suffix(".md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import denoisers
 from denoisers import DRUNet, JointDRUNet, SelfEnsemble, tiled
-from denoisers.domains import DOMAINS, levels_of
+from denoisers.domains import DOMAINS, fit_levels
 from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.denoise.denoiser import Noisy, RawDenoiser
@@ -29,7 +29,7 @@ def noisy_raw(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 def malvar(noisy: Tensor, variance: Tensor, cfa: CFA = CFA.RGGB, denoised: Tensor | None = None) -> Tensor:
     """Malvar's interpolation, where the noise is white, of noisy RAW or of what became of it."""
-    levels, root = levels_of(noisy, variance), DOMAINS["anscombe"]
+    levels, root = fit_levels(noisy, variance), DOMAINS["anscombe"]
     packed = noisy if denoised is None else denoised
     mosaic = bayer.unpack(root.forward(packed, *levels), cfa)
     return root.inverse(bayer.demosaic(mosaic, cfa, "malvar"), *levels)

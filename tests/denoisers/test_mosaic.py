@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from denoisers import DRUNet, MosaicDRUNet, tiled
-from denoisers.mosaic import OfBayer, entered, mended, of_pattern, with_planes
+from denoisers.mosaic import BayerAdapter, denoise_mosaic, entry_pattern, mend_mosaic, with_planes
 from rawaug import bayer
 from rawaug.bayer import pattern
 from rawaug.training.config import DenoiserConfig
@@ -54,7 +54,7 @@ def test_it_starts_from_a_network_of_packed_raw_as_that_network() -> None:
     own = MosaicDRUNet(**SMALL, mend=False)
     own.start_from(packed)
     noisy, variance = (bayer.pack(x, "RGGB") for x in noisy_mosaic("RGGB", 128, 128))
-    expected, found = packed(noisy, variance), OfBayer(own)(noisy, variance)
+    expected, found = packed(noisy, variance), BayerAdapter(own)(noisy, variance)
     assert (expected - noisy).square().mean() > 1e-5
     # but for the mean light of a cell, which is one for both greens
     assert (found - expected).square().mean() < 0.01 * (expected - noisy).square().mean()
@@ -83,7 +83,7 @@ def test_tiles_are_the_whole_mosaic(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*bayer.PATTERNS, "XTRANS+1+0", "XTRANS+2+5", "QUAD-RGGB+1+2"])
 def test_a_network_meets_every_pattern_where_it_is_trained_to(name: str) -> None:
-    met = entered(pattern(name))
+    met = entry_pattern(pattern(name))
     squares = bayer.pack(met.channels(12, 12)[None], "RGGB").flatten(1).T
     counts = torch.stack([(squares == colour).sum(1) for colour in range(3)])
     whole = (counts == torch.tensor([1, 2, 1])[:, None]).all(0).float().mean().item()
@@ -94,7 +94,7 @@ def test_a_network_meets_every_pattern_where_it_is_trained_to(name: str) -> None
         assert torch.equal(given[0, 1:, 1:, 1:].argmax(0), met.channels(*told.shape[-2:])[1:, 1:])
         return given[:, :1]
 
-    assert torch.equal(of_pattern(run, noisy, variance, name), noisy)
+    assert torch.equal(denoise_mosaic(run, noisy, variance, name), noisy)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -103,12 +103,12 @@ def test_hot_and_dead_pixels_are_mended_and_nothing_else(name: str) -> None:
     signal = noisy_mosaic(name)[0] * 0 + 30.0 * (1 + torch.linspace(0, 1, width))
     signal = signal + 10.0 * known.channels(height, width) + torch.randn(signal.shape, generator=seeded(3))
     planes = known.planes(height, width)[None]
-    assert (mended(signal, planes) != signal).float().mean() < 1e-3
+    assert (mend_mosaic(signal, planes) != signal).float().mean() < 1e-3
     damaged = signal.clone()
     places = [(9, 11), (20, 31), (33, 40)]
     for (row, column), value in zip(places, (200.0, 0.0, 150.0), strict=True):
         damaged[..., row, column] = value
-    repaired = mended(damaged, planes)
+    repaired = mend_mosaic(damaged, planes)
     for row, column in places:
         assert (repaired - signal)[..., row, column].abs() < 12.0
 

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 import denoisers
 from denoisers import DHDN, CycleISPDenoiser, Denoiser, DnCNN, UNet
-from denoisers.network import mended, pad_to_multiple
+from denoisers.network import mend_planes, pad_to_multiple
 from denoisers.networks import DRUNet, NAFNet
 from denoisers.pmrid import PMRID
 
@@ -220,15 +220,15 @@ def test_limits_tell_a_network_where_the_sensor_clips() -> None:
 def test_single_defects_are_mended_and_nothing_else() -> None:
     ramp = torch.linspace(10.0, 60.0, 64).expand(1, 4, 64, 64)
     signal = ramp + torch.randn(1, 4, 64, 64, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(mended(signal), signal), "noise is none"
+    assert torch.equal(mend_planes(signal), signal), "noise is none"
     faulty = signal.clone()
     faulty[0, 0, 20, 30], faulty[0, 3, 40, 50], faulty[0, 1, 0, 0] = 90.0, 1.2, 60.0  # hot, dead, in a corner
-    torch.testing.assert_close(mended(faulty), signal, rtol=0, atol=5.0)
-    assert (mended(faulty) != faulty).sum() == 3
+    torch.testing.assert_close(mend_planes(faulty), signal, rtol=0, atol=5.0)
+    assert (mend_planes(faulty) != faulty).sum() == 3
     scene = signal.clone()
     scene[0, :, 20, 30] += torch.tensor([30.0, 50.0, 45.0, 25.0])  # a star, in all colours
     scene[..., 40] += 40.0  # a line
-    assert torch.equal(mended(scene), scene)
+    assert torch.equal(mend_planes(scene), scene)
 
 
 @torch.no_grad()

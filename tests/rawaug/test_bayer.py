@@ -47,7 +47,7 @@ def test_a_turn_moves_the_pattern_as_it_says_or_keeps_it(cfa: CFA, view: int, he
     mosaic = colour_map(cfa, height, width)
     kept, turned = bayer.turn_keeping_cfa(mosaic, cfa, view), bayer.turn(mosaic, view)
     assert torch.equal(kept, colour_map(cfa, *kept.shape[-2:]))
-    assert torch.equal(turned, colour_map(cfa.turned(view), *turned.shape[-2:]))
+    assert torch.equal(turned, colour_map(cfa.turn(view), *turned.shape[-2:]))
 
 
 def test_views_flip_and_turn() -> None:
@@ -85,7 +85,7 @@ def test_a_random_turn_keeps_the_pattern_unless_asked(
     view = transform.sample(torch.Generator().manual_seed(seed))
     assert quarter or view < 4
     turned = transform.apply(colour_map(cfa, height, width), view)
-    assert torch.equal(turned, colour_map(cfa if keep else cfa.turned(int(view)), *turned.shape[-2:]))
+    assert torch.equal(turned, colour_map(cfa if keep else cfa.turn(int(view)), *turned.shape[-2:]))
     assert torch.equal(transform(colour_map(cfa, height, width), torch.Generator().manual_seed(seed)), turned)
 
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from rawaug.camera_names import alike, key_of, spelled
+from rawaug.camera_names import camera_key, find_camera, similar_cameras
 from rawaug.cli import main
-from rawaug.isp.cameras import published_cameras
-from rawaug.noise.cameras import noise_levels, published_profiles
+from rawaug.isp.cameras import load_cameras
+from rawaug.noise.cameras import load_profiles, noise_levels
 
-MATRICES, PROFILES = published_cameras().names, published_profiles().names
+MATRICES, PROFILES = load_cameras().names, load_profiles().names
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ MATRICES, PROFILES = published_cameras().names, published_profiles().names
     ],
 )
 def test_marketing_names_are_those_of_the_files(said: str, listed: str) -> None:
-    assert spelled(said, MATRICES) == spelled(said, PROFILES) == listed
+    assert find_camera(said, MATRICES) == find_camera(said, PROFILES) == listed
 
 
 def test_no_two_cameras_share_a_key() -> None:
@@ -44,22 +44,22 @@ def test_no_two_cameras_share_a_key() -> None:
     plain: dict[str, set[str]] = {}
     for name in {*MATRICES, *PROFILES} - beginnings:
         letters = "".join(c for c in name.casefold().replace("mark ii", "ii").replace("markii", "ii") if c.isalnum())
-        plain.setdefault(key_of(name), set()).add(letters)
+        plain.setdefault(camera_key(name), set()).add(letters)
     assert not {key: names for key, names in plain.items() if len(names) > 1}
 
 
 def test_names_as_they_are_listed_come_first() -> None:
-    assert all(spelled(name, MATRICES).casefold() == name.casefold() for name in MATRICES)
+    assert all(find_camera(name, MATRICES).casefold() == name.casefold() for name in MATRICES)
 
 
 def test_an_unknown_camera_is_compared_by_its_words() -> None:
     with pytest.raises(ValueError, match="similar: Sony ILCE-7M3; rawaug info cameras lists all"):
-        spelled("A7 III", MATRICES)
+        find_camera("A7 III", MATRICES)
     with pytest.raises(ValueError, match="camera 'iPhone 12' is not listed; rawaug info"):
-        spelled("iPhone 12", MATRICES)
+        find_camera("iPhone 12", MATRICES)
     with pytest.raises(ValueError, match="similar: Nikon D750,"):
         noise_levels("Nikon D75O")
-    assert alike("mark iii canon 5d", PROFILES) == ["Canon EOS 5D Mark III"]
+    assert similar_cameras("mark iii canon 5d", PROFILES) == ["Canon EOS 5D Mark III"]
 
 
 def test_the_list_says_what_is_known_of_each(capsys: pytest.CaptureFixture[str], refused: Callable[..., str]) -> None:
@@ -74,7 +74,7 @@ def test_the_list_says_what_is_known_of_each(capsys: pytest.CaptureFixture[str],
         low < high for _, *ends in camera["noise"] for low, high in ends
     )
     index = MATRICES.index("Nikon D850")
-    assert camera["xyz_to_camera"] == published_cameras().xyz_to_camera[index].tolist()
+    assert camera["xyz_to_camera"] == load_cameras().xyz_to_camera[index].tolist()
     assert main(["info", "cameras"]) == 0
     everything = capsys.readouterr().out
     assert {"Google Pixel", "SonyA7S2"} <= {line.split("  ")[0] for line in everything.splitlines()}

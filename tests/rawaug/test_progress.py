@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from rawaug.progress import progress, quiet
+from rawaug.progress import hide_progress, progress
 
 
 class Terminal(io.StringIO):
@@ -57,10 +57,10 @@ def test_what_is_nested_has_lines_of_its_own(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_is_quiet_or_not_shown_prints_nothing() -> None:
     screen = Terminal()
     list(progress(range(3), label="read", unit="frame", shown=False, stream=screen))
-    with quiet():
+    with hide_progress():
         bar = progress(range(3), label="train", unit="step", stream=screen)
         bar.set_postfix_str("loss 1", refresh=False)
         assert list(bar) == [0, 1, 2]
-    with quiet(False):
+    with hide_progress(False):
         assert list(progress(range(3), label="train", unit="step", stream=screen)) == [0, 1, 2]
     assert screen.getvalue().count("train:   0%") == 1

@@ -6,7 +6,7 @@ import pytest
 
 from rawaug.experiment.recipe import ArmConfig
 from rawaug.noise import EldNoise, SensorNoise, noise_model
-from rawaug.registry import BASELINES, DATASETS, ESTIMATORS, FILTERS, LOSSES, Registry, name_and_settings
+from rawaug.registry import BASELINES, DATASETS, ESTIMATORS, FILTERS, LOSSES, Registry, split_spec
 from rawaug.training.estimators import R2R, Noisier
 
 
@@ -56,4 +56,4 @@ def test_noise_has_settings_by_name() -> None:
 def test_an_arm_names_its_estimator() -> None:
     estimator = ESTIMATORS.make({"name": "noisier", "settings": {"alpha": 0.7, "correct": True}})
     assert isinstance(estimator, Noisier) and (estimator.alpha, estimator.correct) == (0.7, True)
-    assert name_and_settings(ArmConfig().estimator) == ("supervised", {})
+    assert split_spec(ArmConfig().estimator) == ("supervised", {})

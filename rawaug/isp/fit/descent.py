@@ -66,7 +66,7 @@ def weight_distance(ours: ISPParams, theirs: ISPParams) -> Tensor:
 
 
 @torch.no_grad()
-def decibels(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> float:
+def mean_psnr(isp: DictionaryISP, frames: FitFrames, as_shot: bool = False) -> float:
     """Mean PSNR of the frames, each in the setting that the ISP chooses for its thumbnail, or with as-shot gains."""
     values = []
     for k, shot in enumerate(frames.shots):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import Descent, cycle_error, decibels, mean_square, weight_distance
+from rawaug.isp.fit.descent import Descent, cycle_error, mean_psnr, mean_square, weight_distance
 from rawaug.isp.fit.samples import FitFrames, FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
 
@@ -49,9 +49,9 @@ def train_encoders(isp: DictionaryISP, frames: FitFrames, config: FitConfig, des
         """dB by which encoders beat constants on frames that no stage of the fit has seen."""
         other = refit(kept, part, config)
         other.use_encoders(False)
-        constants = decibels(other, out)
+        constants = mean_psnr(other, out)
         _train(other, kept, config, descent, f"encoders{part}")
-        return decibels(other, out) - constants
+        return mean_psnr(other, out) - constants
 
     wanted = config.encoders
     isp.use_encoders(False)
@@ -86,7 +86,7 @@ def _drawn(
 def _frame_loss(
     isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig, generator: torch.Generator
 ) -> Tensor:
-    srgb, raw = _same_piece(shot.srgb, isp.unshaded(shot.raw, None), generator)
+    srgb, raw = _same_piece(shot.srgb, isp.remove_shading(shot.raw, None), generator)
     ours, theirs = isp.choose(srgb), isp.choose_forward(raw)
     errors = [(mean_square(isp, part, params) + config.mse_floor).log() for params in (ours, theirs)]
     return (errors[0] + errors[1]).sum() + config.consistency * weight_distance(ours, theirs)
@@ -130,13 +130,13 @@ def train_jointly(isp: DictionaryISP, frames: FitFrames, config: FitConfig, desc
         return torch.stack([_joint_frame_loss(isp, part, shot, config) for part, shot in drawn]).mean()
 
     tensors = dict(isp.named_parameters())
-    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=lambda: decibels(isp, watched))
+    descent.run("end to end", loss, tensors, steps, LEARNING_RATE, watch=lambda: mean_psnr(isp, watched))
     seen = descent.watched["end to end"]
     isp.info["joint"] = {"steps": steps, "kept_step": seen.step, "gain_db": round(seen.best - seen.start, 2)}
 
 
 def _joint_frame_loss(isp: DictionaryISP, part: PixelSamples, shot: FrameSummary, config: FitConfig) -> Tensor:
-    ours, theirs = isp.choose(shot.srgb), isp.choose_forward(isp.unshaded(shot.raw, None))
+    ours, theirs = isp.choose(shot.srgb), isp.choose_forward(isp.remove_shading(shot.raw, None))
     back: dict[str, Tensor] = {}
     back["raw"] = isp.reverse_pixels(part.cell_srgb, ours, part.place, back)
     cycle = cycle_error(isp, part, theirs, back, config)

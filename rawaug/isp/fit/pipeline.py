@@ -28,15 +28,24 @@ from rawaug.files import digest
 from rawaug.isp import stages
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.fit.config import FitConfig
-from rawaug.isp.fit.descent import Descent, cycle_error, decibels, reading_error
+from rawaug.isp.fit.descent import Descent, cycle_error, mean_psnr, reading_error
 from rawaug.isp.fit.encoders import FOLDS, Refit, gain_left_out, train_encoders, train_jointly
 from rawaug.isp.fit.samples import FitFrames, FramePair, FrameSummary, PixelSamples, sample_pixels
-from rawaug.isp.fit.start import REACH_ATOMS, FrameColour, Tie, fall_off, least_squares, set_atoms, set_knee, set_priors
+from rawaug.isp.fit.start import (
+    REACH_ATOMS,
+    FrameColour,
+    Tie,
+    fit_fall_off,
+    least_squares,
+    set_atoms,
+    set_knee,
+    set_priors,
+)
 from rawaug.isp.model import DictionaryISP
 from rawaug.isp.stages import LensShading, Stage
 from rawaug.kernels.runtime import one_thread
 from rawaug.progress import progress as progress_of
-from rawaug.seeding import derived_seed
+from rawaug.seeding import derive_seed
 
 
 def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tuple[FitConfig, float | None]:
@@ -49,7 +58,7 @@ def with_better_tone(frames: FitFrames, config: FitConfig, refit: Refit) -> tupl
     def better(out: FitFrames, kept: FitFrames, part: str) -> float:
         learned = refit(kept, f", learned{part}", replace(config, tone="learned"))
         curve = refit(kept, f", curve{part}", replace(config, tone="curve"))
-        return decibels(curve, out, True) - decibels(learned, out, True)
+        return mean_psnr(curve, out, True) - mean_psnr(learned, out, True)
 
     gain = gain_left_out(frames, min(FOLDS, len(frames.shots)), better)
     return replace(config, tone="curve" if gain > 0 else "learned"), gain
@@ -91,12 +100,12 @@ def fit_isp(
     descent = Descent(path, _key(config, frames), config.seed, progress)
 
     def refit(some: FitFrames, part: str, config: FitConfig) -> DictionaryISP:
-        return _Fit(some, config, descent, part).reversed_only()
+        return _Fit(some, config, descent, part).fit_reverse()
 
     with one_thread():
         config, gain = with_better_tone(frames, config, refit)
         fit = _Fit(frames, config, descent)
-        fit.reversed_only(report)
+        fit.fit_reverse(report)
         train_encoders(fit.isp, frames, config, descent, refit)
         fit.forward()
         train_jointly(fit.isp, frames, config, descent)
@@ -132,7 +141,7 @@ def new_isp(shots: Sequence[FrameSummary], config: FitConfig) -> DictionaryISP:
     fewest, most = settings["colour_atoms"], settings["colour_atoms"] + more
     if not fewest <= settings["gain_atoms"] <= most:
         raise ValueError(f"isp: gain_atoms is {settings['gain_atoms']}, but these frames need {fewest} to {most}")
-    return DictionaryISP(ISPConfig(**settings), derived_seed(config.seed, "isp"))
+    return DictionaryISP(ISPConfig(**settings), derive_seed(config.seed, "isp"))
 
 
 class _Fit:
@@ -161,7 +170,7 @@ class _Fit:
         for stage in self.isp.ordered_stages:
             stage.start_coarse(gamma, toe)
 
-    def reversed_only(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
+    def fit_reverse(self, report: Callable[[DictionaryISP], str] | None = None) -> DictionaryISP:
         """Stages 1 to 3: the reverse pass, without encoders."""
         self.curve()
         self.tone(report)
@@ -179,8 +188,8 @@ class _Fit:
         if shading is None or wanted == "off":
             self._remove(shading)
             return
-        mean, precision = fall_off(self._curved(self.samples), self.samples, self.colour.product())
-        if wanted == "auto" and not takes_light(mean, precision):
+        mean, precision = fit_fall_off(self._curved(self.samples), self.samples, self.colour.product())
+        if wanted == "auto" and not darkens_corners(mean, precision):
             self._remove(shading)
             return
         error = self._error()
@@ -288,7 +297,7 @@ class _Fit:
             self.descent.run("RAW to sRGB", loss, tensors, self.config.steps, self.config.learning_rate)
 
 
-def takes_light(mean: Tensor, precision: Tensor) -> bool:
+def darkens_corners(mean: Tensor, precision: Tensor) -> bool:
     """Whether a mask takes more than :data:`DIMMEST` of the light at a corner, 1 from the centre."""
     corners = torch.tensor([[0.6, 0.8], [0.6, -0.8], [-0.6, 0.8], [-0.6, -0.8]]) - mean
     exponent = 0.5 * torch.einsum("ki,ij,kj->k", corners, precision, corners)

@@ -19,7 +19,7 @@ from rawaug import bayer
 from rawaug.bayer import CFA
 from rawaug.errors import extra
 from rawaug.isp.staged import thumbnail
-from rawaug.isp.stages import as_float, place_in_frame
+from rawaug.isp.stages import as_float, frame_coordinates
 from rawaug.seeding import keyed_generator
 
 CLIPPED_SRGB = 0.98
@@ -143,7 +143,7 @@ def _sites(srgb: Tensor, raw: Tensor, cfa: CFA, pixels: int, generator: torch.Ge
     spread = (corners.amax(0) - corners.amin(0)).amax(0)
     unclipped = (corners.amax((0, 1)) < CLIPPED_SRGB) & (cell_raw.amax(0) < CLIPPED_RAW)
     weight = unclipped / (1.0 + (spread * 32.0) ** 2)
-    place = place_in_frame(height, width)[0, :, row, column]
+    place = frame_coordinates(height, width)[0, :, row, column]
     return _samples(pixel, reading * own, own, own * inside, place, corners.mean(0), cell_raw, weight)
 
 
@@ -182,7 +182,7 @@ def block_averages(srgb: Tensor, raw: Tensor, cfa: CFA) -> Blocks:
     low_srgb = F.avg_pool2d(x[None] ** 2.2, BLOCK)[0] ** (1 / 2.2)
     low_raw = F.avg_pool2d(_colours(window, cfa)[None], BLOCK // 2)[0]
     clipped = F.max_pool2d((window >= CLIPPED_RAW).float()[None], BLOCK)[0, 0] > 0
-    place = place_in_frame(rows, columns, (top, left), (height, width))
+    place = frame_coordinates(rows, columns, (top, left), (height, width))
     return Blocks(low_srgb, low_raw, clipped, F.avg_pool2d(place, BLOCK))
 
 

@@ -21,11 +21,11 @@ from torch import Tensor
 
 from rawaug.isp import stages
 from rawaug.isp.config import ISPParams
-from rawaug.isp.dictionary import l1_normalised, log_light
+from rawaug.isp.dictionary import l1_normalise, log_light
 from rawaug.isp.fit.config import FitConfig
 from rawaug.isp.fit.samples import FrameSummary, PixelSamples
 from rawaug.isp.model import DictionaryISP
-from rawaug.seeding import derived_seed
+from rawaug.seeding import derive_seed
 
 TIE = 1e-1
 """Weight of the deviations; the squared errors of a good fit are near 1e-6."""
@@ -44,16 +44,16 @@ class FrameColour:
     @classmethod
     def from_product(cls, product: Tensor) -> FrameColour:
         """Split ``M`` ``(F, 3, 3)``."""
-        return cls(product.abs().sum(2).log(), l1_normalised(product))
+        return cls(product.abs().sum(2).log(), l1_normalise(product))
 
     def product(self) -> Tensor:
         """``M`` ``(F, 3, 3)``."""
-        return self.log_scale.exp()[:, :, None] * l1_normalised(self.matrix)
+        return self.log_scale.exp()[:, :, None] * l1_normalise(self.matrix)
 
     def params(self) -> ISPParams:
         """As the ISP takes them (without weights)."""
         none = self.log_scale.new_empty(len(self.log_scale), 0)
-        return ISPParams(none, none, l1_normalised(self.matrix), torch.exp(-self.log_scale), none)
+        return ISPParams(none, none, l1_normalise(self.matrix), torch.exp(-self.log_scale), none)
 
     def pick(self, frames: Tensor | slice) -> FrameColour:
         """The colours of some frames."""
@@ -100,7 +100,7 @@ def least_squares(linear: Tensor, samples: PixelSamples) -> Tensor:
 
 
 @torch.no_grad()
-def fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Tensor, Tensor]:
+def fit_fall_off(linear: Tensor, samples: PixelSamples, product: Tensor) -> tuple[Tensor, Tensor]:
     """Mean ``(2,)`` and precision ``(2, 2)`` of the Gaussian that best explains log(reading / prediction)."""
     # A quadratic in the place; an offset for each frame and channel takes up what the mask does to the matrices.
     predicted = stages.correct_colour(linear, product)
@@ -159,7 +159,7 @@ def _groups(points: Tensor, count: int, seed: int) -> Tensor:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of an empty cluster, which frames that are all alike leave
-        _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derived_seed(seed, "atoms") % 2**32)
+        _, labels = kmeans2(points.double().numpy(), count, minit="++", rng=derive_seed(seed, "atoms") % 2**32)
     member = torch.nn.functional.one_hot(torch.from_numpy(labels).long(), count).T.float()
     used = member.sum(1, keepdim=True)
     # An empty cluster becomes the mean of all points.

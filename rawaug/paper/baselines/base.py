@@ -179,7 +179,7 @@ def random_crops(
     def drawn() -> Iterator[Crops]:
         for k in torch.randint(len(pairs), (training.batch,), generator=generator).tolist():
             pair = pairs[k]
-            srgb, raw = (bayer.aligned(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
+            srgb, raw = (bayer.crop_to_cfa(image, CFA(pair.cfa), cfa) for image in (pair.srgb, pair.raw))
             place = crop.sample(raw.shape[-2], raw.shape[-1], generator)
             yield Crops(as_float(crop.apply(srgb, place)), crop.apply(raw, place), torch.tensor(pair.white_balance))
 

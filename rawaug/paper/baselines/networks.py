@@ -47,7 +47,7 @@ from rawaug.isp.fit.samples import FramePair
 from rawaug.isp.stages import as_float
 from rawaug.paper.baselines.base import Crops, CropTrainedISP
 from rawaug.registry import BASELINES
-from rawaug.seeding import derived_seed, initialised_from
+from rawaug.seeding import derive_seed, initialise_from
 
 BLUR_SIZE, BLUR_SIGMA = 21, 12.0
 LOG_FLOOR = 1e-3
@@ -134,7 +134,7 @@ class InvertibleGrey(CropTrainedISP):
 
     def __init__(self, cfa: CFA | str = "RGGB", features: int = 64, blocks: int = 8, seed: int = 0) -> None:
         super().__init__(cfa)
-        with initialised_from(derived_seed(seed, "baseline")):
+        with initialise_from(derive_seed(seed, "baseline")):
             self.encoder = Encoder(features)
             last = nn.Conv2d(4 * features, 3, 1)
             body = (_conv(3, features), _blocks(features, blocks), _conv(features, 4 * features))
@@ -217,7 +217,7 @@ class CycleISP(CropTrainedISP):
         seed: int = 0,
     ) -> None:
         super().__init__(cfa)
-        with initialised_from(derived_seed(seed, "baseline")):
+        with initialise_from(derive_seed(seed, "baseline")):
             self.rgb2raw = RGB2RAW(features, groups, blocks, reduction)
             self.raw2rgb = RAW2RGB(features, groups, blocks, reduction)
             self.ccm = ColourBranch(features, reduction)
@@ -333,7 +333,7 @@ class InvISP(CropTrainedISP):
     ) -> None:
         super().__init__(cfa)
         self.jpeg_quality = jpeg_quality
-        with initialised_from(derived_seed(seed, "baseline")):
+        with initialise_from(derive_seed(seed, "baseline")):
             self.flow = Flow(blocks, growth)
         self.balance: Tensor
         self.register_buffer("balance", torch.ones(1, 3))

@@ -59,7 +59,7 @@ def test_patterns_are_matlabs_and_move_with_the_box(folder: Path) -> None:
     for k, name in enumerate(CFAS):
         assert dnd.frames[k].cfa == CFA(name)
         top, left = (info(k)["boundingboxes"][0][:2] - 1).astype(int)
-        assert dnd[20 * k].cfa == CFA(name).shifted(top, left)
+        assert dnd[20 * k].cfa == CFA(name).shift(top, left)
 
 
 def test_the_submission_is_the_kits(folder: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from rawaug.bayer import CFA, bin_mosaic, binned_variance, mosaic
+from rawaug.bayer import CFA, bin_mosaic, bin_mosaic_variance, mosaic
 from rawaug.data import Binned, demo_pairs, open_pairs
 from rawaug.data.folders import Readable
 from rawaug.data.pairs import (
@@ -158,8 +158,8 @@ def test_binned_sites_lie_where_a_sensor_s_lie(factor: int) -> None:
     noise = torch.randn(1, 1600, 1600, generator=torch.Generator().manual_seed(0))
     side = 1600 // (2 * factor) * 2 * factor
     left = bin_mosaic(noise[..., :side, :side], "GRBG", factor)[..., 4:-4, 4:-4].var().item()
-    assert left == pytest.approx(binned_variance(factor), rel=0.03)
-    assert binned_variance(factor) == pytest.approx(factor**-2, rel=0.35)
+    assert left == pytest.approx(bin_mosaic_variance(factor), rel=0.03)
+    assert bin_mosaic_variance(factor) == pytest.approx(factor**-2, rel=0.35)
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 4])
@@ -172,7 +172,7 @@ def test_sites_that_are_binned_together_share_one_centre(factor: int) -> None:
     side = 1600 // (2 * factor) * 2 * factor
     noise = torch.randn(1, side, side, generator=torch.Generator().manual_seed(0))
     left = bin_mosaic(noise, "GRBG", factor, together=True)[..., 4:-4, 4:-4].var().item()
-    assert left == pytest.approx(binned_variance(factor, together=True), rel=0.03)
+    assert left == pytest.approx(bin_mosaic_variance(factor, together=True), rel=0.03)
 
 
 @pytest.mark.parametrize("cfa", ["XTRANS", "RGBW"])
@@ -189,7 +189,7 @@ def test_noise_falls_by_the_number_of_sites() -> None:
     noisy = raw + torch.randn(raw.shape, generator=generator) * (4e-3 * raw + 1e-4) ** 0.5
     srgb = torch.zeros(3, 768, 768, dtype=torch.uint8)
     pair = Pair("a", srgb, raw.contiguous(), CFA.RGGB, noisy=noisy, shot_var=4e-3, read_var=1e-4).binned(4)
-    left = binned_variance(4)
+    left = bin_mosaic_variance(4)
     assert pair.noisy is not None and (pair.shot_var, pair.read_var) == pytest.approx((4e-3 * left, 1e-4 * left))
     measured = captured_noise(pair.raw.numpy(), pair.noisy.numpy())
     assert measured[0] * 0.5 + measured[1] == pytest.approx((4e-3 * 0.5 + 1e-4) * left, rel=0.05)

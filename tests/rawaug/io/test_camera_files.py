@@ -47,7 +47,7 @@ def test_an_odd_active_area_and_crop_neither_tint_nor_shift(
     )
     frame = read_raw(path)
     rows, columns = top % 2, left % 2
-    assert frame.cfa == cfa.shifted(rows, columns)
+    assert frame.cfa == cfa.shift(rows, columns)
     seen = signal[rows:, columns:][: frame.mosaic.shape[1], : frame.mosaic.shape[2]]
     assert seen.shape == (48 - 2 * rows, 64 - 2 * columns)
     assert np.abs(frame.mosaic[0].numpy() - seen).max() < 0.6 / (WHITE - BLACK), "shifted, or another black level"

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rawaug.bayer import CFA, mosaic, pattern, sites
+from rawaug.bayer import CFA, mosaic, pattern, plane_indices
 from rawaug.io import GainMap, RawFrame, read_raw, read_raw_and_develop, write_dng
 from rawaug.io.gain_map import parse_gain_maps
 from rawaug.io.raw import Exposure
@@ -258,7 +258,7 @@ def test_a_real_dng_written_again_is_the_same(tmp_path: Path, camera_files: Path
 @pytest.mark.parametrize("name", ["XTRANS", "XTRANS+1+2", "QUAD-RGGB", "QUAD-RGGB+1+3"])
 @pytest.mark.parametrize("black", [(64.0,) * 4, (64.0, 70.25, 70.25, 80.0)])
 def test_other_patterns_go_there_and_back(tmp_path: Path, name: str, black: tuple[float, ...]) -> None:
-    cell = sites(name)
+    cell = plane_indices(name)
     levels = torch.tensor(black)[cell].repeat(12, 12)[:36, :46].double()
     numbers = torch.randint(0, 1024, (36, 46), generator=torch.Generator().manual_seed(0)).double()
     raw = ((numbers - levels) / (1023 - levels)).float()[None]

@@ -12,24 +12,24 @@ from rawaug.isp.cameras import (
     PHOTOGRAPHS,
     Array,
     LightRange,
-    colour_matrix,
+    camera_from_srgb,
     daylight,
-    off_locus,
+    gains_in_light,
+    load_cameras,
+    move_off_locus,
     planckian,
-    published_cameras,
     responses,
     sample_lights,
-    white_balance,
     white_point,
 )
 
 
 def test_white_stays_white_and_the_gains_make_its_raw_grey() -> None:
-    cameras = published_cameras().xyz_to_camera
+    cameras = load_cameras().xyz_to_camera
     white = torch.ones(3, dtype=torch.float64)
-    torch.testing.assert_close(colour_matrix(cameras) @ white, torch.ones(len(cameras), 3, dtype=torch.float64))
+    torch.testing.assert_close(camera_from_srgb(cameras) @ white, torch.ones(len(cameras), 3, dtype=torch.float64))
     light = white_point(planckian(np.array(3200.0)))
-    balance = white_balance(cameras[:5], light)
+    balance = gains_in_light(cameras[:5], light)
     grey = balance * responses(cameras[:5], light)
     torch.testing.assert_close(grey, grey[:, 1:2].expand(5, 3))
     torch.testing.assert_close(balance[:, 1], torch.ones(5, dtype=torch.float64))
@@ -37,30 +37,30 @@ def test_white_stays_white_and_the_gains_make_its_raw_grey() -> None:
 
 def test_the_d65_balance_of_a_known_camera() -> None:
     """By hand: (0.902, -0.289, -0.0715) . (0.9504, 1, 1.0889) = 0.490, and 1.068 of green, 0.875 of blue."""
-    red, _, blue = white_balance(published_cameras().named(["Nikon D750"])[0], white_point(D65)).tolist()
+    red, _, blue = gains_in_light(load_cameras().select(["Nikon D750"])[0], white_point(D65)).tolist()
     assert red == pytest.approx(1.068 / 0.490, abs=0.01) and blue == pytest.approx(1.068 / 0.875, abs=0.01)
 
 
 def test_tungsten_light_needs_less_red_and_more_blue() -> None:
-    cameras = published_cameras().xyz_to_camera
-    day = white_balance(cameras, white_point(D65))
-    tungsten = white_balance(cameras, white_point((0.44758, 0.40745)))
+    cameras = load_cameras().xyz_to_camera
+    day = gains_in_light(cameras, white_point(D65))
+    tungsten = gains_in_light(cameras, white_point((0.44758, 0.40745)))
     assert (tungsten[:, 0] < day[:, 0]).float().mean() > 0.99
     assert (tungsten[:, 2] > day[:, 2]).float().mean() > 0.99
 
 
 def test_the_plausible_rows_of_the_table_are_kept() -> None:
-    cameras = published_cameras()
+    cameras = load_cameras()
     assert len(cameras.names) == len(cameras.xyz_to_camera) == 1427
     assert cameras.xyz_to_camera.isfinite().all() and torch.linalg.det(cameras.xyz_to_camera).abs().min() > 1e-4
 
 
 def test_names_are_found_whatever_their_case_and_similar_ones_suggested() -> None:
-    cameras = published_cameras()
-    torch.testing.assert_close(cameras.named(["nikon d750"]), cameras.named(["Nikon D750"]))
-    assert cameras.named(["Nikon D750", "Sony ILCE-7M3"]).shape == (2, 3, 3)
+    cameras = load_cameras()
+    torch.testing.assert_close(cameras.select(["nikon d750"]), cameras.select(["Nikon D750"]))
+    assert cameras.select(["Nikon D750", "Sony ILCE-7M3"]).shape == (2, 3, 3)
     with pytest.raises(ValueError, match=r"'Nikon D705' is not listed; similar: .*Nikon D70"):
-        cameras.named(["Nikon D705"])
+        cameras.select(["Nikon D705"])
 
 
 def kelvin(*values: float) -> Array:
@@ -87,7 +87,7 @@ def test_the_loci_pass_through_the_cie_illuminants() -> None:
 def test_a_step_off_the_locus_has_its_length_and_is_greener_when_positive() -> None:
     t, duv = kelvin(2500, 4000, 8000), kelvin(0.005, 0.005, 0.005)
     on = planckian(t)
-    off = off_locus(on, t, duv)
+    off = move_off_locus(on, t, duv)
     np.testing.assert_allclose(np.linalg.norm(uv(off) - uv(on), axis=1), duv, rtol=1e-6, atol=0)
     assert (off[:, 1] > on[:, 1]).all()
     np.testing.assert_allclose(mccamy(off), t, rtol=0.03, atol=0)

@@ -12,10 +12,10 @@ from rawaug.isp import dictionary
 from rawaug.isp.cameras import (
     D65,
     LightRange,
-    colour_matrix,
-    published_cameras,
+    camera_from_srgb,
+    gains_in_light,
+    load_cameras,
     sample_lights,
-    white_balance,
     white_point,
 )
 from rawaug.isp.dictionary import (
@@ -29,7 +29,7 @@ from rawaug.isp.dictionary import (
     project_to_simplex,
 )
 from rawaug.isp.fast import BakedISP
-from rawaug.isp.model import DictionaryISP, of_cameras
+from rawaug.isp.model import DictionaryISP, restrict_to_cameras
 from rawaug.isp.tone import STEPS
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.dataset import RawPairs
@@ -152,21 +152,21 @@ def test_the_balance_in_a_light_is_that_of_the_matrix_from_xyz(universal: Dictio
     sampler = universal.camera_sampler()
     assert sampler is not None and isinstance(universal.colour, CameraDictionary)
     weights, light = universal.colour.known[::100], sample_lights(7, generator())
-    expected = white_balance(universal.colour.xyz_to_camera(weights), torch.from_numpy(light))
+    expected = gains_in_light(universal.colour.xyz_to_camera(weights), torch.from_numpy(light))
     torch.testing.assert_close(torch.from_numpy(sampler.balance(weights.double().numpy(), light)), expected)
 
 
 def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same cameras as in a consistent draw, and the same spread of gains, in no relation to each other."""
     assert isinstance(universal.colour, CameraDictionary)
-    camera = of_cameras(universal, ["Nikon D750", "Leica S3"]).colour
+    camera = restrict_to_cameras(universal, ["Nikon D750", "Leica S3"]).colour
     assert isinstance(camera, CameraDictionary)
     monkeypatch.setattr(dictionary, "CAMERAS_MIXED", 1)
 
     def error(consistent: bool) -> torch.Tensor:
         sampler = CameraSampler(camera, 0, LightRange((6504.0, 6504.0), lamps=0.0), consistent)
         setting = sampler.sample(64, generator())
-        balance = white_balance(camera.xyz_to_camera(setting.colour_weights), white_point(D65))
+        balance = gains_in_light(camera.xyz_to_camera(setting.colour_weights), white_point(D65))
         own = balance / balance.amin(dim=1, keepdim=True)
         return (setting.gains / own).log().abs().amax(dim=1)
 
@@ -175,20 +175,20 @@ def test_independent_gains_are_those_of_other_light(universal: DictionaryISP, mo
 
 
 def test_one_named_camera_has_its_own_matrix_and_balance(universal: DictionaryISP) -> None:
-    own = published_cameras().named(["Nikon D750"])
-    nikon = of_cameras(universal, "nikon d750")
+    own = load_cameras().select(["Nikon D750"])
+    nikon = restrict_to_cameras(universal, "nikon d750")
     setting = nikon.draw_setting(5, generator())
-    torch.testing.assert_close(setting.matrix, colour_matrix(own).float().expand(5, 3, 3))
+    torch.testing.assert_close(setting.matrix, camera_from_srgb(own).float().expand(5, 3, 3))
     assert setting.gains.std(dim=0).max() > 0.1
     assert isinstance(nikon.colour, CameraDictionary)
     back = nikon.colour.xyz_to_camera(torch.ones(1, 1))
     d65 = white_point(D65)
-    torch.testing.assert_close(white_balance(back, d65), white_balance(own, d65), atol=1e-3, rtol=0)
+    torch.testing.assert_close(gains_in_light(back, d65), gains_in_light(own, d65), atol=1e-3, rtol=0)
     torch.testing.assert_close(back, own, atol=1e-4, rtol=0)
     with pytest.raises(ValueError, match="not listed"):
-        of_cameras(universal, "Box Brownie")
+        restrict_to_cameras(universal, "Box Brownie")
     with pytest.raises(ValueError, match="by name needs an ISP of published cameras"):
-        of_cameras(DictionaryISP(), "Nikon D750")
+        restrict_to_cameras(DictionaryISP(), "Nikon D750")
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:

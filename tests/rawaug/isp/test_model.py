@@ -12,7 +12,7 @@ import torch
 from rawaug.files import WEIGHTS, read_tensors
 from rawaug.isp.config import POINTWISE_STAGES, SMALL, ISPConfig
 from rawaug.isp.model import DictionaryISP
-from rawaug.isp.stages import place_in_frame
+from rawaug.isp.stages import frame_coordinates
 from rawaug.metrics import psnr
 
 
@@ -58,8 +58,8 @@ def test_white_balance_is_taken_as_given(srgb: torch.Tensor) -> None:
 def test_shading_depends_on_the_place_in_the_frame(srgb: torch.Tensor) -> None:
     isp = DictionaryISP()
     cast(Any, isp.stages["shading"]).mask.set(torch.zeros(2), torch.eye(2))
-    centre = isp.reverse(srgb, place=place_in_frame(32, 48, (1000, 1500), (2032, 3048))).raw
-    corner = isp.reverse(srgb, place=place_in_frame(32, 48, (0, 0), (2032, 3048))).raw
+    centre = isp.reverse(srgb, place=frame_coordinates(32, 48, (1000, 1500), (2032, 3048))).raw
+    corner = isp.reverse(srgb, place=frame_coordinates(32, 48, (0, 0), (2032, 3048))).raw
     assert 0.55 < (corner.mean() / centre.mean()).item() < 0.65  # exp(-1/2) at the corner
 
 
@@ -183,7 +183,7 @@ def test_the_forward_encoders_are_asked_after_the_shading_is_corrected() -> None
     """Of a flat grey scene, dim in the corners, they see the same everywhere."""
     isp, seen = two_lights(), list[torch.Tensor]()
     isp.forward_encoders.gain.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
-    mask = cast(Any, isp.stages["shading"]).mask(place_in_frame(32, 32))
+    mask = cast(Any, isp.stages["shading"]).mask(frame_coordinates(32, 32))
     raw = 0.3 * mask.expand(1, 1, 32, 32)
     assert raw.max() / raw.min() > 1.5
     isp.forward(raw)

@@ -28,7 +28,7 @@ def x() -> torch.Tensor:
 def test_untrained_networks_are_the_identity(x: torch.Tensor) -> None:
     assert torch.equal(stages.ToneNetwork()(x), x)
     assert torch.equal(stages.AttentionMask()(x), torch.ones(2, 1, 6, 8))
-    assert torch.equal(stages.GaussianMask()(stages.place_in_frame(6, 8)), torch.ones(1, 1, 6, 8))
+    assert torch.equal(stages.GaussianMask()(stages.frame_coordinates(6, 8)), torch.ones(1, 1, 6, 8))
 
 
 def test_a_tone_network_starts_from_exactly_the_curve(x: torch.Tensor) -> None:
@@ -56,10 +56,10 @@ def test_a_gain_below_one_divides_plainly_in_highlights_too() -> None:
 
 
 def test_a_crop_keeps_its_place_in_the_frame() -> None:
-    whole = stages.place_in_frame(20, 30)
-    crop = stages.place_in_frame(8, 10, offset=(4, 6), frame=(20, 30))
+    whole = stages.frame_coordinates(20, 30)
+    crop = stages.frame_coordinates(8, 10, offset=(4, 6), frame=(20, 30))
     torch.testing.assert_close(crop, whole[..., 4:12, 6:16])
-    corner = stages.place_in_frame(2000, 3000)[0, :, -1, -1]
+    corner = stages.frame_coordinates(2000, 3000)[0, :, -1, -1]
     assert corner.norm().item() == pytest.approx(1.0, abs=1e-3)
 
 
@@ -68,7 +68,7 @@ def test_gaussian_mask_takes_mean_and_precision() -> None:
     mean, precision = torch.tensor([0.1, -0.2]), torch.tensor([[0.8, 0.1], [0.1, 0.5]])
     mask.set(mean, precision)
     torch.testing.assert_close(mask.precision, precision)
-    place = stages.place_in_frame(40, 60)
+    place = stages.frame_coordinates(40, 60)
     p = place[0] - mean[:, None, None]
     expected = torch.exp(-0.5 * (0.8 * p[0] ** 2 + 0.2 * p[0] * p[1] + 0.5 * p[1] ** 2))
     torch.testing.assert_close(mask(place)[0, 0], expected)

@@ -16,7 +16,7 @@ from benchmarks.universal import (
     inverse_gains_in_any_light,
     tone_tables,
 )
-from rawaug.isp.cameras import colour_matrix, published_cameras
+from rawaug.isp.cameras import camera_from_srgb, load_cameras
 from rawaug.isp.config import ISPConfig
 from rawaug.isp.dictionary import CameraDictionary
 from rawaug.isp.model import DictionaryISP
@@ -30,7 +30,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_squared_distance_is_the_error_on_pictures() -> None:
     colours = torch.rand(3, 500, generator=generator()).double() ** 2
-    first, second = colour_matrix(distinct_cameras()[[3, 90]])
+    first, second = camera_from_srgb(distinct_cameras()[[3, 90]])
     a, b = colour_coordinates(torch.stack([first, second]), colours @ colours.T / 500)
     error = (first @ colours - second @ colours).square().mean()
     assert (a - b).square().sum().item() == pytest.approx(error.item(), rel=1e-9)
@@ -51,14 +51,14 @@ def test_the_hull_holds_the_published_cameras(name: str, least: float) -> None:
     isp = DictionaryISP.from_pretrained(name)
     assert isinstance(isp.colour, CameraDictionary)
     atoms = isp.colour.xyz_to_camera(torch.eye(isp.config.colour_atoms))
-    share = held(camera_points(published_cameras().xyz_to_camera), camera_points(atoms))
+    share = held(camera_points(load_cameras().xyz_to_camera), camera_points(atoms))
     assert share >= least
     assert share == pytest.approx(isp.info["holds"]["cameras"], abs=0.002)
 
 
 def test_gain_atoms_hold_lights_that_they_were_not_chosen_for(universal: DictionaryISP) -> None:
     atoms = 1.0 / universal.gain.channel_gains().detach().double()
-    others = inverse_gains_in_any_light(published_cameras().xyz_to_camera[::7], "test", 400)
+    others = inverse_gains_in_any_light(load_cameras().xyz_to_camera[::7], "test", 400)
     assert held(others / 3**0.5, atoms / 3**0.5) > 0.95
 
 

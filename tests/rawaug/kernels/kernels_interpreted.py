@@ -58,7 +58,7 @@ def check_kernels_are_used() -> None:
         asked.append(image.shape)
         return True
 
-    with mock.patch.object(kernels, "triton_usable", usable):
+    with mock.patch.object(kernels, "can_use_triton", usable):
         torch.testing.assert_close(model.apply(clean, params), expected[0], atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(isp(srgb, chosen), expected[1], atol=2e-6, rtol=1e-5)
     assert asked == [clean.shape, srgb.shape] and not kernels._failed

@@ -32,7 +32,7 @@ def test_every_row_is_done_once(rows: int, width: int, threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     done: list[int] = []
-    runtime.over_rows(rows, width, lambda start, stop: done.extend(range(start, stop)))
+    runtime.run_over_rows(rows, width, lambda start, stop: done.extend(range(start, stop)))
     torch.set_num_threads(before)
     assert sorted(done) == list(range(rows))
 
@@ -42,7 +42,7 @@ def test_an_error_in_a_thread_is_raised(two_threads: None) -> None:
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError, match="no"):
-        runtime.over_rows(8, 10**6, fail)
+        runtime.run_over_rows(8, 10**6, fail)
 
 
 @pytest.mark.skipif(not runtime.has_numba(), reason="without Numba there are no loops")
@@ -50,13 +50,13 @@ def test_an_error_in_a_thread_is_raised(two_threads: None) -> None:
 @pytest.mark.parametrize("cfa", list(bayer.CFA))
 def test_choices_of_direction_are_those_of_pytorch(cfa: bayer.CFA, method: str, two_threads: None) -> None:
     """But near the border, where the loops reflect the mosaic once and PyTorch every step."""
-    from rawaug.kernels.cpu import directional
+    from rawaug.kernels.cpu import demosaic_directional
 
     raw = torch.rand(2, 1, 200, 700, generator=torch.Generator().manual_seed(0))
-    ours, expected = directional(raw, cfa, method), bayer.demosaic(raw, cfa, method)
+    ours, expected = demosaic_directional(raw, cfa, method), bayer.demosaic(raw, cfa, method)
     torch.testing.assert_close(ours[..., 6:-6, 6:-6], expected[..., 6:-6, 6:-6], atol=1e-5, rtol=0)
     assert torch.equal(bayer.mosaic(ours, cfa), raw)
-    assert directional(raw[..., :4, :4], cfa, method).isfinite().all()
+    assert demosaic_directional(raw[..., :4, :4], cfa, method).isfinite().all()
 
 
 class Augmented(Dataset[torch.Tensor]):
@@ -88,4 +88,4 @@ def test_forked_workers_go_on_where_the_parent_used_threads(two_threads: None) -
 def test_code_that_cannot_be_kept_is_compiled_all_the_same() -> None:
     made: dict[str, Callable[[int], int]] = {}
     exec("def double(x):\n    return 2 * x", made)  # no file, so no place beside it
-    assert runtime.compiled(made["double"])(21) == 42
+    assert runtime.compile_loop(made["double"])(21) == 42

@@ -65,12 +65,12 @@ def test_a_kernel_that_fails_is_reported_once_and_pytorch_goes_on(monkeypatch: p
         raise RuntimeError("no ptxas\nfor this target")
 
     with pytest.warns(UserWarning, match="unavailable, using PyTorch instead: RuntimeError: for this target"):
-        assert kernels.kernel_or(fails, lambda: 2) == 2
-    assert not kernels.triton_usable(torch.zeros(1, device="meta"))
+        assert kernels.try_kernel(fails, lambda: 2) == 2
+    assert not kernels.can_use_triton(torch.zeros(1, device="meta"))
 
     def has_no_room() -> int:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     with pytest.raises(torch.OutOfMemoryError):
-        kernels.kernel_or(has_no_room, lambda: 2)
+        kernels.try_kernel(has_no_room, lambda: 2)
     assert kernels._failed == ["RuntimeError"]

@@ -42,7 +42,7 @@ def assert_same_bits(a: RawPair, b: RawPair) -> None:
 def test_the_kernels_are_the_ones_that_run() -> None:
     srgb = pictures().to(DEVICE)
     on_device()(srgb)
-    assert kernels.triton_usable(srgb) and not kernels._failed
+    assert kernels.can_use_triton(srgb) and not kernels._failed
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])

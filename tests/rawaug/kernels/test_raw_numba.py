@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from rawaug.kernels import cpu
-from rawaug.kernels.reference import Camera, frame_of, through_curves, unprocess
+from rawaug.kernels.reference import Camera, apply_curves, mask_frame, unprocess
 
 NODES = 9
 
@@ -19,7 +19,7 @@ NODES = 9
 def camera(batch: int, attention: bool, shading: bool, seed: int = 0, entries: int = 0) -> Camera:
     generator = torch.Generator().manual_seed(seed)
     table = torch.rand(NODES, NODES, NODES, 4, generator=generator)
-    frames = [frame_of([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
+    frames = [mask_frame([2 * k, 4, 200, 300, k], 10, 12, (0.1, -0.05)) for k in range(batch)]
     return Camera(
         table=torch.empty(0, 0, 0, 4) if entries else table,
         curves=torch.rand(batch, entries, generator=generator).sort(dim=1).values,
@@ -65,9 +65,9 @@ def test_curves_by_picture_are_the_same_pass(entries: int, all_stages: bool) -> 
 def test_a_curve_has_every_code_of_a_byte() -> None:
     curve = torch.linspace(0.0, 1.0, 1021)[None] ** 2
     codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16)
-    torch.testing.assert_close(through_curves(curve[:, ::4], codes).flatten(), curve[0, ::4], atol=0, rtol=0)
-    torch.testing.assert_close(through_curves(curve, codes).flatten(), curve[0, ::4])
-    between = through_curves(curve, torch.tensor([[[[0.0, 100.25 / 1020]]]]))
+    torch.testing.assert_close(apply_curves(curve[:, ::4], codes).flatten(), curve[0, ::4], atol=0, rtol=0)
+    torch.testing.assert_close(apply_curves(curve, codes).flatten(), curve[0, ::4])
+    between = apply_curves(curve, torch.tensor([[[[0.0, 100.25 / 1020]]]]))
     torch.testing.assert_close(between.flatten()[1], curve[0, 100] + 0.25 * (curve[0, 101] - curve[0, 100]))
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from rawaug.bayer import CFA, binned_variance, unpack
+from rawaug.bayer import CFA, bin_mosaic_variance, unpack
 from rawaug.data import Binned, Pair
 from rawaug.evaluation.trials import Measured
 from rawaug.noise import (
@@ -26,8 +26,8 @@ from rawaug.noise import (
     RowNoise,
     SensorNoise,
     ShotReadNoise,
+    estimate_dark_noise,
     estimate_noise,
-    from_dark_frames,
     own_noise,
     own_noise_share,
     plot_noise,
@@ -116,7 +116,7 @@ def test_smoothed_levels_are_left_out() -> None:
 
 def test_known_read_noise_is_kept() -> None:
     dark = [shoot(torch.zeros(1, 4, 128, 128), 1e-3, 1e-5, seed) for seed in range(2)]
-    read_var = from_dark_frames(dark, "GRBG").read_var
+    read_var = estimate_dark_noise(dark, "GRBG").read_var
     assert read_var == pytest.approx(1e-5 + ROUNDING, rel=0.02)
     estimate = estimate_noise(shoot(scene(0), 1e-3, 1e-5, 0), "GRBG", read_var=read_var)
     assert estimate.read_var == read_var
@@ -130,16 +130,16 @@ def test_dark_frames_show_banding_black_level_and_ignore_hot_pixels() -> None:
             clean = model.apply(clean, model.sample(1, torch.Generator().manual_seed(seed)))
         return unpack(clean, "BGGR")
 
-    measured = from_dark_frames([dark(seed) for seed in range(4)], "BGGR")
+    measured = estimate_dark_noise([dark(seed) for seed in range(4)], "BGGR")
     assert measured.read_var == pytest.approx(1e-5, rel=0.02)
     assert measured.row_var == pytest.approx(2e-6, rel=0.1)
     assert measured.black_offset == pytest.approx((1e-3, 2e-3, -1e-3, 0.0), abs=1e-4)
     plain = shoot(torch.zeros(1, 4, 512, 32), 1e-3, 1e-5, 0)
-    assert from_dark_frames([plain], "GRBG").row_var < 3e-8  # a row's mean varies by 1.6e-7 without any banding
+    assert estimate_dark_noise([plain], "GRBG").row_var < 3e-8  # a row's mean varies by 1.6e-7 without any banding
     with pytest.raises(ValueError, match="clipped at black"):
-        from_dark_frames([dark(0).clamp(min=0)], "BGGR")
+        estimate_dark_noise([dark(0).clamp(min=0)], "BGGR")
     with pytest.raises(ValueError, match="no dark frames"):
-        from_dark_frames([], "BGGR")
+        estimate_dark_noise([], "BGGR")
 
 
 @pytest.mark.parametrize(
@@ -245,7 +245,7 @@ def test_what_cannot_be_measured_is_unknown_and_what_is_stated_is_taken() -> Non
     small = reference(patches(64, 64))
     assert own_noise(small.raw, small.cfa) is None
     stated = Pair("a", small.srgb, small.raw, small.cfa, own_noise=(3.2e-5, 1.6e-7))
-    for together, left in ((False, binned_variance(4)), (True, binned_variance(4, together=True))):
+    for together, left in ((False, bin_mosaic_variance(4)), (True, bin_mosaic_variance(4, together=True))):
         assert Binned(Measured([stated]), 4, together)[0].own_noise == pytest.approx((3.2e-5 * left, 1.6e-7 * left))
 
 

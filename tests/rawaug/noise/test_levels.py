@@ -30,8 +30,8 @@ from rawaug.noise.cameras import (
     SHOT_ON_MOSAIC,
     SPREAD,
     ProfileLevels,
+    load_profiles,
     profile_ends,
-    published_profiles,
 )
 from rawaug.noise.levels import MixedLevels
 from rawaug.noise.models import NoiseModel
@@ -198,7 +198,7 @@ def test_a_row_of_the_file_is_hit(iso: int, shot: float, read: float) -> None:
 
 
 def test_between_two_rows_the_logarithms_are_interpolated() -> None:
-    profiles = published_profiles()
+    profiles = load_profiles()
     index = profiles.names.index("Sony ILCE-7M3")
     (x0, x1), (s0, s1), _ = profiles.table[:, index, 2:4].tolist()
     iso = math.exp(0.25 * x0 + 0.75 * x1)
@@ -207,7 +207,7 @@ def test_between_two_rows_the_logarithms_are_interpolated() -> None:
 
 
 def test_levels_stay_within_the_profile_and_replay() -> None:
-    profiles = published_profiles()
+    profiles = load_profiles()
     levels = ProfileLevels("Nikon D750")
     shot_var, read_var = levels.sample(2000, generator(3))
     index = profiles.names.index("Nikon D750")
@@ -220,10 +220,10 @@ def test_levels_stay_within_the_profile_and_replay() -> None:
 def test_any_camera_draws_each_camera_alike() -> None:
     """By its profile's levels where it has one row alone, whose factors then lie within the spread."""
     levels = ProfileLevels("any camera")
-    assert len(levels.cameras) == len(published_profiles().names) == 369
+    assert len(levels.cameras) == len(load_profiles().names) == 369
     levels.spread = False
-    one_row = published_profiles().rows == 1
-    fixed = published_profiles().table[1, one_row, 0].exp().float()
+    one_row = load_profiles().rows == 1
+    fixed = load_profiles().table[1, one_row, 0].exp().float()
     shot_var, _ = levels.sample(200_000, generator())
     hits = torch.isclose(shot_var[:, None], fixed, rtol=1e-6, atol=0).float().mean(dim=0)
     torch.testing.assert_close(hits, torch.full_like(hits, 1 / 369), atol=5e-4, rtol=0)
@@ -255,7 +255,7 @@ def test_a_profile_says_how_far_its_levels_are_known() -> None:
 
 
 def test_limits_of_iso_leave_out_the_cameras_without_a_share() -> None:
-    profiles = published_profiles()
+    profiles = load_profiles()
     high = ProfileLevels("any camera", iso=(51_200, 102_400))
     ends = profiles.limits()[:, 1].exp()
     assert len(high.cameras) == int((ends > 51_199).sum()) < 150

@@ -9,7 +9,7 @@ from skimage.color import rgb2gray
 from rawaug.bayer import CFA
 from rawaug.data import demo_photographs
 from rawaug.data.pairs import Pair
-from rawaug.isp.cameras import colour_matrix, published_cameras
+from rawaug.isp.cameras import camera_from_srgb, load_cameras
 from rawaug.paper.ablation import synthetic_frames
 from rawaug.paper.reconstruction import overexposed, retouched
 
@@ -28,7 +28,7 @@ def test_a_frame_is_its_cameras_and_its_lights(pictures: list[torch.Tensor]) -> 
     names = ["Nikon-D750", "Canon-EOS-5D-Mark-III"] * 2
     assert [frame.name for frame in frames] == [f"train_{k:03d}_{name}" for k, name in enumerate(names)]
     assert {frame.raw.shape for frame in frames} == {(1, 288, 448)}
-    matrices = colour_matrix(published_cameras().named(CAMERAS)).float()
+    matrices = camera_from_srgb(load_cameras().select(CAMERAS)).float()
     for k, frame in enumerate(frames):
         assert torch.allclose(torch.linalg.inv(frame.color_matrix), matrices[k % 2], atol=1e-4)
         assert min(frame.white_balance) == 1.0

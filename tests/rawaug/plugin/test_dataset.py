@@ -322,9 +322,9 @@ def test_absurd_weights_end_in_a_line_that_names_the_picture(pictures: list[Tens
 
 def test_an_enlarged_crop_keeps_its_place_in_the_frame() -> None:
     """Twice the size: its pixels lie half as far apart, and its first half a step nearer to the corner."""
-    from rawaug.kernels.reference import frame_of
+    from rawaug.kernels.reference import mask_frame
 
-    plain, large = (frame_of([10, 20, 100, 200, 0, rows], 16, 16, (0.0, 0.0)) for rows in (16, 8))
+    plain, large = (mask_frame([10, 20, 100, 200, 0, rows], 16, 16, (0.0, 0.0)) for rows in (16, 8))
     y, x, down, _, _, right = large
     assert (down, right) == pytest.approx((plain[2] / 2, plain[5] / 2))
     assert (y, x) == pytest.approx((plain[0] - plain[2] / 4, plain[1] - plain[5] / 4))

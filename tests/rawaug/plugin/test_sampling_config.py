@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from rawaug.isp.cameras import LAMPS, light_range, published_cameras, sample_lights, white_balance, white_point
+from rawaug.isp.cameras import LAMPS, gains_in_light, light_range, load_cameras, sample_lights, white_point
 from rawaug.isp.model import DictionaryISP
 from rawaug.plugin.augment import RawAugment
 from rawaug.plugin.sampling_config import SamplingConfig
@@ -20,9 +20,9 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def test_a_lamp_and_a_temperature_give_their_gains() -> None:
-    camera = published_cameras().named(["Nikon D750"])
+    camera = load_cameras().select(["Nikon D750"])
     lamp = SamplingConfig(camera="Nikon D750", light="LED-B1", exposure=0.0).make()
-    expected = white_balance(camera, white_point(LAMPS["LED-B1"]))
+    expected = gains_in_light(camera, white_point(LAMPS["LED-B1"]))
     drawn = torch.stack([lamp.sample(PICTURE, seeded(k)).isp.gains for k in range(20)])
     balance = drawn / drawn[:, 1:2]
     torch.testing.assert_close(balance.mean(dim=0), expected[0].float(), atol=0.05, rtol=0)

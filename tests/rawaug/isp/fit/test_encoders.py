@@ -11,7 +11,7 @@ import torch
 
 from rawaug.data.pairs import Pair
 from rawaug.isp.fit import FitConfig, encoders, fit_isp, pipeline
-from rawaug.isp.fit.descent import Descent, decibels
+from rawaug.isp.fit.descent import Descent, mean_psnr
 from rawaug.isp.fit.encoders import joint_steps, train_jointly
 from rawaug.isp.fit.samples import FitFrames, sample_pixels
 from rawaug.isp.model import DictionaryISP
@@ -83,18 +83,18 @@ def test_frames_that_judge_were_left_out_of_curve_tone_and_atoms_too(
     judged: list[tuple[set[str], set[str]]] = []
 
     class Noted(pipeline._Fit):
-        def reversed_only(self, *args: Any) -> DictionaryISP:
-            isp = super().reversed_only(*args)
+        def fit_reverse(self, *args: Any) -> DictionaryISP:
+            isp = super().fit_reverse(*args)
             assert self.samples.srgb.shape[0] == self.colour.matrix.shape[0] == len(self.shots)
             fitted.append({shot.name for shot in self.shots})
             return isp
 
-    def decibels(isp: DictionaryISP, frames: FitFrames) -> float:
+    def mean_psnr(isp: DictionaryISP, frames: FitFrames) -> float:
         judged.append((fitted[-1], {shot.name for shot in frames.shots}))
         return 0.0
 
     monkeypatch.setattr(pipeline, "_Fit", Noted)
-    monkeypatch.setattr(encoders, "decibels", decibels)
+    monkeypatch.setattr(encoders, "mean_psnr", mean_psnr)
     fit_isp(lit_frames(exact_pair, 4, informative=True), settings, progress=False)
     everything = {f"shot{k}" for k in range(4)}
     assert fitted[0] == everything and len(fitted) == 3 and len(judged) == 4
@@ -132,9 +132,9 @@ def test_the_watched_frame_gains(isp: DictionaryISP, frames: list[Pair], trained
     with torch.no_grad():
         isp.gain.log_gains.add_(0.1)
     drawn = sample_pixels(frames, CONFIG.pixels, CONFIG.seed)
-    before = decibels(isp, drawn.some([0]))
+    before = mean_psnr(isp, drawn.some([0]))
     trained(isp, drawn, steps=20, learning_rate=1e-2)
-    gain, info = decibels(isp, drawn.some([0])) - before, isp.info["joint"]
+    gain, info = mean_psnr(isp, drawn.some([0])) - before, isp.info["joint"]
     assert gain > 3.0 and info["gain_db"] == pytest.approx(gain, abs=0.006)
     assert info["steps"] == 20 and info["kept_step"] in (5, 10, 15, 20)
 
